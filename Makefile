@@ -1,0 +1,103 @@
+# make run                     sets up, then runs the demo capture into out/demo
+# make run PHOTOS=dir OUT=dir  the same on your photos (PRESET=preview|standard|high)
+# make test                    sets up, then passes every test
+# TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
+# A second call does not set up again.
+
+PYTHON ?= python3
+PRESET ?= standard
+PHOTOS ?=
+OUT ?= $(if $(PHOTOS),out/$(notdir $(patsubst %/,%,$(PHOTOS))),out/demo)
+TORCH ?=
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' 2>/dev/null)
+NATIVE := $(filter %.cpp %.h %.cu,$(SOURCES))
+
+# The index has torch's own wheels; what torch needs comes from PyPI with the rest.
+CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.pytorch.org/whl/cpu)
+
+# The flags that find fetched headers; nothing where Python has its own.
+FETCHED = $(firstword $(wildcard $(CURDIR)/.venv/headers/usr/include/python3.*))
+WITH_HEADERS = $(if $(FETCHED),CXXFLAGS="-I$(FETCHED) -I$(dir $(FETCHED))" SKBUILD_CMAKE_DEFINE="Python_INCLUDE_DIR=$(FETCHED)")
+
+.PHONY: run test test-captures setup develop lint types layers wheel format clean
+.DEFAULT_GOAL := run
+
+run: .venv/.installed
+ifeq ($(PHOTOS),)
+	@echo "== the demo capture → $(OUT)"
+	@$(BIN)/splatpipe demo "$(OUT)"
+else
+	@echo "== $(PHOTOS) → $(OUT)"
+	@$(BIN)/splatpipe run "$(PHOTOS)" "$(OUT)" --preset $(PRESET)
+endif
+
+test: .venv/.tested
+	@echo "== tests"
+	@$(BIN)/python -m pytest -q -m "not captures and not cuda"
+
+test-captures: .venv/.tested
+	@echo "== the line on real photos"
+	@$(BIN)/python -m pytest -q -m captures --captures=../shared/data
+
+setup: .venv/.installed
+
+# For work on splatpipe itself: the sources in place instead of a built wheel.
+develop: .venv/.tested
+	@$(WITH_HEADERS) $(PIP) install -q --no-deps --no-build-isolation -e .
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+	  { echo "splatpipe needs Python 3.11 to 3.13 (give another with PYTHON=python3.12)"; exit 1; }
+	@command -v c++ >/dev/null || { echo "splatpipe needs a C++ compiler: apt install g++"; exit 1; }
+	@echo "== making .venv"
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "splatpipe needs venv: apt install python3-venv"; exit 1; }
+
+# Debian and Ubuntu keep Python.h in a package that neither python3-venv nor g++ brings. Its files do without installing.
+.venv/.headers: | .venv/bin/python
+	@if ! $(BIN)/python -c 'import pathlib, sys, sysconfig; \
+	  sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())'; then \
+	  echo "== fetching the headers of Python"; rm -rf .venv/headers; mkdir .venv/headers; cd .venv/headers; \
+	  { apt-get -q download "libpython$$(../bin/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')-dev" && \
+	    dpkg -x libpython*-dev*.deb . ; } || { echo "splatpipe needs Python.h: apt install python3-dev"; exit 1; }; fi
+	@touch $@
+
+.venv/.dependencies: pyproject.toml constraints.txt | .venv/bin/python
+	@echo "== installing what splatpipe stands on (a few minutes, once)"
+	@$(PIP) install -q $$(grep '^torch==' constraints.txt) -c constraints.txt $(CPU_TORCH)
+	@$(PIP) install -q -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb")); \
+	  print(*(f"{chr(39)}{r}{chr(39)}" for r in p["project"]["dependencies"] + p["build-system"]["requires"]))' | xargs) cmake ninja
+	@touch $@
+
+.venv/.installed: .venv/.dependencies .venv/.headers $(SOURCES)
+	@echo "== building and installing splatpipe"
+	@rm -rf dist && $(WITH_HEADERS) $(PIP) wheel -q --no-deps --no-build-isolation -w dist .
+	@$(PIP) install -q --no-deps --force-reinstall dist/splatpipe-*.whl
+	@touch $@
+
+.venv/.tested: .venv/.installed
+	@if [ ! -e .venv/.dev ] || [ pyproject.toml -nt .venv/.dev ]; then \
+	  echo "== installing what the tests need" && \
+	  $(PIP) install -q -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb")); \
+	  print(*p["project"]["optional-dependencies"]["dev"])') && touch .venv/.dev; fi
+	@touch $@
+
+lint: .venv/.tested
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	@$(BIN)/clang-format --dry-run --Werror $(NATIVE)
+
+format: .venv/.tested
+	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/clang-format -i $(NATIVE)
+
+types: .venv/.tested
+	@$(BIN)/mypy -p splatpipe.pipeline -p splatpipe.stages
+
+layers: .venv/.tested
+	@$(BIN)/lint-imports
+
+wheel: .venv/.installed
+	@ls dist/splatpipe-*.whl
+
+clean:
+	@rm -rf .venv build dist

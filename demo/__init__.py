@@ -1,0 +1,12 @@
+"""The demo capture: 40 rendered photos of a house, their truth, and the generator that made them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+CAPTURE = Path(__file__).parent / "capture"
+
+
+def capture_path() -> Path:
+    """The folder with the photos; ``truth.json``, ``gcp_list.txt``, ``rtk.json`` and ``surface.ply`` lie beside it."""
+    return CAPTURE / "photos"

@@ -1,0 +1,330 @@
+"""The command line: thin commands over the engine, and one place where errors become exit codes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from splatpipe.pipeline.ending import Ending, exit_code, for_the_user, print_json
+from splatpipe.pipeline.engine.errors import (
+    EXIT_INTERRUPTED,
+    EXIT_TERMINATED,
+    EXIT_USAGE,
+    MachineError,
+    Stopped,
+    UsageError,
+)
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.runner import Runner
+    from splatpipe.pipeline.engine.session import Request
+    from splatpipe.stages.line import LineConfig
+
+app = typer.Typer(
+    name="splatpipe",
+    help="From a folder of drone photos to a georeferenced, quality-checked 3D Gaussian splat.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _expand(path: Path) -> Path:
+    return path.expanduser()
+
+
+PhotosArgument = Annotated[Path, typer.Argument(help="Folder of photos, or one with images/ and sparse/0 (COLMAP).")]
+OutArgument = Annotated[
+    Path, typer.Argument(callback=_expand, help="Folder for the results; a run goes on where it was stopped.")
+]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with options, over the preset's.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.OPTION=VALUE", help="One option, over all else. Repeatable."),
+]
+DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+ThreadsOption = Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. The result is the same.")]
+SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout at the end.")]
+PresetOption = Annotated[str, typer.Option(help="preview (minutes), standard or high.")]
+UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
+RerunOption = Annotated[list[str] | None, typer.Option(metavar="STAGE", help="Run this stage again. Repeatable.")]
+RerunFromOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage and all after it again.")]
+
+
+@dataclass(frozen=True)
+class _Overrides:
+    """What the command line says about the configuration."""
+
+    tables: Sequence[dict[str, Any]]
+
+    def resolve(self, *below: dict[str, Any]) -> LineConfig:
+        from splatpipe.pipeline.engine.config import resolve
+        from splatpipe.stages.line import LineConfig
+
+        return resolve(LineConfig, [*below, *self.tables])
+
+
+def _overrides(config: Path | None, assignments: Sequence[str] | None, seed: int | None) -> _Overrides:
+    from splatpipe.pipeline.engine.config import load_file, parse_set, with_seed
+    from splatpipe.stages.line import LineConfig
+
+    tables = [load_file(config)] if config else []
+    for table in tables:  # OUT/config.toml has these two besides the options
+        table.pop("photos", None), table.pop("splatpipe", None)
+    if seed is not None:
+        tables.append(with_seed(LineConfig, seed))
+    return _Overrides([*tables, *(parse_set(text, LineConfig) for text in assignments or ())])
+
+
+def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
+    from splatpipe.pipeline.engine.session import Request
+    from splatpipe.pipeline.engine.stage import Machine
+    from splatpipe.stages.line import LINE
+
+    if device not in ("auto", "cpu", "cuda"):
+        raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
+    if device == "cuda":
+        raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
+    return Request(LINE, config, photos, out, Machine(device, threads or available_cores()))
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"splatpipe {version('splatpipe')}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(
+    photos: PhotosArgument,
+    out: OutArgument,
+    preset: PresetOption = "standard",
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    until: UntilOption = None,
+    rerun: RerunOption = None,
+    rerun_from: RerunFromOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    seed: SeedOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Turn a folder of photos into a Gaussian splat; what is there and valid is reused."""
+    from splatpipe.pipeline.engine.config import load_preset
+
+    with Ending(out, as_json) as done:
+        resolved = _overrides(config, assignments, seed).resolve(load_preset(preset))
+        again = _stages_to_rerun(rerun or [], rerun_from, until)
+        with _Session(_request(photos, out, resolved, device, threads)) as runner:
+            done.outcome = runner.outcome
+            runner.walk(until=until, rerun=again)
+
+
+@app.command()
+def demo(
+    out: OutArgument,
+    preset: PresetOption = "demo",
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    seed: SeedOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the line on the capture that ships with splatpipe, to see it work."""
+    from splatpipe.demo import capture_path
+
+    run(capture_path(), out, preset, None, assignments, None, None, None, device, threads, seed, as_json)
+
+
+@app.command()
+def stage(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The stage to run.")],
+    out: OutArgument,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Run one stage again on an existing OUT, and nothing else."""
+    from splatpipe.pipeline.engine.config import known
+    from splatpipe.pipeline.engine.session import load_run
+    from splatpipe.stages.line import LineConfig
+
+    with Ending(out, as_json) as done:
+        _check_stage(name)
+        photos, table = load_run(out)
+        resolved = _overrides(None, assignments, None).resolve(known(LineConfig, table))
+        request = _request(photos, out, resolved, device, threads)
+        with _Session(request) as runner:
+            done.outcome = runner.outcome
+            runner.run_alone(name)
+
+
+@app.command()
+def status(out: OutArgument, as_json: JsonOption = False) -> None:
+    """Say what is there, what is stale and why."""
+    from splatpipe.pipeline.console import show_standings
+    from splatpipe.pipeline.engine.runner import survey
+    from splatpipe.pipeline.engine.session import survey_line
+
+    with Ending(out, as_json) as done:
+        standings = list(survey(*survey_line(_existing(out))))
+        stages = [
+            {
+                "name": standing.stage.name,
+                "state": standing.state,
+                "reason": standing.reason,
+                "seconds": standing.artifact.manifest["seconds"] if standing.artifact else None,
+                "summary": standing.artifact.summary if standing.artifact else None,
+            }
+            for standing in standings
+        ]
+        done.told = {"stages": stages}
+    if not as_json:
+        show_standings(standings)
+
+
+@app.command()
+def clean(out: OutArgument, as_json: JsonOption = False) -> None:
+    """Remove artifacts that the present configuration no longer asks for."""
+    from splatpipe.pipeline.console import say
+    from splatpipe.pipeline.engine.runner import survey
+    from splatpipe.pipeline.engine.session import survey_line
+    from splatpipe.pipeline.engine.store import locked
+
+    with Ending(out, as_json) as done:
+        line, store = survey_line(_existing(out))
+        with locked(store):
+            keep = [(standing.stage.name, standing.key) for standing in survey(line, store)]
+            removed, freed = store.remove_stale(keep)
+        done.told = {"removed": removed, "freed_bytes": freed}
+        say(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")
+
+
+@app.command()
+def options(preset: PresetOption = "standard") -> None:
+    """List every option with its value in a preset and what it does."""
+    from splatpipe.pipeline.console import show_table
+    from splatpipe.pipeline.engine.config import load_preset, lookup, option_help
+
+    resolved = _Overrides([]).resolve(load_preset(preset))
+    rows = [(name, str(lookup(resolved, name)), text) for name, text in option_help(type(resolved))]
+    show_table(rows, ("option", "value", "what it does"))
+
+
+@app.command()
+def doctor(as_json: JsonOption = False) -> None:
+    """Say what this machine can do."""
+    from splatpipe.pipeline.console import show_table
+    from splatpipe.pipeline.doctor import examine
+
+    findings = examine()
+    if as_json:
+        print_json(findings)
+    else:
+        show_table([(name, str(value)) for name, value in findings.items()], ("what", "found"))
+
+
+def _existing(out: Path) -> Request:
+    from splatpipe.pipeline.engine.config import known
+    from splatpipe.pipeline.engine.session import load_run
+    from splatpipe.stages.line import LineConfig
+
+    photos, table = load_run(out)
+    return _request(photos, out, _Overrides([]).resolve(known(LineConfig, table)))
+
+
+def _check_stage(name: str) -> None:
+    from splatpipe.stages.line import LINE
+
+    names = [entry.name for entry in LINE]
+    if name not in names:
+        raise UsageError(f'There is no stage "{name}".', hint=f"The line is: {', '.join(names)}.")
+
+
+def _stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | None) -> frozenset[str]:
+    from splatpipe.stages.line import LINE
+
+    for name in [*rerun, *filter(None, (rerun_from, until))]:
+        _check_stage(name)
+    names = [entry.name for entry in LINE]
+    return frozenset([*rerun, *(names[names.index(rerun_from) :] if rerun_from else [])])
+
+
+class _Session:
+    """An open session whose events go to the terminal, which is left tidy whatever happens."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+
+    def __enter__(self) -> Runner:
+        from splatpipe.pipeline.console import RunConsole
+        from splatpipe.pipeline.engine.session import open_session
+
+        self._console = RunConsole()
+        self._session = open_session(self._request, self._console)
+        return self._session.__enter__()
+
+    def __exit__(self, *error: Any) -> bool | None:
+        self._console.close()
+        return self._session.__exit__(*error)
+
+
+def _stop(number: int, _frame: FrameType | None) -> NoReturn:
+    raise Stopped(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_TERMINATED)
+
+
+def main() -> NoReturn:
+    """Run the command line; every error becomes its message and its exit code here."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup means it
+            signal.signal(number, _stop)
+    try:
+        app()
+    except SystemExit as error:  # typer has told what is wrong with the call
+        if error.code == EXIT_USAGE and "--json" in sys.argv:
+            print_json({"exit_code": EXIT_USAGE, "error": {"message": "Wrong call; see stderr.", "hint": "--help"}})
+        raise
+    except Stopped as error:
+        from splatpipe.pipeline.console import say
+
+        say(f"{error} {error.hint}")
+        sys.exit(error.exit_code)
+    except Exception as error:
+        from splatpipe.pipeline.console import show_error
+
+        show_error(for_the_user(error))
+        sys.exit(exit_code(error))
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""Events and errors on the terminal: a bar with rate and time left, or plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.panel import Panel
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.events import Event
+from splatpipe.pipeline.engine.runner import Standing
+from splatpipe.pipeline.engine.stage import JSON, Summary
+
+PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
+COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
+
+
+class _RateColumn(ProgressColumn):
+    """Done of total with the unit, and how many a second."""
+
+    def render(self, task: Task) -> Text:
+        unit = task.fields.get("unit", "")
+        rate = f"  {_rate(task.speed, unit)}" if task.speed else ""
+        return Text(f"{_count(task.completed)}/{_count(task.total or 0)} {unit}{rate}", style="cyan")
+
+
+def _rate(per_second: float, unit: str) -> str:
+    if per_second < 1:
+        return f"{1 / per_second:.1f} s each"
+    return f"{per_second:.{1 if per_second < 100 else 0}f} {unit}/s"
+
+
+def _count(value: float) -> str:
+    return f"{value:,.0f}"
+
+
+class RunConsole:
+    """Shows a run's events on stderr; a sink for the runner."""
+
+    def __init__(self) -> None:
+        self._console = Console(file=sys.stderr, highlight=False)
+        self._order: list[str] = []
+        self._live: Progress | None = None
+        self._task: TaskID | None = None
+        self._stage_started_s = time.monotonic()
+        self._plain_said_s = 0.0
+        self._what = ""
+
+    def __call__(self, event: Event) -> None:
+        show = getattr(self, f"_{event.kind}", None)
+        if show is not None:
+            show(event.stage, event.data)
+
+    def close(self) -> None:
+        """Take the bar away, so that what follows stands on its own line."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def _run_started(self, _stage: str, data: Mapping[str, JSON]) -> None:
+        self.close()
+        self._order = list(data["stages"])
+
+    def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
+        self._stage_started_s = self._plain_said_s = time.monotonic()
+        self._what = ""
+        if not self._console.is_terminal:
+            self._console.print(f"{self._label(stage)} started ({data['reason']})", markup=False)
+            return
+        self._live = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            _RateColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=self._console,
+            transient=True,
+            speed_estimate_period=60,
+        )
+        self._live.start()
+        self._task = self._live.add_task(escape(f"{self._label(stage)} ({data['reason']})"), total=None, unit="")
+
+    def _progress(self, stage: str, data: Mapping[str, JSON]) -> None:
+        done, total, what, unit = data["done"], data["total"], str(data["what"]), str(data["unit"])
+        if self._live is not None and self._task is not None:
+            description = escape(f"{self._label(stage)} {what}")
+            if what != self._what:
+                self._live.reset(self._task, total=total)
+            self._live.update(self._task, completed=done, total=total, description=description, unit=unit)
+        elif not self._console.is_terminal and time.monotonic() - self._plain_said_s > PLAIN_INTERVAL_S:
+            now = time.monotonic()
+            self._plain_said_s = now
+            left = (now - self._stage_started_s) * (total - done) / done if done else 0.0
+            self._console.print(
+                f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}, about {_duration(left)} left",
+                markup=False,
+            )
+        self._what = what
+
+    def _stage_finished(self, stage: str, data: Mapping[str, JSON]) -> None:
+        self.close()
+        self._line("✓", "green", stage, f"{_duration(data['seconds'])}  {_brief(data['summary'])}")
+
+    def _stage_reused(self, stage: str, data: Mapping[str, JSON]) -> None:
+        self._line("=", "blue", stage, f"reused  {_brief(data['summary'])}")
+
+    def _stage_failed(self, stage: str, data: Mapping[str, JSON]) -> None:
+        self.close()
+        self._line("✗", "red", stage, str(data["message"]))
+
+    def _warning(self, stage: str, data: Mapping[str, JSON]) -> None:
+        hint = f" {data['hint']}" if data["hint"] else ""
+        self._line("!", "yellow", stage, f"{data['message']}{hint}")
+
+    def _line(self, sign: str, colour: str, stage: str, text: str) -> None:
+        target = self._live.console if self._live is not None else self._console
+        target.print(f"[{colour}]{sign}[/] {escape(self._label(stage))} {escape(text)}", soft_wrap=True)
+
+    def _label(self, stage: str) -> str:
+        if stage not in self._order:
+            return stage.ljust(10)
+        return f"{self._order.index(stage) + 1:>2}/{len(self._order)} {stage:<10}"
+
+
+def show_error(error: SplatpipeError) -> None:
+    """The short panel that a user sees instead of a traceback."""
+    lines = [escape(error.message)]
+    if error.hint:
+        lines.append(f"[bold]→[/] {escape(error.hint)}")
+    Console(file=sys.stderr, highlight=False).print(Panel("\n".join(lines), title="splatpipe", border_style="red"))
+
+
+def show_standings(standings: Iterable[Standing]) -> None:
+    """The table of ``splatpipe status``."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("stage", "state", "took", "what"):
+        table.add_column(title, overflow="fold")
+    for standing in standings:
+        artifact = standing.artifact
+        took = _duration(float(artifact.manifest["seconds"])) if artifact else ""
+        what = _brief(artifact.summary) if artifact else standing.reason
+        table.add_row(
+            standing.stage.name, f"[{COLOURS[standing.state]}]{standing.state}[/]", took, Text(what), end_section=False
+        )
+    Console(highlight=False).print(table)
+
+
+def show_outputs(out: Path, seconds: float, ran: int, metrics: Mapping[str, JSON], files: Iterable[Path]) -> None:
+    """What a run left and how good it is, for people."""
+    console = Console(file=sys.stderr, highlight=False)
+    done = "Everything was there already: nothing to do." if not ran else f"Done in {_duration(seconds)}."
+    console.print(f"\n[bold]{done}[/]  {escape(_brief(metrics))}", soft_wrap=True)
+    for path in files:
+        size = path.stat().st_size
+        console.print(f"  {escape(str(path))}  [dim]{_bytes(size)}[/]", soft_wrap=True)
+    if not ran:
+        console.print(f"[dim]Change an option, or --rerun a stage, to do more. Results: {escape(str(out))}[/]")
+
+
+def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
+    """A plain table on stdout."""
+    table = Table(box=None, pad_edge=False)
+    for title in titles:
+        table.add_column(title, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console(highlight=False).print(table)
+
+
+def say(text: str) -> None:
+    """One line to the user on stderr."""
+    Console(file=sys.stderr, highlight=False).print(escape(text), soft_wrap=True)
+
+
+def _brief(summary: Summary) -> str:
+    """The scalars of a summary in one line."""
+    shown = []
+    for name, value in summary.items():
+        if isinstance(value, bool | int | str):
+            shown.append(
+                f"{name.replace('_', ' ')} {value:,}" if type(value) is int else f"{name.replace('_', ' ')} {value}"
+            )
+        elif isinstance(value, float):
+            shown.append(f"{name.replace('_', ' ')} {value:.4g}")
+    return ", ".join(shown)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def _bytes(size: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} GB"

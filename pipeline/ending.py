@@ -1,0 +1,112 @@
+"""How a command ends: a summary for people, one JSON object for programs, a message and an exit code for errors."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatpipe.pipeline.engine.errors import (
+    EXIT_MACHINE,
+    EXIT_STAGE,
+    MachineError,
+    SplatpipeError,
+    StageError,
+    Stopped,
+)
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.runner import Outcome
+
+
+class Ending:
+    """Tells the end of a command, good or bad: a summary for people on stderr, one JSON object for programs."""
+
+    outcome: Outcome | None = None
+    told: Mapping[str, Any] | None = None
+
+    def __init__(self, out: Path, as_json: bool) -> None:
+        self._out, self._as_json = out, as_json
+        self._started_s = time.monotonic()
+
+    def __enter__(self) -> Ending:
+        return self
+
+    def __exit__(self, _kind: Any, error: BaseException | None, _traceback: Any) -> None:
+        seconds = time.monotonic() - self._started_s
+        if isinstance(error, GeneratorExit | SystemExit):
+            return
+        if error is None and self.outcome is not None:
+            self._show(self.outcome, seconds)
+        if self._as_json:
+            print_json({**self._as_object(error, seconds), **(self.told or {})})
+
+    def _show(self, outcome: Outcome, seconds: float) -> None:
+        from splatpipe.pipeline.console import show_outputs
+
+        show_outputs(self._out, seconds, len(outcome.ran), _headline(outcome), self._files(outcome))
+
+    def _files(self, outcome: Outcome) -> list[Path]:
+        from splatpipe.stages.line import LINE
+
+        parts = {entry.name: entry for entry in LINE if entry.name in outcome.artifacts}
+        files = [self._out / entry.parts[name] for entry in parts.values() for name in entry.deliverables]
+        return [path for path in files if path.is_file()]
+
+    def _as_object(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
+        outcome = self.outcome
+        artifacts = outcome.artifacts if outcome else {}
+        return {
+            "out": str(self._out),
+            "exit_code": exit_code(error),
+            "error": None if error is None else {"message": str(error), "hint": getattr(error, "hint", "")},
+            "seconds": round(seconds, 3),
+            "stages": [
+                {
+                    "name": name,
+                    "state": "ran" if outcome and name in outcome.ran else "reused",
+                    "seconds": artifact.manifest["seconds"],
+                    "summary": artifact.summary,
+                }
+                for name, artifact in artifacts.items()
+            ],
+            "failed": outcome.failed if outcome else "",
+            "outputs": [str(path) for path in self._files(outcome)] if outcome else [],
+        }
+
+
+def _headline(outcome: Outcome) -> dict[str, Any]:
+    """The figures that people ask for first."""
+    merged: dict[str, Any] = {}
+    for artifact in outcome.artifacts.values():
+        merged.update(artifact.summary)
+    wanted = ("photos", "registered", "points3d", "gaussians", "psnr", "ssim")
+    return {name: merged[name] for name in wanted if merged.get(name) is not None}
+
+
+def print_json(value: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(value) + "\n")
+    sys.stdout.flush()
+
+
+def exit_code(error: BaseException | None) -> int:
+    if error is None:
+        return 0
+    if isinstance(error, SplatpipeError | Stopped):
+        return error.exit_code
+    return EXIT_MACHINE if isinstance(error, OSError) else EXIT_STAGE
+
+
+def for_the_user(error: Exception) -> SplatpipeError:
+    if isinstance(error, SplatpipeError):
+        return error
+    if isinstance(error, OSError):
+        return MachineError(str(error), "Check the free space and the permissions.")
+    with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:
+        traceback.print_exception(error, file=file)
+    return StageError(f"A fault of splatpipe: {type(error).__name__}: {error}", f"Please report it with {file.name}")

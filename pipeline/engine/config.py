@@ -1,0 +1,185 @@
+"""Configuration: defaults < preset < file < ``--set``; what the answer depends on, checked before anything runs."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TypeVar
+
+import tomli_w
+from pydantic import BaseModel, ValidationError
+
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.stage import JSON
+
+Table = dict[str, JSON]
+Model = TypeVar("Model", bound=BaseModel)
+MAX_CONFIG_BYTES = 1 << 20  # a configuration is a page of text
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that ship with the package."""
+    folder = resources.files("splatpipe.configs")
+    return sorted(entry.name[: -len(".toml")] for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_preset(name: str) -> Table:
+    """Read a preset.
+
+    Raises:
+        UsageError: if there is no preset of that name.
+    """
+    if name not in preset_names():
+        raise UsageError(f'There is no preset "{name}".', hint=f"Choose one of: {', '.join(preset_names())}.")
+    return tomllib.loads((resources.files("splatpipe.configs") / f"{name}.toml").read_text(encoding="utf-8"))
+
+
+def load_file(path: Path) -> Table:
+    """Read a TOML file.
+
+    Raises:
+        UsageError: if it cannot be read or is not TOML; the message has the line.
+    """
+    try:
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise UsageError(f"{path} is too large to be a configuration file.", hint="Give a TOML file with --config.")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(
+            f"Cannot read {path}: {error.strerror}.", hint="Check the path given with --config."
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(
+            f"{path} is not valid TOML: {error}.",
+            hint='Write it like: [train] and below it "iterations = 7000".',
+        ) from error
+
+
+def known(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
+    """What of a table the model has: another version's OUT may name options that are gone."""
+    result: Table = {}
+    for name, value in table.items():
+        if name in model.model_fields:
+            section = model.model_fields[name].annotation
+            nested = isinstance(section, type) and issubclass(section, BaseModel) and isinstance(value, Mapping)
+            result[name] = known(section, value) if nested else value  # type: ignore[arg-type]
+    return result
+
+
+def parse_set(assignment: str, model: type[BaseModel]) -> Table:
+    """Turn ``train.iterations=7000`` into ``{"train": {"iterations": 7000}}``.
+
+    Args:
+        assignment: What stands after ``--set``; text options take it as it is, others as a TOML value.
+        model: The configuration that it is for.
+
+    Raises:
+        UsageError: if there is no ``=`` or no section.
+    """
+    dotted, equals, raw = assignment.partition("=")
+    keys = dotted.strip().split(".")
+    if not equals or len(keys) < 2 or not all(keys):
+        raise UsageError(
+            f'Cannot understand --set "{assignment}".',
+            hint="Write it as --set SECTION.OPTION=VALUE, e.g. train.iterations=7000.",
+        )
+    table: JSON = raw.strip() if _takes_text(model, keys) else _parse_value(raw.strip())
+    for key in reversed(keys):
+        table = {key: table}
+    result: Table = table
+    return result
+
+
+def _takes_text(model: type[BaseModel], keys: Sequence[str]) -> bool:
+    annotation: JSON = model
+    for key in keys:
+        fields = getattr(annotation, "model_fields", {})
+        annotation = fields[key].annotation if key in fields else None
+    return annotation is str
+
+
+def _parse_value(raw: str) -> JSON:
+    try:
+        return tomllib.loads(f"value = {raw}")["value"]
+    except (tomllib.TOMLDecodeError, RecursionError, KeyError):
+        return raw
+
+
+def merge(layers: Iterable[Mapping[str, JSON]]) -> Table:
+    """Overlay tables, later ones winning, sections merged key by key."""
+    result: Table = {}
+    for layer in layers:
+        for key, value in layer.items():
+            below = result.get(key)
+            result[key] = merge([below, value]) if isinstance(below, dict) and isinstance(value, Mapping) else value
+    return result
+
+
+def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
+    """Check merged tables against the configuration model.
+
+    Raises:
+        UsageError: names every wrong key and value, with the nearest known name.
+    """
+    try:
+        return model.model_validate(merge(layers))
+    except ValidationError as error:
+        problems = [
+            _describe(model, problem["loc"], problem["type"], problem["msg"], problem["input"])
+            for problem in error.errors()
+        ]
+        raise UsageError(" ".join(problems), hint="`splatpipe options` lists every option with its default.") from error
+
+
+def _describe(model: type[BaseModel], location: tuple[int | str, ...], kind: str, message: str, value: JSON) -> str:
+    dotted = ".".join(str(key) for key in location)
+    if kind == "extra_forbidden":
+        close = difflib.get_close_matches(dotted, list(option_names(model)), n=1, cutoff=0.5)
+        return f"There is no option {dotted}." + (f" Did you mean {close[0]}?" if close else "")
+    return f"{dotted} = {value!r}: {message[0].lower()}{message[1:]}."
+
+
+def option_names(model: type[BaseModel], prefix: str = "") -> Iterable[str]:
+    """Dotted names of every option, and of the sections."""
+    for name, info in model.model_fields.items():
+        yield prefix + name
+        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
+            yield from option_names(info.annotation, f"{prefix}{name}.")
+
+
+def option_help(model: type[BaseModel]) -> Iterable[tuple[str, str]]:
+    """Dotted name and help text of every option."""
+    for name, info in model.model_fields.items():
+        section = info.annotation
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            for option, field in section.model_fields.items():
+                yield f"{name}.{option}", " ".join((field.description or "").split())
+
+
+def with_seed(model: type[BaseModel], seed: int) -> Table:
+    """The table that gives every section with a ``seed`` this one."""
+    return {
+        name: {"seed": seed}
+        for name, info in model.model_fields.items()
+        if isinstance(info.annotation, type) and "seed" in getattr(info.annotation, "model_fields", {})
+    }
+
+
+def lookup(config: BaseModel, dotted: str) -> JSON:
+    """The value of ``section.option``."""
+    section, _, option = dotted.partition(".")
+    return getattr(getattr(config, section), option)
+
+
+def dump(table: Mapping[str, JSON]) -> str:
+    """A table as TOML; options that are None are left out, since None is what leaving out means."""
+
+    def without_none(value: JSON) -> JSON:
+        if isinstance(value, Mapping):
+            return {key: without_none(item) for key, item in value.items() if item is not None}
+        return value
+
+    return tomli_w.dumps(without_none(table))

@@ -1,0 +1,138 @@
+"""Content digests: of a file, of a folder, of the user's photos (hashed once, then remembered)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import JSON
+
+BLOCK_BYTES = 1 << 20
+UNREADABLE = "unreadable"  # stands for the digest of a file that ingest will leave out with the reason
+MAX_SOURCE_FILES = 1_000_000  # a folder with more is somebody's home, not a capture
+
+
+def canonical(value: JSON) -> bytes:
+    """JSON with sorted keys and no blanks: the same bytes for the same value."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def digest(value: JSON) -> str:
+    """sha256 (hex) of a JSON value's canonical form."""
+    return hashlib.sha256(canonical(value)).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """sha256 (hex) of a file's bytes."""
+    sha = hashlib.sha256()
+    with path.open("rb", buffering=0) as file:
+        while block := file.read(BLOCK_BYTES):
+            sha.update(block)
+    return sha.hexdigest()
+
+
+def walk_files(root: Path) -> Iterator[Path]:
+    """Every regular file below ``root`` in sorted order; hidden names and symlinked folders are passed over."""
+    for folder, folders, files in os.walk(root):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(files):
+            path = Path(folder) / name
+            if not name.startswith(".") and path.is_file():
+                yield path
+
+
+@dataclass(frozen=True)
+class FileEntry:
+    """A file below an artifact: its POSIX path relative to it, size in bytes, sha256."""
+
+    path: str
+    size: int
+    sha256: str
+
+
+def tree_entries(path: Path, relative_to: Path) -> list[FileEntry]:
+    """Entries of a file, or of every file below a folder, sorted by path; dangling links are an error of ours."""
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    return [
+        FileEntry(file.relative_to(relative_to).as_posix(), file.stat().st_size, file_digest(file)) for file in files
+    ]
+
+
+def part_digest(entries: Iterable[FileEntry], root: str) -> str:
+    """Digest of a part: independent of where it lies, so that equal content has equal digests.
+
+    Args:
+        entries: Its files, paths relative to the artifact.
+        root: The part's own path relative to the artifact.
+    """
+    return digest(sorted([entry.path.removeprefix(root).lstrip("/"), entry.sha256] for entry in entries))
+
+
+def _digest_or_unreadable(path: Path) -> str:
+    try:
+        return file_digest(path)
+    except OSError:
+        return UNREADABLE
+
+
+class HashTable:
+    """Remembers the sha256 of files by path, size, mtime and inode, so that gigabytes are read once.
+
+    Args:
+        path: Where the table is kept (JSON); a broken one is started anew.
+        remember: Keep what is learnt; only the holder of the lock may.
+    """
+
+    def __init__(self, path: Path, *, remember: bool) -> None:
+        self._path = path
+        self._remember = remember
+        self._known: dict[str, list[JSON]] = {}
+        try:
+            table = json.loads(path.read_text(encoding="utf-8"))
+            self._known = {str(key): list(value) for key, value in table.items() if len(value) == 4}
+        except (OSError, ValueError, AttributeError, TypeError):
+            pass  # no table or a broken one costs one more reading of the photos, nothing else
+
+    def digest_of(
+        self, files: Mapping[str, Path], threads: int, progress: Callable[[int, int], None] | None = None
+    ) -> str:
+        """Digest of named files.
+
+        Args:
+            files: Name to path; the names are part of the digest, the paths are not.
+            threads: Files read at once.
+            progress: Called with (done, total) files that had to be read.
+        """
+        wanted: dict[str, list[JSON]] = {}
+        unread: list[str] = []
+        for name, path in files.items():
+            try:
+                status = path.stat()
+                wanted[name] = [status.st_size, status.st_mtime_ns, status.st_ino]
+            except OSError:
+                wanted[name] = [-1, -1, -1]
+            known = self._known.get(str(path))
+            if known is None or known[:3] != wanted[name]:
+                unread.append(name)
+        with ThreadPoolExecutor(max(1, threads)) as pool:
+            for done, (name, sha) in enumerate(
+                zip(unread, pool.map(lambda name: _digest_or_unreadable(files[name]), unread), strict=True), start=1
+            ):
+                self._known[str(files[name])] = [*wanted[name], sha]
+                if progress:
+                    progress(done, len(unread))
+        found = digest(sorted([name, self._known[str(path)][3]] for name, path in files.items()))
+        if unread and self._remember:
+            self._known = {path: known for path, known in self._known.items() if known[3] != UNREADABLE}
+            self._save()
+        return found
+
+    def _save(self) -> None:
+        temporary = self._path.with_name(f"{self._path.name}.{os.getpid()}.new")
+        temporary.write_text(json.dumps(self._known), encoding="utf-8")
+        temporary.replace(self._path)

@@ -1,0 +1,58 @@
+"""What can go wrong, said once: every error carries what to do about it and the exit code it leads to."""
+
+EXIT_INPUT = 1
+EXIT_USAGE = 2
+EXIT_STAGE = 3
+EXIT_MACHINE = 4
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+
+class SplatpipeError(Exception):
+    """The input cannot be read or reconstructed.
+
+    Args:
+        message: One sentence for the user: what is wrong, naming the file or option.
+        hint: What to do about it; empty where nothing helps.
+    """
+
+    exit_code = EXIT_INPUT
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+
+class UsageError(SplatpipeError):
+    """The command, an option or a configuration file is wrong."""
+
+    exit_code = EXIT_USAGE
+
+
+class StageError(SplatpipeError):
+    """A stage failed for a reason that is not the input's: a crash, a fault of ours."""
+
+    exit_code = EXIT_STAGE
+
+
+class MachineError(SplatpipeError):
+    """This machine lacks something: space, permission, memory, a device."""
+
+    exit_code = EXIT_MACHINE
+
+
+ERRORS = {error.__name__: error for error in (SplatpipeError, UsageError, StageError, MachineError)}
+
+
+class Stopped(BaseException):
+    """Ctrl-C, SIGTERM or SIGHUP. Not an Exception, so that nothing mistakes it for a failure.
+
+    Args:
+        exit_code: What the program ends with.
+    """
+
+    def __init__(self, exit_code: int) -> None:
+        super().__init__("Stopped.")
+        self.exit_code = exit_code
+        self.hint = "What was finished is kept: run the same command again to go on."

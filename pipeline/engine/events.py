@@ -1,0 +1,91 @@
+"""The one kind of event that a run tells of itself; the console, the report and a batch driver all read these."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from splatpipe.pipeline.engine.stage import JSON
+
+Kind = Literal[
+    "run_started",
+    "stage_started",
+    "stage_reused",
+    "stage_finished",
+    "stage_failed",
+    "progress",
+    "metric",
+    "warning",
+    "run_finished",
+]
+
+PROGRESS_INTERVAL_S = 0.1  # a console redraws ten times a second at most
+LOGGED_PROGRESS_INTERVAL_S = 2.0  # events.jsonl is for reading afterwards: it needs no more than a curve
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened.
+
+    Attributes:
+        kind: What happened.
+        stage: The stage it happened in, or empty.
+        data: The details, JSON values. ``progress``: done, total, what, unit. ``metric``: name, value, step.
+            ``warning``: message, hint. ``stage_started``: reason. ``stage_finished``: seconds, summary.
+        time_s: Seconds since the epoch.
+    """
+
+    kind: Kind
+    stage: str = ""
+    data: Mapping[str, JSON] = field(default_factory=dict)
+    time_s: float = field(default_factory=time.time)
+
+
+Sink = Callable[[Event], None]
+
+
+class EventReporter:
+    """The Reporter that stage bodies are given: makes events of its calls and thins out the progress."""
+
+    def __init__(self, stage: str, sink: Sink) -> None:
+        self._stage = stage
+        self._sink = sink
+        self._last_progress_s = 0.0
+
+    def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
+        now = time.monotonic()
+        if now - self._last_progress_s < PROGRESS_INTERVAL_S and done < total:
+            return
+        self._last_progress_s = now
+        self._send("progress", {"done": done, "total": total, "what": what, "unit": unit})
+
+    def metric(self, name: str, value: int | float, step: int | None = None) -> None:
+        self._send("metric", {"name": name, "value": value, "step": step})
+
+    def warning(self, message: str, hint: str = "") -> None:
+        self._send("warning", {"message": message, "hint": hint})
+
+    def _send(self, kind: Kind, data: Mapping[str, JSON]) -> None:
+        self._sink(Event(kind, self._stage, data))
+
+
+class EventLog:
+    """Appends events to ``events.jsonl``, one JSON object a line, progress thinned out."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("a", encoding="utf-8", buffering=1)
+        self._last_progress_s = 0.0
+
+    def __call__(self, event: Event) -> None:
+        if event.kind == "progress":
+            if event.time_s - self._last_progress_s < LOGGED_PROGRESS_INTERVAL_S:
+                return
+            self._last_progress_s = event.time_s
+        self._file.write(json.dumps(asdict(event)) + "\n")
+
+    def close(self) -> None:
+        self._file.close()

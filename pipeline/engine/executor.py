@@ -1,0 +1,147 @@
+"""Runs tasks in a worker process: starts it, passes its events on, ends it, and explains its death."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, StageError, Stopped
+from splatpipe.pipeline.engine.events import Event, Sink
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.worker import Task
+
+GRACE_S = 3.0  # a training writes its checkpoint in less; Ctrl-C promises an end within five seconds
+
+
+class Executor:
+    """A worker process, started for the first task and kept for the next ones.
+
+    Args:
+        log: File that takes what libraries print.
+        lock: The OUT's lock, inherited so that it lasts as long as the worker writes.
+        environment: Variables for the worker besides our own (threads of the numeric libraries).
+    """
+
+    def __init__(self, log: Path, lock: int, environment: Mapping[str, str]) -> None:
+        self._log = log
+        self._lock = lock
+        self._environment = {**os.environ, **environment}
+        self._process: subprocess.Popen[str] | None = None
+
+    def run(self, task: Task, sink: Sink) -> dict[str, JSON]:
+        """Run one task to its end.
+
+        Args:
+            task: The stage to run.
+            sink: Takes its events.
+
+        Returns:
+            ``summary``, ``seconds``, ``cpu_seconds``, ``peak_memory_bytes``.
+
+        Raises:
+            SplatpipeError: what the body raised, or how the worker died.
+        """
+        process = self._started()
+        assert process.stdin is not None and process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):  # a worker dead at birth is explained below
+            process.stdin.write(json.dumps({"task": asdict(task)}) + "\n")
+            process.stdin.flush()
+        for line in process.stdout:
+            if not line.endswith("\n"):
+                break  # it died in the middle of a message
+            message = json.loads(line)
+            if "event" in message:
+                sink(Event(**message["event"]))
+            elif "done" in message:
+                result: dict[str, JSON] = message["done"]
+                return result
+            else:
+                self._raise(message["failed"])
+        code = process.wait()
+        self._process = None
+        _close(process)
+        raise StageError(
+            f"The stage {task.stage} died{_cause(code)}.",
+            hint=f"{_remedy(code)} The log ends with what it said: {self._log}",
+        )
+
+    def stop(self) -> None:
+        """End the worker: politely, then within ``GRACE_S`` for certain."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        try:
+            process.terminate()
+            process.wait(GRACE_S)
+        except BaseException as error:
+            process.kill()
+            process.wait()
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+        finally:
+            _close(process)
+
+    def close(self) -> None:
+        """Let an idle worker go."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write('{"exit": true}\n')
+            process.stdin.flush()
+        try:
+            process.wait(GRACE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        _close(process)
+
+    def _started(self) -> subprocess.Popen[str]:
+        if self._process is None:
+            with self._log.open("a", encoding="utf-8") as log:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=log,
+                    text=True,
+                    encoding="utf-8",
+                    env=self._environment,
+                    pass_fds=(self._lock,),
+                )
+        return self._process
+
+    def _raise(self, failure: Mapping[str, str]) -> None:
+        if failure["type"] == "KeyboardInterrupt":
+            raise Stopped(EXIT_TERMINATED)  # somebody ended the worker alone
+        raise ERRORS[failure["type"]](failure["message"], failure["hint"])
+
+
+def _close(process: subprocess.Popen[str]) -> None:
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with contextlib.suppress(BrokenPipeError):
+                pipe.close()
+
+
+def _cause(code: int) -> str:
+    if code >= 0:
+        return f" (exit code {code})"
+    try:
+        return f" of {signal.Signals(-code).name}"
+    except ValueError:
+        return f" of signal {-code}"
+
+
+def _remedy(code: int) -> str:
+    if code == -signal.SIGKILL:
+        return "The system may have run out of memory: close other programs, or choose a smaller preset."
+    return "What was finished is kept; run again, and if it dies again, please report it."

@@ -1,0 +1,133 @@
+"""A run on an OUT: opens the source, the store, the lock, the log and the worker, and closes them whatever happens."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from splatpipe.pipeline.engine.config import Table, dump, load_file
+from splatpipe.pipeline.engine.digests import HashTable
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
+from splatpipe.pipeline.engine.executor import Executor
+from splatpipe.pipeline.engine.runner import Line, Runner
+from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.engine.stage import Machine, Stage
+from splatpipe.pipeline.engine.store import Part, Store, locked, open_store, write_synced
+
+CONFIG_FILE = "config.toml"
+LOG_FILE = "splatpipe.log"
+EVENTS_FILE = "events.jsonl"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to run.
+
+    Attributes:
+        stages: The line.
+        config: Its resolved configuration.
+        photos: The user's folder.
+        out: Where the results go.
+        machine: Device and threads.
+    """
+
+    stages: Sequence[Stage]
+    config: BaseModel
+    photos: Path
+    out: Path
+    machine: Machine
+
+
+@contextmanager
+def open_session(request: Request, show: Sink) -> Iterator[Runner]:
+    """Everything that a run needs, held for its length.
+
+    Args:
+        request: What to run.
+        show: Shows events to the user.
+
+    Yields:
+        The runner.
+
+    Raises:
+        SplatpipeError: if the photos or OUT cannot be used.
+    """
+    source = open_source(request.photos, request.out)
+    store = open_store(request.out, create=True)
+    with locked(store) as lock:
+        log = EventLog(store.out / EVENTS_FILE)
+        executor = Executor(store.out / LOG_FILE, lock, _worker_environment(request.machine.threads))
+        try:
+
+            def sink(event: Event) -> None:
+                log(event)
+                show(event)
+
+            line = _open_line(request, store, EventReporter("source", sink), remember=True)
+            yield Runner(line, store, executor, request.machine, sink, partial(_save_config, store, source.folder))
+        except BaseException:
+            executor.stop()
+            raise
+        else:
+            executor.close()
+        finally:
+            log.close()
+
+
+def survey_line(request: Request) -> tuple[Line, Store]:
+    """The line and the store of an existing OUT, for looking and not for running."""
+    store = open_store(request.out, create=False)
+    return _open_line(request, store, EventReporter("source", _unheard), remember=False), store
+
+
+def _unheard(_event: Event) -> None:
+    """The sink of a look that nobody waits for."""
+
+
+def _open_line(request: Request, store: Store, report: EventReporter, *, remember: bool) -> Line:
+    source = open_source(request.photos, request.out)
+    table = HashTable(store.stages / "photos-index.json", remember=remember)
+    digests = source.digests(table, request.machine.threads, report)
+    parts = {name: Part(source.part_path(name), value) for name, value in digests.items()}
+    return Line(request.stages, request.config, parts, source.folder)
+
+
+def _worker_environment(threads: int) -> dict[str, str]:
+    """What libraries read at import: the size of their pools, which shall sleep and not spin; the order of sets."""
+    return {
+        "OMP_NUM_THREADS": str(threads),
+        "MKL_NUM_THREADS": str(threads),
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "PYTHONHASHSEED": "0",
+    }
+
+
+def _save_config(store: Store, photos: Path, config: BaseModel) -> None:
+    head = {"photos": os.fsdecode(photos), "splatpipe": importlib.metadata.version("splatpipe")}
+    write_synced(store.out / CONFIG_FILE, dump({**head, **config.model_dump(mode="json")}))
+
+
+def load_run(out: Path) -> tuple[Path, Table]:
+    """The photos' folder and the configuration that a run left in OUT.
+
+    Raises:
+        UsageError: if OUT holds no run.
+    """
+    open_store(out, create=False)
+    try:
+        table = load_file(out / CONFIG_FILE)
+    except UsageError as error:
+        raise UsageError(error.message, hint=f"Run again: splatpipe run PHOTOS {out}") from error
+    photos = table.pop("photos", None)
+    table.pop("splatpipe", None)
+    if not isinstance(photos, str) or not all(isinstance(section, Mapping) for section in table.values()):
+        raise UsageError(f"{out / CONFIG_FILE} is not what a run leaves.", hint="Run again: splatpipe run PHOTOS OUT")
+    return Path(photos), table

@@ -1,0 +1,116 @@
+"""What a stage is: a name, a configuration, the parts it reads and leaves, and a body loaded by string."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from pydantic import BaseModel, ConfigDict
+
+JSON = Any  # a value that json.dumps takes: pydantic's JsonValue costs import time
+Summary = Mapping[str, JSON]
+
+
+class StageConfig(BaseModel):
+    """Base of every stage's configuration: what changes the answer. Unknown keys are refused.
+
+    The docstring under each field is its help text.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False, strict=True
+    )
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What changes only speed; never part of a key.
+
+    Attributes:
+        device: ``auto``, ``cpu`` or ``cuda``.
+        threads: Worker threads, at least 1.
+    """
+
+    device: str = "auto"
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the line.
+
+    Attributes:
+        name: The stage's name; its parts are called ``<name>.<part>``.
+        version: Raised whenever the body's answer changes for the same config and inputs.
+        config: Its configuration model.
+        reads: Names of the parts it reads, e.g. ``ingest.photos``; ``source.photos`` is the user's folder.
+        parts: What it leaves: part name to the file or folder below the stage's own folder.
+        entry: ``module:function`` of the body, a ``Body``.
+        borrows: Settings of other stages that its answer depends on, e.g. ``evaluate.every``.
+        resumable: Its partial folder is kept after a kill, for the body to go on from.
+        deliverables: Parts that are copied into OUT for people (a folder part: what is in it).
+    """
+
+    name: str
+    version: int
+    config: type[StageConfig]
+    reads: tuple[str, ...]
+    parts: Mapping[str, str]
+    entry: str
+    borrows: tuple[str, ...] = ()
+    resumable: bool = False
+    deliverables: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """All that a body may look at besides its config.
+
+    Attributes:
+        parts: Absolute path of each part that the stage reads.
+        photos_dir: The user's photo folder. Its content is pinned by the digests in ``ingest.photos``.
+        settings: The borrowed settings, by their dotted names.
+        machine: Device and threads.
+        summaries: What the stages before it returned; outside the key, so only for what people read (timings).
+    """
+
+    parts: Mapping[str, Path]
+    photos_dir: Path
+    settings: Mapping[str, JSON] = field(default_factory=dict)
+    machine: Machine = field(default_factory=Machine)
+    summaries: Mapping[str, Summary] = field(default_factory=dict)
+
+    def __getitem__(self, part: str) -> Path:
+        return self.parts[part]
+
+
+@runtime_checkable
+class Reporter(Protocol):
+    """How a body tells what it does. Calls are cheap; the receiver thins them out."""
+
+    def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
+        """``done`` of ``total`` ``unit`` (photos, pairs, iterations); ``what`` is being done, in a few words."""
+
+    def metric(self, name: str, value: int | float, step: int | None = None) -> None:
+        """A figure worth a curve, e.g. ``loss`` at an iteration."""
+
+    def warning(self, message: str, hint: str = "") -> None:
+        """Something the user should know about a result that is right all the same."""
+
+
+# The function behind ``Stage.entry``, as (config, inputs, out, report): writes all of the stage's parts below out.
+Body = Callable[[Any, Inputs, Path, Reporter], Summary]
+
+
+def load_body(entry: str) -> Body:
+    """Import a stage's body.
+
+    Args:
+        entry: ``module:function``.
+    """
+    module, _, function = entry.partition(":")
+    body: Body = getattr(importlib.import_module(module), function)
+    return body

@@ -1,0 +1,367 @@
+"""The artifacts of a run: keys, manifests, the lock, and the commit that makes them appear whole or not at all."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.engine.digests import FileEntry, canonical, digest, part_digest, tree_entries
+from splatpipe.pipeline.engine.errors import MachineError, StageError, UsageError
+from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
+
+FORMAT = 1  # of what lies under OUT; raised when older versions could no longer read it
+KEY_CHARACTERS = 16  # of a folder's name: 64 bits tell the few artifacts of one OUT apart
+LOCK_PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
+MIN_FREE_BYTES = 16 << 20
+
+
+@dataclass(frozen=True)
+class Part:
+    """A named part of an artifact: where it lies, and the digest of its content."""
+
+    path: Path
+    digest: str
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A finished stage: its folder and what its manifest says."""
+
+    folder: Path
+    manifest: Mapping[str, JSON]
+
+    @property
+    def key(self) -> str:
+        return str(self.manifest["key"])
+
+    @property
+    def summary(self) -> Summary:
+        summary: Summary = self.manifest["summary"]
+        return summary
+
+    @property
+    def parts(self) -> dict[str, Part]:
+        """Its parts under their full names."""
+        return {
+            f"{self.manifest['stage']}.{name}": Part(self.folder / part["path"], part["digest"])
+            for name, part in self.manifest["parts"].items()
+        }
+
+
+@dataclass(frozen=True)
+class StageInputs:
+    """What a stage's answer depends on; its digest is the key."""
+
+    stage: str
+    version: int
+    config: Mapping[str, JSON]
+    borrowed: Mapping[str, JSON]
+    reads: Mapping[str, str]
+
+    @property
+    def key(self) -> str:
+        return digest(asdict(self))
+
+
+class Store:
+    """The ``stages/`` folder of an OUT.
+
+    Args:
+        out: The run's folder; made by ``open_store``.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.stages = out / "stages"
+        self.partials = self.stages / ".partial"
+
+    def find(self, stage: Stage, key: str) -> Artifact | None:
+        """The finished artifact of that key, if all of its files are there with their sizes."""
+        artifact = _read_artifact(self.stages / _folder_name(stage.name, key))
+        if artifact is None or artifact.key != key or set(artifact.manifest["parts"]) != set(stage.parts):
+            return None
+        return artifact
+
+    def artifacts(self, stage: str) -> list[Artifact]:
+        """All finished artifacts of a stage, the newest first."""
+        found = [_read_artifact(folder) for folder in self.stages.glob(f"{stage}-*")]
+        whole = [artifact for artifact in found if artifact is not None]
+        return sorted(whole, key=lambda artifact: float(artifact.manifest["finished_s"]), reverse=True)
+
+    def begin(self, stage: Stage, key: str) -> Path:
+        """An empty folder for a stage to work in; a resumable stage gets back what a killed run left."""
+        folder = self.partials / _folder_name(stage.name, key)
+        if folder.exists() and not stage.resumable:
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def commit(
+        self, stage: Stage, inputs: StageInputs, partial: Path, summary: Summary, run: Mapping[str, JSON]
+    ) -> Artifact:
+        """Make what lies in ``partial`` the stage's artifact: manifest last, all synced, then one rename.
+
+        Args:
+            stage: The stage that ran.
+            inputs: What it depended on.
+            partial: Its working folder; what belongs to no part is dropped.
+            summary: What the body returned.
+            run: Versions, machine, timings: what does not belong to the key.
+
+        Raises:
+            StageError: if the body did not leave one of its parts.
+        """
+        parts: dict[str, dict[str, JSON]] = {}
+        for name, relative in stage.parts.items():
+            if not (partial / relative).exists():
+                raise StageError(
+                    f"The stage {stage.name} left no {relative}.",
+                    hint="This is a fault of splatpipe; please report it.",
+                )
+            entries = tree_entries(partial / relative, partial)
+            parts[name] = {
+                "path": relative,
+                "digest": part_digest(entries, relative),
+                "files": [asdict(entry) for entry in entries],
+            }
+        manifest = {
+            "format": FORMAT,
+            "stage": stage.name,
+            "key": inputs.key,
+            "inputs": asdict(inputs),
+            "parts": parts,
+            "summary": summary,
+            "finished_s": time.time(),
+            **run,
+        }
+        _sync_tree(partial)
+        write_synced(partial / "manifest.json", json.dumps(manifest, indent=1))
+        _drop_strays(partial, {"manifest.json", *(entry["path"] for part in parts.values() for entry in part["files"])})
+        return self._publish(partial)
+
+    def _publish(self, partial: Path) -> Artifact:
+        final = self.stages / partial.name
+        if final.exists():
+            replaced = self.partials / f"replaced-{partial.name}"
+            shutil.rmtree(replaced, ignore_errors=True)
+            final.rename(replaced)
+            partial.rename(final)
+            shutil.rmtree(replaced)
+        else:
+            partial.rename(final)
+        _sync_folder(self.stages)
+        artifact = _read_artifact(final)
+        if artifact is None:
+            raise StageError(
+                f"{final.name} changed while it was being written.",
+                hint="Is something else writing into OUT?",
+            )
+        return artifact
+
+    def recover(self) -> None:
+        """Finish the rename that a killed run had begun, and drop what it had replaced."""
+        for partial in sorted(self.partials.glob("*")):
+            if partial.name.startswith("replaced-"):
+                shutil.rmtree(partial, ignore_errors=True)
+            elif (partial / "manifest.json").is_file():
+                if _read_artifact(partial) is not None:
+                    self._publish(partial)
+                else:
+                    shutil.rmtree(partial, ignore_errors=True)
+
+    def remove_stale(self, keep: Iterable[tuple[str, str]]) -> tuple[int, int]:
+        """Remove artifacts and unfinished work that nothing asks for any more.
+
+        Args:
+            keep: Stage name and key of what is wanted.
+
+        Returns:
+            How many folders were removed, and how many bytes that freed.
+        """
+        names = {_folder_name(stage, key) for stage, key in keep}
+        folders = [path for path in [*self.stages.glob("*-*"), *self.partials.glob("*-*")] if path.is_dir()]
+        stale = [folder for folder in folders if folder.name not in names]
+        freed = sum(file.stat().st_size for folder in stale for file in folder.rglob("*") if file.is_file())
+        for folder in stale:
+            shutil.rmtree(folder)
+        return len(stale), freed
+
+    def deliver(self, artifact: Artifact, stage: Stage) -> list[Path]:
+        """Copy an artifact's deliverables into OUT, each replaced in one step; unchanged ones are left alone."""
+        delivered = []
+        for name in stage.deliverables:
+            root = artifact.folder / stage.parts[name]
+            files = [root] if root.is_file() else [path for path in sorted(root.rglob("*")) if path.is_file()]
+            for file in files:
+                target = self.out / (file.name if file == root else file.relative_to(root))
+                _copy_if_changed(file, target)
+                delivered.append(target)
+        return delivered
+
+
+def _copy_if_changed(source: Path, target: Path) -> None:
+    before = source.stat()
+    if target.is_file() and (target.stat().st_size, target.stat().st_mtime_ns) == (
+        before.st_size,
+        before.st_mtime_ns,
+    ):
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.new")
+    shutil.copy2(source, temporary)
+    temporary.replace(target)
+
+
+def _folder_name(stage: str, key: str) -> str:
+    return f"{stage}-{key[:KEY_CHARACTERS]}"
+
+
+def _read_artifact(folder: Path) -> Artifact | None:
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        if manifest["format"] != FORMAT:
+            return None
+        entries = [FileEntry(**entry) for part in manifest["parts"].values() for entry in part["files"]]
+        whole = all((folder / entry.path).stat().st_size == entry.size for entry in entries)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return Artifact(folder, manifest) if whole else None
+
+
+def _drop_strays(folder: Path, keep: set[str]) -> None:
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_dir() and not path.is_symlink():
+            if not any(path.iterdir()):
+                path.rmdir()
+        elif path.relative_to(folder).as_posix() not in keep:
+            path.unlink()
+
+
+def _sync_tree(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        if path.is_dir():
+            _sync_folder(path)
+        else:
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+    _sync_folder(folder)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_synced(path: Path, text: str) -> None:
+    """Write a file so that it is there whole or not at all, even after a power cut."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    _sync_folder(path.parent)
+
+
+def open_store(out: Path, *, create: bool) -> Store:
+    """Check an OUT and make its folders.
+
+    Args:
+        out: The run's folder.
+        create: Make it if it is not there; otherwise a missing one is an error.
+
+    Raises:
+        UsageError: if it is a file, is not a run's folder, or was made by a version with another layout.
+        MachineError: if it cannot be written.
+    """
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is made if it is not there.")
+    above = next((parent for parent in out.parents if parent.exists() and not parent.is_dir()), None)
+    if above is not None:
+        raise UsageError(f"{above} is a file.", hint=f"{out} cannot be in it; name another folder for the results.")
+    if not create and not (out / "stages").is_dir():
+        raise UsageError(f"{out} holds no run.", hint=f"Begin with: splatpipe run PHOTOS {out}")
+    _check_format(out)
+    store = Store(out)
+    if create and not store.stages.exists():
+        taken = [name for name in ("splat.ply", "config.toml", "metrics.json", "cameras.json") if (out / name).exists()]
+        if taken:
+            raise UsageError(
+                f"{out} has files of something else ({', '.join(taken)}).",
+                hint="Choose an empty or a new folder.",
+            )
+    if not create:
+        return store
+    try:
+        store.partials.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=store.partials) as probe:
+            probe.write(canonical(FORMAT))
+    except OSError as error:
+        raise MachineError(
+            f"Cannot write to {out}: {error.strerror}.",
+            hint="Check its permissions and the free space, or choose another OUT.",
+        ) from error
+    format_file = store.stages / "format.json"
+    if not format_file.exists():
+        write_synced(format_file, json.dumps({"format": FORMAT}))
+    return store
+
+
+def _check_format(out: Path) -> None:
+    try:
+        found = json.loads((out / "stages" / "format.json").read_text(encoding="utf-8"))["format"]
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(
+            f"{out / 'stages' / 'format.json'} is damaged.",
+            hint="If this version made it, delete that file and run again: what is whole is reused.",
+        ) from error
+    if found != FORMAT:
+        raise UsageError(
+            f"{out} was made by a version of splatpipe with another layout ({found}; this one has {FORMAT}).",
+            hint="Choose another OUT, or use the version that made it. Nothing in it was touched.",
+        )
+
+
+@contextmanager
+def locked(store: Store) -> Iterator[int]:
+    """Hold the OUT for writing.
+
+    Yields:
+        The lock's file descriptor, for the worker to inherit: the lock lasts as long as either lives.
+
+    Raises:
+        UsageError: if another process works in it.
+    """
+    descriptor = os.open(store.stages / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        deadline = time.monotonic() + LOCK_PATIENCE_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    holder = os.pread(descriptor, 64, 0).decode(errors="replace").strip() or "unknown"
+                    raise UsageError(
+                        f"Another splatpipe (process {holder}) is working in {store.out}.",
+                        hint="Wait for it to end, or choose another OUT.",
+                    ) from None
+                time.sleep(0.1)
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        yield descriptor
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,220 @@
+"""The child process in which stage bodies run, so that a crash in somebody's C++ is a failed stage and no more.
+
+One worker runs the stages of a line one after the other (torch is imported once). Requests come in on stdin and events
+go out on what was stdout, a JSON object a line; whatever libraries print goes to the log. The worker dies with its
+parent, whatever kills that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import IO
+
+from splatpipe.pipeline.engine.errors import ERRORS, MachineError, SplatpipeError, StageError
+from splatpipe.pipeline.engine.events import Event, EventReporter
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, StageConfig, load_body
+
+PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
+
+
+@dataclass(frozen=True)
+class Task:
+    """One stage to run, as plain JSON, so that any process that sees the same files can run it.
+
+    Attributes:
+        stage: Its name.
+        entry: ``module:function`` of its body.
+        config_type: ``module:class`` of its configuration model.
+        config: The configuration's values.
+        parts: Path of each part that it reads.
+        photos_dir: The user's folder.
+        settings: Borrowed settings.
+        summaries: Summaries of the stages before it.
+        machine: Device and threads.
+        out: Where it writes.
+    """
+
+    stage: str
+    entry: str
+    config_type: str
+    config: dict[str, JSON]
+    parts: dict[str, str]
+    photos_dir: str
+    settings: dict[str, JSON]
+    summaries: dict[str, JSON]
+    machine: dict[str, JSON]
+    out: str
+
+    def inputs(self) -> Inputs:
+        """What the body is given."""
+        return Inputs(
+            {name: Path(path) for name, path in self.parts.items()},
+            Path(self.photos_dir),
+            self.settings,
+            Machine(**self.machine),
+            self.summaries,
+        )
+
+
+def execute(task: Task, send: IO[str]) -> None:
+    """Run a task's body here and send its events and its end.
+
+    Args:
+        task: What to run.
+        send: Takes JSON lines: ``{"event": …}``, then ``{"done": …}`` or ``{"failed": …}``.
+    """
+
+    lock = threading.Lock()
+
+    def tell(message: JSON) -> None:
+        with lock:
+            send.write(json.dumps(message) + "\n")
+            send.flush()
+
+    def sink(event: Event) -> None:
+        tell({"event": asdict(event)})
+
+    started = _Usage.now()
+    try:
+        module, _, name = task.config_type.partition(":")
+        config_type: type[StageConfig] = getattr(__import__(module, fromlist=[name]), name)
+        config = config_type.model_validate(task.config)
+        body = load_body(task.entry)
+        _listen()  # again: pycolmap's import puts its own handlers in place of ours
+        summary = body(config, task.inputs(), Path(task.out), EventReporter(task.stage, sink))
+    except KeyboardInterrupt:
+        tell({"failed": {"type": "KeyboardInterrupt"}})
+    except BaseException as error:
+        traceback.print_exc(file=sys.stderr)
+        sys.stderr.flush()
+        failure = as_splatpipe_error(task.stage, error)
+        tell({"failed": {"type": type(failure).__name__, "message": failure.message, "hint": failure.hint}})
+    else:
+        tell({"done": {"summary": dict(summary), **started.until_now()}})
+
+
+def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
+    """The message for the user behind any exception of a stage's body."""
+    if isinstance(error, SplatpipeError):
+        # A stage may raise a subclass of its own; only the known ones cross the process boundary by name.
+        known = next(ERRORS[kind.__name__] for kind in type(error).__mro__ if kind.__name__ in ERRORS)
+        return known(error.message, error.hint)
+    text = str(error).lower()
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        where = f" ({error.filename})" if error.filename else ""
+        return MachineError(
+            f"The stage {stage} could not write: {error.strerror}{where}.",
+            "Make room, then run again: it goes on from here.",
+        )
+    if "disk is full" in text or "no space left" in text:
+        return MachineError(
+            f"The disk ran full in the stage {stage}.", "Make room, then run again: it goes on from here."
+        )
+    if isinstance(error, MemoryError) or "not enough memory" in text or "bad_alloc" in text:
+        return MachineError(
+            f"The stage {stage} ran out of memory.",
+            "Close other programs, or lower undistort.max_megapixels or train.max_gaussians.",
+        )
+    return StageError(
+        f"The stage {stage} failed: {type(error).__name__}: {error}",
+        "The log has the details; please report it.",
+    )
+
+
+@dataclass(frozen=True)
+class _Usage:
+    wall_s: float
+    cpu_s: float
+
+    @staticmethod
+    def now() -> _Usage:
+        with contextlib.suppress(OSError):  # restarts the kernel's record of this process's peak memory
+            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        return _Usage(time.monotonic(), time.process_time())
+
+    def until_now(self) -> dict[str, float | int]:
+        return {
+            "seconds": round(time.monotonic() - self.wall_s, 3),
+            "cpu_seconds": round(time.process_time() - self.cpu_s, 3),
+            "peak_memory_bytes": peak_memory_bytes(),
+        }
+
+
+def peak_memory_bytes() -> int:
+    """Peak resident memory of this process since the stage began (where the kernel says so, else since its start)."""
+    with contextlib.suppress(OSError, StopIteration, ValueError):
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _die_with_parent(parent: int) -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _requests(stream: IO[str]) -> Iterator[Task]:
+    """Tasks from the parent; its end of the pipe closing, unasked, is the parent's death."""
+    ready: list[Task | None] = []
+    arrived = threading.Condition()
+
+    def read() -> None:
+        for line in stream:
+            request = json.loads(line)
+            with arrived:
+                ready.append(Task(**request["task"]) if "task" in request else None)
+                arrived.notify()
+            if "task" not in request:
+                return
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        with arrived:
+            arrived.wait_for(lambda: ready)
+            task = ready.pop(0)
+        if task is None:
+            return
+        yield task
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _listen() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C reaches the parent, which decides
+    signal.signal(signal.SIGTERM, _interrupt)
+
+
+def main() -> None:
+    """Serve the parent named on the command line until it says goodbye."""
+    _die_with_parent(int(sys.argv[1]))
+    _listen()
+    events = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    with contextlib.suppress(KeyboardInterrupt):
+        for task in _requests(sys.stdin):
+            execute(task, events)
+
+
+if __name__ == "__main__":
+    main()

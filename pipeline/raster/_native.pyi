@@ -1,0 +1,93 @@
+"""Native kernels, built from `native/`. Arrays are C-contiguous CPU tensors of the dtype named, never copied."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+def set_threads(threads: int) -> None:
+    """Threads of the one pool that all kernels share, the caller included; clamped to 1..256."""
+
+def threads() -> int: ...
+def isa() -> str:
+    """The instruction set in use."""
+
+def isas() -> list[str]:
+    """Instruction sets that this CPU has and this build knows, best first."""
+
+def set_isa(name: str) -> None:
+    """Use one of `isas()`, or "auto" for the best; for tests and comparisons.
+
+    Raises:
+        ValueError: if this CPU or this build lacks it.
+    """
+
+class TooManyPairs(OverflowError):
+    """The Gaussians cover more tiles of the picture than 32-bit indices hold."""
+
+class Frame:
+    """A render and what its backward pass needs; its memory is reused by later ones."""
+
+    def __init__(self) -> None: ...
+    def forward(
+        self,
+        parameters: Sequence[Tensor],
+        camera: tuple[np.ndarray[Any, Any], tuple[int, int], tuple[float, float, float, float]],
+        options: tuple[int, bool, float, tuple[float, float, float]],
+        outputs: tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor],
+    ) -> None:
+        """Render.
+
+        Args:
+            parameters: means (n, 3), log_scales (n, 3), quats (n, 4), opacity_logits (n,), sh (n, k, 3); float32.
+            camera: cam_from_world (4, 4) float64; width, height; fx, fy, cx, cy in pixels.
+            options: SH degree, antialias, near plane, background.
+            outputs: Written: colour (h, w, 3), alpha (h, w), depth_sum and median_depth (h, w) or both None, radii (n,)
+                float32; visible (n,) uint8.
+
+        Raises:
+            TooManyPairs, MemoryError: if the scene is too much.
+            ValueError: if shapes do not fit.
+        """
+
+    def backward(
+        self,
+        parameters: Sequence[Tensor],
+        gradients: Sequence[Tensor | None],
+        outputs: Sequence[Tensor],
+        means2d: Tensor,
+    ) -> None:
+        """Gradients of the last forward(); can be repeated.
+
+        Args:
+            parameters: Those that were rendered.
+            gradients: dL/d(colour), dL/d(alpha), dL/d(depth_sum); None for zero.
+            outputs: Written: gradients of the parameters, laid out like them.
+            means2d: Written: dL/d(centres on screen), pixels (n, 2).
+        """
+
+    @property
+    def pairs(self) -> int:
+        """Splat-tile pairs of the render."""
+
+def photo_loss(render: Tensor, photo: Tensor, mask: Tensor | None, ssim_weight: float, gradient: Tensor) -> float:
+    """(1 - w) L1 + w (1 - SSIM) of two float32 (h, w, 3) images; its gradient by the render goes to `gradient`.
+
+    `mask` is uint8 (h, w), zero does not count.
+    """
+
+def adam_step(
+    values: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    means: Sequence[Tensor],
+    squares: Sequence[Tensor],
+    rates: Sequence[Tensor],
+    visible: Tensor | None,
+    options: tuple[float, float, float, int],
+) -> int:
+    """One Adam step in place over float32 tensors of the same rows; returns those left out for their gradients.
+
+    `rates` holds the rate of every value of a row; `visible` is uint8 (n,); `options` are beta1, beta2, epsilon and the
+    step, counted from 1.
+    """

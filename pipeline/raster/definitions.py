@@ -1,0 +1,105 @@
+"""What a render is, for every backend: its options, its outputs, and the constants of the rasterizer's definition."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.gaussians import Gaussians
+
+ALPHA_MAX = 0.99
+"""Cap on a pixel's alpha, so that 1 - alpha can be divided by."""
+ALPHA_MIN = 1.0 / 255.0
+"""What contributes less to a pixel (an 8-bit step) is skipped."""
+TRANSMITTANCE_MIN = 1e-4
+"""The Gaussian that would take a pixel's transmittance below this is not blended, and ends the pixel."""
+MEDIAN_TRANSMITTANCE = 0.5
+"""The median depth is that of the Gaussian that takes the transmittance down to this."""
+BLUR_PX2 = 0.3
+"""Added to the variances on screen: no Gaussian is thinner than about a pixel (EWA's low-pass filter)."""
+FRUSTUM_MARGIN = 0.3
+"""The projection's linearisation is held at the frustum plus this share of its half-width: it diverges outside."""
+COMPENSATION_MIN = 2.5e-5
+"""Floor of det(Σ') / det(Σ' + blur) in the anti-aliased variant; its root is the least opacity factor, 0.005."""
+QUAT_EPSILON = 1e-12
+"""Added to a quaternion's squared norm before the root: the zero quaternion is the identity, with zero gradient."""
+RADIUS_SIGMAS = 3.0
+"""`Render.radii` are this many standard deviations along the longer axis on screen, as published."""
+
+# Beyond these a Gaussian is skipped like one with a NaN: nothing sensible lies there, and float32 overflows soon after.
+MAX_SCREEN_PX = 1e7
+MAX_VARIANCE_PX2 = 1e12
+MAX_QUAT_NORM2 = 1e36
+MAX_COLOUR = 1e6
+MAX_DEPTH = 1e9
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How to render.
+
+    Attributes:
+        sh_degree: Degree of the spherical harmonics that count, 0..3; at most what the Gaussians hold.
+        background: Red, green, blue behind everything, 0..1.
+        antialias: Scale opacities by √(det Σ' / det(Σ' + 0.3 I)), floored: a Gaussian keeps its energy when the blur
+            widens it ("Mip-Splatting", Yu et al. 2024, the 2D Mip filter).
+        near: Gaussians nearer than this are skipped, world units along the view axis, > 0.
+        depth: Render depths, too; without, both are zeros and a render takes a fifth less.
+    """
+
+    sh_degree: int
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antialias: bool = False
+    near: float = 0.01
+    depth: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Render:
+    """A rendered view.
+
+    Attributes:
+        colour: Red, green, blue with the background, not clamped at 1.
+        alpha: 1 - the transmittance that is left.
+        depth_sum: Σ z α T, z along the view axis, world units.
+        median_depth: z of the Gaussian that takes T down to 0.5, world units; 0 where none does. No gradient.
+        visible: Gaussians whose ellipse (alpha ≥ 1/255) reaches the picture.
+        radii: Three standard deviations along the longer axis on screen, pixels; 0 where not visible. No gradient.
+    """
+
+    colour: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"]
+    depth_sum: Float[Tensor, "h w"]
+    median_depth: Float[Tensor, "h w"]
+    visible: Bool[Tensor, " n"]
+    radii: Float[Tensor, " n"]
+
+    @property
+    def expected_depth(self) -> Float[Tensor, "h w"]:
+        """Mean depth of what is seen, depth_sum / alpha; 0 where nothing is."""
+        seen = self.alpha > 0.0
+        return torch.where(seen, self.depth_sum / torch.where(seen, self.alpha, 1.0), 0.0)
+
+
+def check(gaussians: Gaussians, camera: Camera, options: RenderOptions, means2d_probe: Tensor | None) -> None:
+    """Refuse what no backend renders.
+
+    Raises:
+        ValueError: if the picture has no pixel or too many, the Gaussians do not hold the SH degree, the near plane or
+            a focal length is not positive and finite, or the probe does not fit the Gaussians.
+    """
+    if not (1 <= camera.width <= 65536 and 1 <= camera.height <= 65536):
+        raise ValueError(f"a picture of {camera.width} × {camera.height} pixels cannot be rendered")
+    if not 0 <= options.sh_degree <= gaussians.sh_degree:
+        raise ValueError(f"SH degree {options.sh_degree} of Gaussians that hold degree {gaussians.sh_degree}")
+    if not (options.near > 0.0 and math.isfinite(options.near)):
+        raise ValueError(f"near plane at {options.near}")
+    if not all(f > 0.0 and math.isfinite(f) for f in (camera.fx, camera.fy)):
+        raise ValueError(f"focal lengths {camera.fx}, {camera.fy}")
+    if means2d_probe is not None and tuple(means2d_probe.shape) != (len(gaussians), 2):
+        raise ValueError(f"means2d_probe is {tuple(means2d_probe.shape)}, not ({len(gaussians)}, 2)")

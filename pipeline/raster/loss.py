@@ -1,0 +1,103 @@
+"""The photometric loss of training, (1 - w) · L1 + w · (1 - mean SSIM), with its gradient by the render."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.scene.metrics import SSIM_WINDOW
+
+MIN_SIDE_PX = SSIM_WINDOW // 2 + 1
+"""The smallest image whose border can be reflected by half a window."""
+
+
+def photo_loss(
+    render: Float[Tensor, "h w 3"],
+    photo: Float[Tensor, "h w 3"],
+    ssim_weight: float = 0.2,
+    mask: Bool[Tensor, "h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """How far a render is from its photo: ``photo_loss_reference``, natively for float32 on the CPU.
+
+    The native one is within 5e-5 of the reference in float64 (the gradient within 2e-4, L2) and gives the same bits for
+    any number of threads.
+
+    Args:
+        render: 0..1; the only argument that gets a gradient.
+        photo: 0..1.
+        ssim_weight: λ of 3D Gaussian splatting, 0..1.
+        mask: True where a pixel counts; None: everywhere. If none counts, the loss and its gradient are zero.
+
+    Returns:
+        A scalar, in the render's dtype.
+
+    Raises:
+        ValueError: if the sizes differ, or a side is under 6 pixels.
+    """
+    _check(render, photo, mask)
+    if render.device.type != "cpu" or render.dtype != torch.float32:
+        return photo_loss_reference(render, photo, ssim_weight, mask)
+    result: Tensor = _PhotoLoss.apply(render, photo, ssim_weight, mask)  # type: ignore[no-untyped-call]
+    return result
+
+
+def photo_loss_reference(
+    render: Float[Tensor, "h w 3"],
+    photo: Float[Tensor, "h w 3"],
+    ssim_weight: float = 0.2,
+    mask: Bool[Tensor, "h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """The loss by its definition: Kerbl et al., 3D Gaussian Splatting (SIGGRAPH 2023), eq. 7, with kornia's SSIM.
+
+    Masked pixels of the render are replaced by the photo's before any window sees them; means are over counting pixels.
+
+    Args, returns and errors as ``photo_loss``, in any dtype and on any device.
+    """
+    from kornia.metrics import ssim  # its import costs most of a second
+
+    _check(render, photo, mask)
+    photo = photo.to(render.dtype)
+    counts = torch.ones(render.shape[:2], dtype=torch.bool, device=render.device) if mask is None else mask
+    seen = torch.where(counts[..., None], render, photo)
+    similarity = ssim(seen.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None], SSIM_WINDOW)[0]  # (3, h, w)
+    number = 3 * max(1, int(counts.sum()))
+    l1 = (seen - photo).abs().sum() / number  # what is masked differs by zero
+    dissimilarity = torch.where(counts, 1.0 - similarity, 0.0).sum() / number
+    return (1.0 - ssim_weight) * l1 + ssim_weight * dissimilarity
+
+
+class _PhotoLoss(torch.autograd.Function):
+    """The gradient comes with the value: both are made in one pass over the images."""
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, photo: Tensor, ssim_weight: float, mask: Tensor | None) -> Tensor:
+        gradient = torch.empty_like(render, memory_format=torch.contiguous_format)
+        value = _native.photo_loss(
+            render.detach().contiguous(),
+            photo.detach().to(torch.float32).contiguous(),
+            None if mask is None else mask.contiguous().view(torch.uint8),
+            ssim_weight,
+            gradient,
+        )
+        ctx.save_for_backward(gradient)
+        return render.new_tensor(value)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        scale = float(upstream[0])
+        return (gradient if scale == 1.0 else gradient * scale), None, None, None
+
+
+def _check(render: Tensor, photo: Tensor, mask: Tensor | None) -> None:
+    size = tuple(render.shape[:2])
+    if render.ndim != 3 or render.shape[2] != 3 or render.shape != photo.shape:
+        raise ValueError(f"render {tuple(render.shape)} and photo {tuple(photo.shape)} are not both (h, w, 3)")
+    if mask is not None and (tuple(mask.shape) != size or mask.dtype != torch.bool):
+        raise ValueError(f"mask {tuple(mask.shape)} of {mask.dtype} is not a bool mask of {size}")
+    if min(size) < MIN_SIDE_PX:
+        raise ValueError(f"the loss needs images of {MIN_SIDE_PX} pixels a side, got {size}")

@@ -1,0 +1,43 @@
+// Adam (Kingma and Ba, ICLR 2015) over tensors that share their rows, one a Gaussian: compiled once per ISA.
+#pragma once
+
+#include <cstdint>
+
+#include "isa.h"
+
+namespace splat {
+
+constexpr int kAdamBlock = 16;      // rows worked off at once, a multiple of any vector's lanes
+constexpr int kAdamTaskRows = 256;  // rows of a call at most: their gradients stay in the cache between two looks
+constexpr int kAdamWidth = 64;      // floats a row of one tensor, at most
+constexpr int kAdamTensors = 8;     // tensors of a call, at most
+
+// One tensor of (rows, width) floats, contiguous, with its gradient and moments.
+struct AdamTensor {
+    float* values;
+    const float* gradient;
+    float* mean;         // running mean of the gradient
+    float* square;       // running mean of its square
+    const float* rates;  // (kAdamBlock, width): the step size of every column, bias correction included, repeated
+    const std::int32_t* row_of;  // (kAdamBlock, width): the row of every value of a block
+    int width;
+};
+
+struct AdamJob {
+    AdamTensor tensors[kAdamTensors];
+    int tensor_count;
+    std::int64_t rows;
+    const std::uint8_t* visible;  // (rows,): zero leaves a row as it is; null: every row takes part
+    float beta1, beta2, epsilon;
+    float inverse_root_correction;  // 1 / sqrt(1 - beta2^step)
+};
+
+struct AdamKernels {
+    // Steps rows [from, to), at most kAdamTaskRows; a row with a gradient that is not finite is left as it is.
+    // Returns how many of those there were.
+    std::int64_t (*rows)(const AdamJob& job, std::int64_t from, std::int64_t to);
+};
+
+}  // namespace splat
+
+SPLAT_DECLARE_KERNELS(AdamKernels, adam_kernels)

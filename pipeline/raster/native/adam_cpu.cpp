@@ -1,0 +1,150 @@
+// Adam, fused and row by row, so that what no photo saw costs nothing. Compiled once per ISA: internal linkage, no std
+// templates.
+
+#include "adam.h"
+#include "simd.h"
+
+namespace splat::SPLAT_ISA_NAMESPACE {
+namespace {
+
+constexpr unsigned kAllRows = (1u << kAdamBlock) - 1;
+static_assert(kAdamBlock % kLanes == 0, "a block of any width is whole vectors");
+
+// A block of rows of one tensor, wherever it lies.
+struct Block {
+    float *values, *mean, *square;
+    const float *gradient, *rates;
+};
+
+struct Constants {
+    Floats one_less_beta1, beta2, one_less_beta2, epsilon, inverse_root_correction;
+};
+
+SPLAT_INLINE Constants constants_of(const AdamJob& job) {
+    return {fill(1.0f - job.beta1), fill(job.beta2), fill(1.0f - job.beta2), fill(job.epsilon),
+            fill(job.inverse_root_correction)};
+}
+
+// kLanes values from j on; with lanes given, only where they are set.
+SPLAT_INLINE void step_lanes(const Block& b, int j, const Constants& c, const Mask* lanes) {
+    const Floats gradient = load(b.gradient + j), old_mean = load(b.mean + j), old_square = load(b.square + j);
+    const Floats old_values = load(b.values + j);
+    Floats mean = fma(c.one_less_beta1, gradient - old_mean, old_mean);
+    Floats square = fma(c.beta2, old_square, c.one_less_beta2 * gradient * gradient);
+    const Floats root = fma(sqrt(square), c.inverse_root_correction, c.epsilon);
+    Floats values = old_values - load(b.rates + j) * mean / root;
+    if (lanes) {
+        mean = select(*lanes, mean, old_mean);
+        square = select(*lanes, square, old_square);
+        values = select(*lanes, values, old_values);
+    }
+    store(b.mean + j, mean), store(b.square + j, square), store(b.values + j, values);
+}
+
+// The rows of a block that are set, bit by bit.
+SPLAT_INLINE void step_block(const Block& b, const AdamTensor& tensor, const Constants& c, unsigned rows) {
+    const int width = tensor.width, n = kAdamBlock * width;
+    if (rows == kAllRows) {
+        for (int j = 0; j < n; j += kLanes) step_lanes(b, j, c, nullptr);
+    } else if (width % kLanes == 0) {
+        for (int row = 0; row < kAdamBlock; ++row)
+            if (rows >> row & 1u)
+                for (int j = row * width; j < (row + 1) * width; j += kLanes) step_lanes(b, j, c, nullptr);
+    } else {
+        for (int j = 0; j < n; j += kLanes) {
+            std::int32_t chosen[kLanes];
+            for (int l = 0; l < kLanes; ++l) chosen[l] = rows >> tensor.row_of[j + l] & 1u;
+            const Mask lanes = below(0, chosen);
+            step_lanes(b, j, c, &lanes);
+        }
+    }
+}
+
+// Whether n values are finite: those that are not differ from themselves once multiplied by zero.
+bool all_finite(const float* p, int n) {
+    Floats sum = {};
+    int j = 0;
+    for (; j + kLanes <= n; j += kLanes) sum += load(p + j) * 0.0f;
+    float rest = 0.0f;
+    for (int l = 0; l < kLanes; ++l) rest += sum[l];
+    for (; j < n; ++j) rest += p[j] * 0.0f;
+    return rest == 0.0f;
+}
+
+// Which rows of a block of count rows step, as bits; counts those that would but for their gradients.
+unsigned stepping_rows(const AdamJob& job, std::int64_t from, int count, std::int64_t* skipped) {
+    unsigned rows = 0;
+    for (int i = 0; i < count; ++i) rows |= unsigned(!job.visible || job.visible[from + i]) << i;
+    if (!rows) return 0;
+    bool finite = true;
+    for (int t = 0; t < job.tensor_count; ++t) {
+        const int width = job.tensors[t].width;
+        finite = finite && all_finite(job.tensors[t].gradient + from * width, count * width);
+    }
+    if (finite) return rows;
+    for (int i = 0; i < count; ++i) {
+        if (!(rows >> i & 1u)) continue;
+        bool row_finite = true;
+        for (int t = 0; t < job.tensor_count; ++t) {
+            const int width = job.tensors[t].width;
+            row_finite = row_finite && all_finite(job.tensors[t].gradient + (from + i) * width, width);
+        }
+        if (row_finite) continue;
+        rows &= ~(1u << i);
+        ++*skipped;
+    }
+    return rows;
+}
+
+// The last block, of fewer rows: through a copy, so that nothing beyond the tensors is touched.
+void step_last(const AdamTensor& tensor, std::int64_t from, int count, const Constants& c, unsigned rows) {
+    float values[kAdamBlock * kAdamWidth], mean[kAdamBlock * kAdamWidth], square[kAdamBlock * kAdamWidth];
+    float gradient[kAdamBlock * kAdamWidth];
+    const std::int64_t start = from * tensor.width;
+    const int n = count * tensor.width;
+    for (int j = 0; j < kAdamBlock * tensor.width; ++j) {
+        const bool there = j < n;
+        values[j] = there ? tensor.values[start + j] : 0.0f;
+        mean[j] = there ? tensor.mean[start + j] : 0.0f;
+        square[j] = there ? tensor.square[start + j] : 0.0f;
+        gradient[j] = there ? tensor.gradient[start + j] : 0.0f;
+    }
+    step_block({values, mean, square, gradient, tensor.rates}, tensor, c, rows);
+    for (int j = 0; j < n; ++j) {
+        tensor.values[start + j] = values[j];
+        tensor.mean[start + j] = mean[j];
+        tensor.square[start + j] = square[j];
+    }
+}
+
+// Tensor by tensor, each over all the rows: four streams of memory at a time are as many as a CPU foresees well.
+std::int64_t adam_rows(const AdamJob& job, std::int64_t from, std::int64_t to) {
+    const Constants c = constants_of(job);
+    std::int64_t skipped = 0;
+    unsigned stepping[kAdamTaskRows / kAdamBlock];
+    for (std::int64_t row = from; row < to; row += kAdamBlock) {
+        const int count = to - row < kAdamBlock ? int(to - row) : kAdamBlock;
+        stepping[(row - from) / kAdamBlock] = stepping_rows(job, row, count, &skipped);
+    }
+    for (int t = 0; t < job.tensor_count; ++t) {
+        const AdamTensor& tensor = job.tensors[t];
+        for (std::int64_t row = from; row < to; row += kAdamBlock) {
+            const unsigned rows = stepping[(row - from) / kAdamBlock];
+            const std::int64_t at = row * tensor.width;
+            if (!rows) continue;
+            if (to - row < kAdamBlock)
+                step_last(tensor, row, int(to - row), c, rows);
+            else
+                step_block(
+                    {tensor.values + at, tensor.mean + at, tensor.square + at, tensor.gradient + at, tensor.rates},
+                    tensor, c, rows);
+        }
+    }
+    return skipped;
+}
+
+}  // namespace
+
+extern const AdamKernels adam_kernels = {adam_rows};
+
+}  // namespace splat::SPLAT_ISA_NAMESPACE

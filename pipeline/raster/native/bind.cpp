@@ -1,0 +1,45 @@
+// The Python module `splatpipe.pipeline.raster._native`.
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <string>
+#include <vector>
+
+#include "isa.h"
+#include "threads.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+void bind_raster(nb::module_& m);
+void bind_loss(nb::module_& m);
+
+namespace {
+
+std::vector<std::string> isas() {
+    std::vector<std::string> names;
+    for (splat::Isa isa : {splat::Isa::avx512, splat::Isa::avx2, splat::Isa::baseline})
+        if (splat::isa_available(isa)) names.emplace_back(splat::isa_name(isa));
+    return names;
+}
+
+void set_isa(const std::string& name) {
+    if (!splat::set_isa(name.c_str())) throw nb::value_error(("this CPU has no " + name).c_str());
+}
+
+}  // namespace
+
+NB_MODULE(_native, m) {
+    nb::set_leak_warnings(false);  // a graph that somebody still holds at exit is no leak
+    m.doc() = "Native kernels: rasterizer, loss, optimiser.";
+    m.def("set_threads", &splat::set_threads, "threads"_a, "Threads of the one pool that all kernels share.");
+    m.def("threads", &splat::thread_count);
+    m.def("isa", [] { return std::string(splat::isa_name(splat::active_isa())); }, "The instruction set in use.");
+    m.def("isas", &isas, "Instruction sets that this CPU has and this build knows, best first.");
+    m.def("set_isa", &set_isa, "name"_a, "Use one of isas(), or \"auto\".");
+    if (!splat::set_isa_from_environment())
+        throw nb::import_error("SPLATPIPE_ISA names an instruction set that this CPU does not have");
+    bind_raster(m);
+    bind_loss(m);
+}

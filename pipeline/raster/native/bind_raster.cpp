@@ -1,0 +1,168 @@
+// The rasterizer's Python face; see _native.pyi.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <array>
+#include <limits>
+#include <memory>
+#include <optional>
+#include <tuple>
+
+#include "raster_cpu.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+template <class T, class Shape>
+using Array = nb::ndarray<T, Shape, nb::device::cpu, nb::c_contig>;
+template <class T>
+using Line = Array<T, nb::ndim<1>>;
+template <class T>
+using Grid = Array<T, nb::ndim<2>>;
+template <class T>
+using Cube = Array<T, nb::ndim<3>>;
+using Pose = Array<const double, nb::shape<4, 4>>;
+
+// means, log_scales, quats, opacity_logits, sh
+template <class T>
+using ParameterArrays = std::tuple<Grid<T>, Grid<T>, Grid<T>, Line<T>, Cube<T>>;
+// cam_from_world; width, height; fx, fy, cx, cy
+using CameraTuple = std::tuple<Pose, std::array<int, 2>, std::array<double, 4>>;
+// sh_degree, antialias, near, background
+using OptionsTuple = std::tuple<int, bool, double, std::array<double, 3>>;
+// colour, alpha, depth_sum, median_depth; radii, visible
+using OutputArrays = std::tuple<Cube<float>, Grid<float>, std::optional<Grid<float>>, std::optional<Grid<float>>,
+                                Line<float>, Line<uint8_t>>;
+using PictureGradientArrays =
+    std::tuple<std::optional<Cube<const float>>, std::optional<Grid<const float>>, std::optional<Grid<const float>>>;
+
+template <class T>
+T* checked(const Grid<T>& array, size_t rows, size_t columns, const char* name) {
+    if (array.shape(0) != rows || array.shape(1) != columns) throw nb::value_error(name);
+    return array.data();
+}
+
+template <class T>
+T* checked(const Line<T>& array, size_t rows, const char* name) {
+    if (array.shape(0) != rows) throw nb::value_error(name);
+    return array.data();
+}
+
+template <class T>
+T* checked(const Cube<T>& array, size_t rows, size_t columns, const char* name) {
+    if (array.shape(0) != rows || array.shape(1) != columns || array.shape(2) != 3) throw nb::value_error(name);
+    return array.data();
+}
+
+splat::Parameters parameters_of(const ParameterArrays<const float>& arrays) {
+    const auto& [means, log_scales, quats, opacity_logits, sh] = arrays;
+    const size_t n = means.shape(0);
+    if (n > std::numeric_limits<int32_t>::max()) throw nb::value_error("more Gaussians than 32-bit indices hold");
+    return {static_cast<int64_t>(n),
+            checked(means, n, 3, "means"),
+            checked(log_scales, n, 3, "log_scales"),
+            checked(quats, n, 4, "quats"),
+            checked(opacity_logits, n, "opacity_logits"),
+            checked(sh, n, sh.shape(1), "sh")};
+}
+
+void put_camera(const CameraTuple& camera, splat::View* view) {
+    const auto& [pose, size, intrinsics] = camera;
+    const auto [fx, fy, cx, cy] = intrinsics;
+    if (size[0] < 1 || size[1] < 1 || size[0] > 65536 || size[1] > 65536) throw nb::value_error("size");
+    view->width = size[0], view->height = size[1];
+    view->tiles_x = (view->width + splat::kTile - 1) / splat::kTile;
+    view->tiles_y = (view->height + splat::kTile - 1) / splat::kTile;
+    view->fx = static_cast<float>(fx), view->fy = static_cast<float>(fy);
+    view->cx = static_cast<float>(cx), view->cy = static_cast<float>(cy);
+    for (int row = 0; row < 3; ++row) {
+        double centre = 0.0;
+        for (int column = 0; column < 3; ++column) {
+            view->rotation[3 * row + column] = static_cast<float>(pose(row, column));
+            centre -= pose(column, row) * pose(column, 3);
+        }
+        view->translation[row] = static_cast<float>(pose(row, 3));
+        view->centre[row] = static_cast<float>(centre);
+    }
+    const double margin_x = splat::kFrustumMargin * 0.5 * size[0], margin_y = splat::kFrustumMargin * 0.5 * size[1];
+    view->ratio_min[0] = static_cast<float>(-(cx + margin_x) / fx);
+    view->ratio_max[0] = static_cast<float>((size[0] - cx + margin_x) / fx);
+    view->ratio_min[1] = static_cast<float>(-(cy + margin_y) / fy);
+    view->ratio_max[1] = static_cast<float>((size[1] - cy + margin_y) / fy);
+}
+
+void put_options(const OptionsTuple& options, size_t sh_count, splat::View* view) {
+    const auto& [degree, antialias, near_z, background] = options;
+    if (degree < 0 || degree > 3 || sh_count > 16 || static_cast<size_t>((degree + 1) * (degree + 1)) > sh_count)
+        throw nb::value_error("sh_degree");
+    view->sh_degree = degree, view->sh_count = static_cast<int>(sh_count);
+    view->antialias = antialias, view->near_z = static_cast<float>(near_z);
+    for (int c = 0; c < 3; ++c) view->background[c] = static_cast<float>(background[c]);
+}
+
+// A render and what its backward pass needs.
+class Frame {
+  public:
+    void forward(const ParameterArrays<const float>& arrays, const CameraTuple& camera, const OptionsTuple& options,
+                 const OutputArrays& outputs) {
+        const splat::Parameters in = parameters_of(arrays);
+        put_camera(camera, &view_);
+        put_options(options, std::get<4>(arrays).shape(1), &view_);
+        const size_t n = in.count, h = view_.height, w = view_.width;
+        const auto& [colour, alpha, depth_sum, median_depth, radii, visible] = outputs;
+        if (depth_sum.has_value() != median_depth.has_value()) throw nb::value_error("one depth without the other");
+        const splat::Pictures out = {checked(colour, h, w, "colour"), checked(alpha, h, w, "alpha"),
+                                     depth_sum ? checked(*depth_sum, h, w, "depth_sum") : nullptr,
+                                     median_depth ? checked(*median_depth, h, w, "median_depth") : nullptr};
+        float* radii_out = checked(radii, n, "radii");
+        uint8_t* visible_out = checked(visible, n, "visible");
+        nb::gil_scoped_release release;
+        count_ = -1;
+        frame_->forward(view_, in, out, radii_out, visible_out);
+        count_ = in.count;
+    }
+
+    void backward(const ParameterArrays<const float>& arrays, const PictureGradientArrays& gradients,
+                  const ParameterArrays<float>& outputs, const Grid<float>& means2d) {
+        const splat::Parameters in = parameters_of(arrays);
+        const size_t n = in.count, k = view_.sh_count, h = view_.height, w = view_.width;
+        if (in.count != count_ || std::get<4>(arrays).shape(1) != k)
+            throw nb::value_error("not what forward() rendered");
+        const auto& [colour, alpha, depth_sum] = gradients;
+        const splat::PictureGradients pictures = {colour ? checked(*colour, h, w, "colour") : nullptr,
+                                                  alpha ? checked(*alpha, h, w, "alpha") : nullptr,
+                                                  depth_sum ? checked(*depth_sum, h, w, "depth_sum") : nullptr};
+        const auto& [means, log_scales, quats, opacity_logits, sh] = outputs;
+        const splat::ParameterGradients out = {
+            checked(means, n, 3, "means"), checked(log_scales, n, 3, "log_scales"),
+            checked(quats, n, 4, "quats"), checked(opacity_logits, n, "opacity_logits"),
+            checked(sh, n, k, "sh"),       checked(means2d, n, 2, "means2d")};
+        nb::gil_scoped_release release;
+        frame_->backward(in, pictures, out);
+    }
+
+    int64_t pairs() const { return frame_->pairs(); }
+
+  private:
+    std::shared_ptr<splat::RasterFrame> frame_ = splat::borrow_frame();
+    splat::View view_{};
+    int64_t count_ = -1;  // Gaussians of the render it holds, or none
+};
+
+}  // namespace
+
+void bind_raster(nb::module_& m) {
+    nb::exception<splat::TooManyPairs>(m, "TooManyPairs", PyExc_OverflowError);
+    nb::class_<Frame>(m, "Frame")
+        .def(nb::init<>())
+        .def("forward", &Frame::forward, nb::arg("parameters").noconvert(), nb::arg("camera").noconvert(), "options"_a,
+             nb::arg("outputs").noconvert())
+        .def("backward", &Frame::backward, nb::arg("parameters").noconvert(), nb::arg("gradients").noconvert(),
+             nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert())
+        .def_prop_ro("pairs", &Frame::pairs);
+}

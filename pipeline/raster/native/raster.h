@@ -1,0 +1,128 @@
+// What the rasterizer's kernels (compiled per ISA) and its driver (raster_cpu.cpp) share. Plain structs, no std.
+//
+// Names: a Gaussian is one in space, a splat its image on the screen. A pair is a splat in a tile it touches; a slot is
+// where the gradient of a pair goes. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+#pragma once
+
+#include <stdint.h>
+
+#include "isa.h"
+
+namespace splat {
+
+// The definition's constants; see definitions.py for the reasons.
+constexpr float kAlphaMax = 0.99f;
+constexpr float kAlphaMin = 1.0f / 255.0f;
+constexpr float kLog2AlphaMax = -0.014499569695115089f;
+constexpr float kLog2AlphaMin = -7.994353436858858f;
+constexpr float kTransmittanceMin = 1e-4f;
+constexpr float kMedianTransmittance = 0.5f;
+constexpr float kBlurPx2 = 0.3f;
+constexpr float kFrustumMargin = 0.3f;
+constexpr float kCompensationMin = 2.5e-5f;
+constexpr float kQuatEpsilon = 1e-12f;
+constexpr float kRadiusSigmas = 3.0f;
+constexpr float kMaxScreenPx = 1e7f;
+constexpr float kMaxVariancePx2 = 1e12f;
+constexpr float kMaxQuatNorm2 = 1e36f;
+constexpr float kMaxColour = 1e6f;
+constexpr float kMaxDepth = 1e9f;
+
+constexpr int kTile = 16;  // pixels along a tile's side
+constexpr int kTilePixels = kTile * kTile;
+constexpr float kHalfLog2E = 0.72134752044448170f;  // exp(-x/2) = 2^(-kHalfLog2E x)
+constexpr uint32_t kCulled = 0xffffffffu;           // sort key of a Gaussian that is not visible
+constexpr int kSlotFloats = 12;                     // 10 gradients and padding to whole quarter-vectors
+
+// A camera and what to render, in the kernels' precision.
+struct View {
+    int width, height, tiles_x, tiles_y;
+    float fx, fy, cx, cy;
+    float rotation[9], translation[3];  // cam_from_world, row-major
+    float centre[3];                    // of projection, world
+    float ratio_min[2], ratio_max[2];   // x/z and y/z are clamped to these in the Jacobian
+    float near_z;
+    float background[3];
+    int sh_degree;  // that counts
+    int sh_count;   // coefficients a channel that are stored, >= (sh_degree + 1)^2
+    bool antialias;
+};
+
+// Raw parameters, contiguous rows.
+struct Parameters {
+    int64_t count;
+    const float *means, *log_scales, *quats, *opacity_logits, *sh;
+};
+
+// Their gradients, laid out alike; every row is written.
+struct ParameterGradients {
+    float *means, *log_scales, *quats, *opacity_logits, *sh;
+    float* means2d;  // (n, 2), pixels
+};
+
+// A Gaussian on the screen. In the whitened offset from its centre,
+//   u = a dx + b dy,   v = c dy,   alpha = 2^(log2_opacity - u^2 - v^2):
+// sums of squares do not cancel in long thin splats, as the quadratic form does.
+struct alignas(64) Splat {
+    float x, y;  // centre, pixels
+    float a, b, c;
+    float log2_opacity;
+    float colour[3];
+    float depth;
+    float slope;                   // -b / a: the ellipse's chord in row dy has its middle at slope dy
+    float inv_a;                   // and the half-length inv_a sqrt(reach - v^2)
+    float reach;                   // u^2 + v^2 <= reach is where alpha >= 1/255
+    float rows_dy;                 // dy of the ellipse's rightmost point; the leftmost's is its negative
+    uint16_t first_row, last_row;  // tile rows that it touches; none if first > last
+    uint32_t unused;
+};
+static_assert(sizeof(Splat) == 64, "one cache line");
+
+// Tiles first..last-1 of a tile row.
+struct Span {
+    uint16_t first, last;
+};
+
+// Where a frame's results live; all of these are owned by the driver.
+struct FrameData {
+    Splat* splats;         // (n); meaningful where visible
+    uint32_t* keys;        // (n): bits of the depth, or kCulled
+    int64_t* tile_begin;   // (tiles + 1): each tile's pairs, near to far
+    int32_t* pair_splat;   // (pairs): index of the splat
+    int32_t* pair_slot;    // (pairs): where the pair's gradient goes
+    int64_t* slot_begin;   // (n + 1): a Gaussian's slots
+    float* slots;          // (pairs, kSlotFloats); only for the backward pass
+    float* transmittance;  // (tiles, 256): what is left behind everything
+    int32_t* pixel_end;    // (tiles, 256): number of the tile's pairs that the pixel looked at before it ended
+};
+
+// Pictures, row-major: (h, w, 3) and (h, w). Both depths, or neither (null).
+struct Pictures {
+    float *colour, *alpha, *depth_sum, *median_depth;
+};
+// Null for zero.
+struct PictureGradients {
+    const float *colour, *alpha, *depth_sum;
+};
+
+struct ProjectKernels {
+    // Gaussians begin..end-1: fills splats, keys, radii and visible.
+    void (*project)(const View&, const Parameters&, int64_t begin, int64_t end, const FrameData&, float* radii,
+                    uint8_t* visible);
+    // The tiles that a splat touches in each of its tile rows, exactly. Returns how many.
+    int64_t (*find_spans)(const View&, const Splat&, Span* spans);
+    // Sums the slots of Gaussians begin..end-1 and carries them back to the parameters.
+    void (*project_backward)(const View&, const Parameters&, int64_t begin, int64_t end, const FrameData&,
+                             const ParameterGradients&);
+};
+
+struct BlendKernels {
+    void (*blend_tile)(const View&, const FrameData&, int tile, const Pictures&);
+    // Writes every slot of the tile.
+    void (*blend_tile_backward)(const View&, const FrameData&, int tile, const PictureGradients&);
+};
+
+}  // namespace splat
+
+SPLAT_DECLARE_KERNELS(splat::ProjectKernels, project_kernels)
+SPLAT_DECLARE_KERNELS(splat::BlendKernels, blend_kernels)

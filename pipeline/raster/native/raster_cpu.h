@@ -1,0 +1,84 @@
+// The CPU rasterizer's driver: who computes what when, and who owns the memory. Not for kernel files.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <memory>
+#include <new>
+#include <stdexcept>
+
+#include "raster.h"
+
+namespace splat {
+
+// More pixel-tile pairs than 32-bit indices hold.
+struct TooManyPairs : std::runtime_error {
+    TooManyPairs() : std::runtime_error("the Gaussians cover more tiles than 32-bit indices hold") {}
+};
+
+// Uninitialised memory that only grows, so that a training loop does not fault in fresh pages at every iteration.
+template <class T>
+class Buffer {
+  public:
+    Buffer() = default;
+    Buffer(const Buffer&) = delete;
+    Buffer& operator=(const Buffer&) = delete;
+    ~Buffer() { std::free(data_); }
+
+    // At least `count` elements; what was in it is lost where it grows. Throws std::bad_alloc.
+    T* reserve(int64_t count) {
+        if (count <= capacity_) return data_;
+        std::free(data_);
+        data_ = nullptr, capacity_ = 0;
+        const int64_t wanted = count + count / 4;  // densification grows a scene step by step
+        const std::size_t lines = (static_cast<std::size_t>(wanted) * sizeof(T) + kLine - 1) / kLine;
+        data_ = static_cast<T*>(std::aligned_alloc(kLine, lines * kLine));
+        if (!data_) throw std::bad_alloc();
+        capacity_ = wanted;
+        return data_;
+    }
+    T* data() const { return data_; }
+
+  private:
+    static constexpr std::size_t kLine = 64;  // of the cache
+
+    T* data_ = nullptr;
+    int64_t capacity_ = 0;
+};
+
+// A view's rasterization, with what its backward pass needs. One render at a time.
+class RasterFrame {
+  public:
+    // Renders; every pointer in `out` is written. Throws TooManyPairs, std::bad_alloc.
+    void forward(const View& view, const Parameters& in, const Pictures& out, float* radii, uint8_t* visible);
+
+    // Gradients of the last forward() call, whose parameters these must be. Can be repeated.
+    void backward(const Parameters& in, const PictureGradients& gradients, const ParameterGradients& out);
+
+    int64_t pairs() const { return pairs_; }
+
+  private:
+    void sort_by_depth(int64_t count);
+    void bin(int64_t count);
+    void prefix_tiles(int chunks, int tiles);
+
+    View view_{};
+    FrameData data_{};
+    int64_t visible_ = 0, pairs_ = 0;
+    Buffer<Splat> splats_;
+    Buffer<uint32_t> keys_, sort_keys_;
+    Buffer<int32_t> sort_order_;  // two halves, and the visible Gaussians by depth in the first after the sort
+    Buffer<int64_t> row_begin_;   // of the k-th nearest splat in spans_
+    Buffer<Span> spans_;
+    Buffer<int64_t> cursors_;  // (chunks, tiles)
+    Buffer<int64_t> tile_begin_, slot_begin_;
+    Buffer<int32_t> pair_splat_, pair_slot_;
+    Buffer<float> slots_, transmittance_;
+    Buffer<int32_t> pixel_end_;
+};
+
+// Frames are handed out and taken back, a few of them kept with their memory.
+std::shared_ptr<RasterFrame> borrow_frame();
+
+}  // namespace splat

@@ -1,0 +1,264 @@
+// Vectors of floats for kernel files: 16 lanes (AVX-512), 8 (AVX2) or 4 (baseline: SSE2, NEON). Arithmetic is written
+// with operators; what the compilers' vector extensions lack is here. Everything has internal linkage (see isa.h).
+#pragma once
+
+#include <stdint.h>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+#define SPLAT_INLINE static inline __attribute__((always_inline))
+#define SPLAT_METHOD inline __attribute__((always_inline))
+
+namespace splat {
+namespace SPLAT_ISA_NAMESPACE {
+namespace {
+
+#if SPLAT_ISA_AVX512
+
+constexpr int kLanes = 16;
+using Floats = __m512;
+using Mask = __mmask16;
+
+SPLAT_INLINE Floats fill(float x) { return _mm512_set1_ps(x); }
+SPLAT_INLINE Floats load(const float* p) { return _mm512_loadu_ps(p); }
+SPLAT_INLINE void store(float* p, Floats v) { _mm512_storeu_ps(p, v); }
+SPLAT_INLINE Floats fma(Floats a, Floats b, Floats c) { return _mm512_fmadd_ps(a, b, c); }    // ab + c
+SPLAT_INLINE Floats fnma(Floats a, Floats b, Floats c) { return _mm512_fnmadd_ps(a, b, c); }  // c - ab
+SPLAT_INLINE Floats min(Floats a, Floats b) { return _mm512_min_ps(a, b); }                   // b where either is NaN
+SPLAT_INLINE Floats max(Floats a, Floats b) { return _mm512_max_ps(a, b); }                   // b where either is NaN
+SPLAT_INLINE Floats sqrt(Floats a) { return _mm512_sqrt_ps(a); }
+SPLAT_INLINE Floats ceil(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
+SPLAT_INLINE Floats floor(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+SPLAT_INLINE Mask less(Floats a, Floats b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+SPLAT_INLINE Mask at_most(Floats a, Floats b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+SPLAT_INLINE Mask both(Mask a, Mask b) { return static_cast<Mask>(a & b); }
+SPLAT_INLINE Mask either(Mask a, Mask b) { return static_cast<Mask>(a | b); }
+SPLAT_INLINE Mask without(Mask a, Mask b) { return static_cast<Mask>(a & ~b); }
+SPLAT_INLINE bool any(Mask m) { return m != 0; }
+SPLAT_INLINE uint32_t bits(Mask m) { return m; }  // lane i is bit i
+SPLAT_INLINE Floats select(Mask m, Floats yes, Floats no) { return _mm512_mask_blend_ps(m, no, yes); }
+SPLAT_INLINE Floats only(Mask m, Floats v) { return _mm512_maskz_mov_ps(m, v); }  // 0 elsewhere
+SPLAT_INLINE Floats gather(const float* p, int stride) {                          // p[lane * stride]
+    const __m512i lane = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+    return _mm512_i32gather_ps(_mm512_mullo_epi32(lane, _mm512_set1_epi32(stride)), p, 4);
+}
+// Lanes for which value < p[lane].
+SPLAT_INLINE Mask below(int32_t value, const int32_t* p) {
+    return _mm512_cmplt_epi32_mask(_mm512_set1_epi32(value), _mm512_loadu_si512(p));
+}
+// Interleaved colours of a vector of pixels.
+SPLAT_INLINE void store_rgb(float* p, Floats red, Floats green, Floats blue) {
+    const __m512i rg0 = _mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5);
+    const __m512i rg1 = _mm512_setr_epi32(21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26);
+    const __m512i rg2 = _mm512_setr_epi32(0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0);
+    const __m512i b0 = _mm512_setr_epi32(0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
+    const __m512i b1 = _mm512_setr_epi32(0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
+    const __m512i b2 = _mm512_setr_epi32(26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
+    store(p, _mm512_permutex2var_ps(_mm512_permutex2var_ps(red, rg0, green), b0, blue));
+    store(p + 16, _mm512_permutex2var_ps(_mm512_permutex2var_ps(red, rg1, green), b1, blue));
+    store(p + 32, _mm512_permutex2var_ps(_mm512_permutex2var_ps(red, rg2, green), b2, blue));
+}
+SPLAT_INLINE Floats pick_third(Floats v0, Floats v1, Floats v2, __m512i from_01, __m512i from_2) {
+    return _mm512_permutex2var_ps(_mm512_permutex2var_ps(v0, from_01, v1), from_2, v2);
+}
+SPLAT_INLINE void load_rgb(const float* p, Floats* red, Floats* green, Floats* blue) {
+    const Floats v0 = load(p), v1 = load(p + 16), v2 = load(p + 32);
+    *red = pick_third(v0, v1, v2, _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0),
+                      _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29));
+    *green = pick_third(v0, v1, v2, _mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0),
+                        _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30));
+    *blue = pick_third(v0, v1, v2, _mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0),
+                       _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
+}
+// Two rows of eight that lie apart.
+SPLAT_INLINE Floats load_halves(const float* low, const float* high) {
+    return _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(low)), _mm256_loadu_ps(high), 1);
+}
+SPLAT_INLINE void store_halves(float* low, float* high, Floats v) {
+    _mm256_storeu_ps(low, _mm512_castps512_ps256(v));
+    _mm256_storeu_ps(high, _mm512_extractf32x8_ps(v, 1));
+}
+// 1/x within 1 ulp or so. The estimate is specified to the bit, unlike the older ones.
+SPLAT_INLINE Floats inverse(Floats x) {
+    const Floats estimate = _mm512_rcp14_ps(x);
+    return fma(estimate, fnma(x, estimate, fill(1.0f)), estimate);
+}
+// Sums over the lanes of a, b, c, d to out[0..3].
+SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) {
+    const Floats ab = _mm512_unpacklo_ps(a, b) + _mm512_unpackhi_ps(a, b);
+    const Floats cd = _mm512_unpacklo_ps(c, d) + _mm512_unpackhi_ps(c, d);
+    const Floats abcd = _mm512_shuffle_ps(ab, cd, 0x44) + _mm512_shuffle_ps(ab, cd, 0xee);
+    const __m256 half = _mm512_castps512_ps256(abcd) + _mm512_extractf32x8_ps(abcd, 1);
+    _mm_storeu_ps(out, _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1));
+}
+
+#elif SPLAT_ISA_AVX2
+
+constexpr int kLanes = 8;
+using Floats = __m256;
+using Mask = __m256;  // all bits of a lane, or none
+
+SPLAT_INLINE Floats fill(float x) { return _mm256_set1_ps(x); }
+SPLAT_INLINE Floats load(const float* p) { return _mm256_loadu_ps(p); }
+SPLAT_INLINE void store(float* p, Floats v) { _mm256_storeu_ps(p, v); }
+SPLAT_INLINE Floats fma(Floats a, Floats b, Floats c) { return _mm256_fmadd_ps(a, b, c); }
+SPLAT_INLINE Floats fnma(Floats a, Floats b, Floats c) { return _mm256_fnmadd_ps(a, b, c); }
+SPLAT_INLINE Floats min(Floats a, Floats b) { return _mm256_min_ps(a, b); }
+SPLAT_INLINE Floats max(Floats a, Floats b) { return _mm256_max_ps(a, b); }
+SPLAT_INLINE Floats sqrt(Floats a) { return _mm256_sqrt_ps(a); }
+SPLAT_INLINE Floats ceil(Floats a) { return _mm256_ceil_ps(a); }
+SPLAT_INLINE Floats floor(Floats a) { return _mm256_floor_ps(a); }
+SPLAT_INLINE Mask less(Floats a, Floats b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
+SPLAT_INLINE Mask at_most(Floats a, Floats b) { return _mm256_cmp_ps(a, b, _CMP_LE_OQ); }
+SPLAT_INLINE Mask both(Mask a, Mask b) { return _mm256_and_ps(a, b); }
+SPLAT_INLINE Mask either(Mask a, Mask b) { return _mm256_or_ps(a, b); }
+SPLAT_INLINE Mask without(Mask a, Mask b) { return _mm256_andnot_ps(b, a); }
+SPLAT_INLINE bool any(Mask m) { return _mm256_movemask_ps(m) != 0; }
+SPLAT_INLINE uint32_t bits(Mask m) { return static_cast<uint32_t>(_mm256_movemask_ps(m)); }
+SPLAT_INLINE Floats select(Mask m, Floats yes, Floats no) { return _mm256_blendv_ps(no, yes, m); }
+SPLAT_INLINE Floats only(Mask m, Floats v) { return _mm256_and_ps(m, v); }
+SPLAT_INLINE Floats gather(const float* p, int stride) {
+    const __m256i lane = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
+    return _mm256_i32gather_ps(p, _mm256_mullo_epi32(lane, _mm256_set1_epi32(stride)), 4);
+}
+SPLAT_INLINE Mask below(int32_t value, const int32_t* p) {
+    const __m256i loaded = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
+    return _mm256_castsi256_ps(_mm256_cmpgt_epi32(loaded, _mm256_set1_epi32(value)));
+}
+SPLAT_INLINE Floats inverse(Floats x) { return fill(1.0f) / x; }  // rcpps differs between makes of CPU
+SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) {
+    const Floats abcd = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
+    _mm_storeu_ps(out, _mm256_castps256_ps128(abcd) + _mm256_extractf128_ps(abcd, 1));
+}
+
+#else
+
+constexpr int kLanes = 4;
+using Floats = float __attribute__((vector_size(16)));
+using Mask = int32_t __attribute__((vector_size(16)));
+
+SPLAT_INLINE Floats fill(float x) { return Floats{x, x, x, x}; }
+SPLAT_INLINE Floats load(const float* p) {
+    Floats v;
+    __builtin_memcpy(&v, p, sizeof v);
+    return v;
+}
+SPLAT_INLINE void store(float* p, Floats v) { __builtin_memcpy(p, &v, sizeof v); }
+SPLAT_INLINE Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
+SPLAT_INLINE Floats fnma(Floats a, Floats b, Floats c) { return c - a * b; }
+SPLAT_INLINE Mask less(Floats a, Floats b) { return a < b; }
+SPLAT_INLINE Mask at_most(Floats a, Floats b) { return a <= b; }
+SPLAT_INLINE Mask both(Mask a, Mask b) { return a & b; }
+SPLAT_INLINE Mask either(Mask a, Mask b) { return a | b; }
+SPLAT_INLINE Mask without(Mask a, Mask b) { return a & ~b; }
+SPLAT_INLINE Floats select(Mask m, Floats yes, Floats no) {
+    return reinterpret_cast<Floats>((m & reinterpret_cast<Mask>(yes)) | (~m & reinterpret_cast<Mask>(no)));
+}
+SPLAT_INLINE Floats only(Mask m, Floats v) { return reinterpret_cast<Floats>(m & reinterpret_cast<Mask>(v)); }
+SPLAT_INLINE Floats min(Floats a, Floats b) { return select(a < b, a, b); }
+SPLAT_INLINE Floats max(Floats a, Floats b) { return select(a > b, a, b); }
+SPLAT_INLINE Floats gather(const float* p, int stride) { return Floats{p[0], p[stride], p[2 * stride], p[3 * stride]}; }
+SPLAT_INLINE Mask below(int32_t value, const int32_t* p) {
+    Mask loaded;
+    __builtin_memcpy(&loaded, p, sizeof loaded);
+    return value < loaded;
+}
+SPLAT_INLINE Floats inverse(Floats x) { return fill(1.0f) / x; }
+SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) {
+    out[0] = (a[0] + a[2]) + (a[1] + a[3]);
+    out[1] = (b[0] + b[2]) + (b[1] + b[3]);
+    out[2] = (c[0] + c[2]) + (c[1] + c[3]);
+    out[3] = (d[0] + d[2]) + (d[1] + d[3]);
+}
+// Whole numbers in ±2^22, where these are wanted; larger ones come back as they are.
+SPLAT_INLINE Floats nearest(Floats a) {
+    const Floats magic = fill(12582912.0f);  // 1.5 · 2^23
+    const Floats size = select(a < 0.0f, -a, a);
+    return select(size < 4194304.0f, (a + magic) - magic, a);
+}
+SPLAT_INLINE Floats floor(Floats a) {
+    const Floats n = nearest(a);
+    return n - only(n > a, fill(1.0f));
+}
+SPLAT_INLINE Floats ceil(Floats a) { return -floor(-a); }
+#if defined(__x86_64__)
+SPLAT_INLINE Floats sqrt(Floats a) { return _mm_sqrt_ps(a); }
+SPLAT_INLINE uint32_t bits(Mask m) { return static_cast<uint32_t>(_mm_movemask_ps(reinterpret_cast<__m128>(m))); }
+#else
+SPLAT_INLINE Floats sqrt(Floats a) {
+    return Floats{__builtin_sqrtf(a[0]), __builtin_sqrtf(a[1]), __builtin_sqrtf(a[2]), __builtin_sqrtf(a[3])};
+}
+SPLAT_INLINE uint32_t bits(Mask m) { return static_cast<uint32_t>((m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8)); }
+#endif
+SPLAT_INLINE bool any(Mask m) { return bits(m) != 0; }
+
+#endif
+
+#if !SPLAT_ISA_AVX512
+SPLAT_INLINE void store_rgb(float* p, Floats red, Floats green, Floats blue) {
+    float r[kLanes], g[kLanes], b[kLanes];
+    store(r, red), store(g, green), store(b, blue);
+    for (int i = 0; i < kLanes; ++i) p[3 * i] = r[i], p[3 * i + 1] = g[i], p[3 * i + 2] = b[i];
+}
+SPLAT_INLINE void load_rgb(const float* p, Floats* red, Floats* green, Floats* blue) {
+    *red = gather(p, 3), *green = gather(p + 1, 3), *blue = gather(p + 2, 3);
+}
+#endif
+
+using Ints = int32_t __attribute__((vector_size(kLanes * 4)));
+
+SPLAT_INLINE Mask none() { return less(fill(0.0f), fill(0.0f)); }
+SPLAT_INLINE Floats as_floats(Ints v) { return reinterpret_cast<Floats>(v); }
+SPLAT_INLINE Ints as_ints(Floats v) { return reinterpret_cast<Ints>(v); }
+SPLAT_INLINE Ints fill_int(int32_t x) { return Ints{} + x; }
+SPLAT_INLINE Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
+
+// 2^x for x in [-126, 127]; elsewhere anything at all comes out. A polynomial of degree 5, minimax of the relative
+// error (1e-7 with its rounding), of what x is above a whole number, which goes to the exponent.
+SPLAT_INLINE Floats exp2(Floats x) {
+#if SPLAT_ISA_AVX512
+    const Floats f = _mm512_reduce_ps(x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // in [0, 1)
+    Floats p = fill(0.00187757669f);
+    p = fma(p, f, fill(0.00898933969f));
+    p = fma(p, f, fill(0.0558263175f));
+    p = fma(p, f, fill(0.240153611f));
+    p = fma(p, f, fill(0.693153083f));
+    p = fma(p, f, fill(0.99999994f));
+    return _mm512_scalef_ps(p, x);  // p 2^floor(x)
+#else
+    const Floats magic = fill(12582912.0f);  // 1.5 · 2^23: the sum's low bits are the nearest whole number
+    const Floats shifted = x + magic;
+    const Floats f = x - (shifted - magic);  // in [-1/2, 1/2]
+    Floats p = fill(0.00132647273f);
+    p = fma(p, f, fill(0.00967151299f));
+    p = fma(p, f, fill(0.0555073358f));
+    p = fma(p, f, fill(0.240222424f));
+    p = fma(p, f, fill(0.693147004f));
+    p = fma(p, f, fill(1.0f));
+    return as_floats(as_ints(p) + (as_ints(shifted) << 23));
+#endif
+}
+
+// 2^x with overflow to a huge number and underflow to (nearly) 0.
+SPLAT_INLINE Floats exp2_wide(Floats x) { return exp2(clamp(x, fill(-126.0f), fill(127.0f))); }
+
+// log2(x), normal x > 0, within 2 ulp or so: x = m 2^e with m in [√½, √2), log m = 2 artanh((m - 1)/(m + 1)) by its
+// series.
+SPLAT_INLINE Floats log2(Floats x) {
+    const Ints from_half_root = as_ints(x) - 0x3f3504f3;  // bits of √½
+    const Ints exponent = from_half_root >> 23;
+    const Floats m = as_floats(as_ints(x) - (exponent << 23));
+    const Floats s = (m - fill(1.0f)) / (m + fill(1.0f)), s2 = s * s;
+    Floats p = fill(2.885390082f / 9.0f);  // 2 / ln 2 over the odd numbers
+    p = fma(p, s2, fill(2.885390082f / 7.0f));
+    p = fma(p, s2, fill(2.885390082f / 5.0f));
+    p = fma(p, s2, fill(2.885390082f / 3.0f));
+    p = fma(p, s2, fill(2.885390082f));
+    return fma(p, s, __builtin_convertvector(exponent, Floats));
+}
+
+}  // namespace
+}  // namespace SPLAT_ISA_NAMESPACE
+}  // namespace splat

@@ -1,0 +1,240 @@
+// The mathematics of one Gaussian's projection and its derivative, a Gaussian a lane. For kernel files.
+//
+// Σ' = B Bᵀ + 0.3 I with the 2 x 3 matrix B = J W R S: its rows are all that is kept, and det(B Bᵀ) = |row0 x row1|²
+// (Cauchy-Binet) does not cancel.
+#pragma once
+
+#include "raster.h"
+#include "simd.h"
+
+namespace splat {
+namespace SPLAT_ISA_NAMESPACE {
+namespace {
+
+struct Vec3 {
+    Floats x, y, z;
+};
+
+SPLAT_INLINE Vec3 operator+(const Vec3& a, const Vec3& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+SPLAT_INLINE Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+SPLAT_INLINE Vec3 operator*(Floats s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
+SPLAT_INLINE Vec3 times(const Vec3& a, const Vec3& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+SPLAT_INLINE Floats dot(const Vec3& a, const Vec3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+SPLAT_INLINE Vec3 cross(const Vec3& a, const Vec3& b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+SPLAT_INLINE Vec3 fill3(const float* p) { return {fill(p[0]), fill(p[1]), fill(p[2])}; }
+SPLAT_INLINE Vec3 gather3(const float* p, int stride) {
+    return {gather(p, stride), gather(p + 1, stride), gather(p + 2, stride)};
+}
+
+// The raw parameters of a vector of Gaussians, SH apart.
+struct Lanes {
+    Vec3 mean, log_scale;
+    Floats qw, qx, qy, qz, logit;
+};
+
+// All that the derivative wants to know again.
+struct Projection {
+    Vec3 point;                      // camera frame
+    Floats inv_z, ratio_x, ratio_y;  // ratios clamped
+    Mask clamped_x, clamped_y;
+    Vec3 r0, r1, r2;                  // rows of the rotation matrix
+    Floats qw, qx, qy, qz, inv_norm;  // unit quaternion
+    Vec3 jw0, jw1;                    // rows of J W
+    Vec3 scale, row0, row1;           // row0, row1: of B
+    Floats xx, xy, yy;                // Σ', with the blur
+    Vec3 normal;                      // row0 x row1
+    Floats sharp, det;                // det without and with the blur
+    Floats opacity;                   // without compensation
+    Mask compensated;                 // anti-aliased and above the floor
+    Floats log2_opacity;              // with compensation
+    Mask usable;                      // of what is in here
+};
+
+SPLAT_INLINE Floats sigmoid_and_log2(Floats logit, Floats* log2_sigmoid) {
+    const Floats one_plus = fill(1.0f) + exp2_wide(logit * fill(-1.44269504f));
+    *log2_sigmoid = -log2(one_plus);
+    return fill(1.0f) / one_plus;
+}
+
+SPLAT_INLINE void rotate(const Lanes& in, Projection* p) {
+    const Floats norm2 = in.qw * in.qw + in.qx * in.qx + in.qy * in.qy + in.qz * in.qz;
+    p->usable = both(p->usable, at_most(norm2, fill(kMaxQuatNorm2)));
+    p->inv_norm = fill(1.0f) / sqrt(norm2 + fill(kQuatEpsilon));
+    const Floats w = in.qw * p->inv_norm, x = in.qx * p->inv_norm, y = in.qy * p->inv_norm, z = in.qz * p->inv_norm;
+    p->qw = w, p->qx = x, p->qy = y, p->qz = z;
+    const Floats one = fill(1.0f), two = fill(2.0f);
+    p->r0 = {one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)};
+    p->r1 = {two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)};
+    p->r2 = {two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)};
+}
+
+SPLAT_INLINE Projection project_lanes(const View& view, const Lanes& in) {
+    Projection p;
+    const Vec3 w0 = fill3(view.rotation), w1 = fill3(view.rotation + 3), w2 = fill3(view.rotation + 6);
+    p.point = {dot(w0, in.mean) + fill(view.translation[0]), dot(w1, in.mean) + fill(view.translation[1]),
+               dot(w2, in.mean) + fill(view.translation[2])};
+    p.usable = both(less(fill(view.near_z), p.point.z), at_most(p.point.z, fill(kMaxDepth)));
+    p.inv_z = fill(1.0f) / select(p.usable, p.point.z, fill(1.0f));
+    const Floats ratio_x = p.point.x * p.inv_z, ratio_y = p.point.y * p.inv_z;
+    p.ratio_x = clamp(ratio_x, fill(view.ratio_min[0]), fill(view.ratio_max[0]));
+    p.ratio_y = clamp(ratio_y, fill(view.ratio_min[1]), fill(view.ratio_max[1]));
+    p.clamped_x = either(less(p.ratio_x, ratio_x), less(ratio_x, p.ratio_x));
+    p.clamped_y = either(less(p.ratio_y, ratio_y), less(ratio_y, p.ratio_y));
+    p.jw0 = (fill(view.fx) * p.inv_z) * (w0 - p.ratio_x * w2);
+    p.jw1 = (fill(view.fy) * p.inv_z) * (w1 - p.ratio_y * w2);
+
+    rotate(in, &p);
+    const Floats log2e = fill(1.44269504f);
+    p.scale = {exp2_wide(in.log_scale.x * log2e), exp2_wide(in.log_scale.y * log2e), exp2_wide(in.log_scale.z * log2e)};
+    p.row0 = times(p.jw0.x * p.r0 + p.jw0.y * p.r1 + p.jw0.z * p.r2, p.scale);
+    p.row1 = times(p.jw1.x * p.r0 + p.jw1.y * p.r1 + p.jw1.z * p.r2, p.scale);
+    const Floats xx = dot(p.row0, p.row0), yy = dot(p.row1, p.row1), blur = fill(kBlurPx2);
+    p.xx = xx + blur, p.xy = dot(p.row0, p.row1), p.yy = yy + blur;
+    p.normal = cross(p.row0, p.row1);
+    p.sharp = dot(p.normal, p.normal);
+    p.det = p.sharp + blur * (xx + yy) + fill(kBlurPx2 * kBlurPx2);
+
+    p.opacity = sigmoid_and_log2(in.logit, &p.log2_opacity);
+    p.compensated = none();
+    if (view.antialias) {
+        const Floats ratio = p.sharp / p.det, floor = fill(kCompensationMin);
+        p.compensated = at_most(floor, ratio);
+        p.log2_opacity = p.log2_opacity + fill(0.5f) * log2(select(p.compensated, ratio, floor));
+    }
+    const Floats limit = fill(kMaxVariancePx2);
+    p.usable = both(p.usable, both(at_most(p.xx, limit), at_most(p.yy, limit)));
+    p.usable = both(p.usable, at_most(fill(kLog2AlphaMin), p.log2_opacity));
+    // 0 x is NaN where x is not finite.
+    const Floats zero = fill(0.0f);
+    const Floats sum = zero * in.mean.x + zero * in.mean.y + zero * in.mean.z + zero * in.log_scale.x +
+                       zero * in.log_scale.y + zero * in.log_scale.z + zero * in.qw + zero * in.qx + zero * in.qy +
+                       zero * in.qz + zero * in.logit;
+    p.usable = both(p.usable, at_most(sum, zero));
+    return p;
+}
+
+// The basis of scene/sh.py at unit directions, degree 0..3. With slopes: its derivatives by x, y, z.
+constexpr float kSh0 = 0.28209479177387814f;
+constexpr float kSh1 = 0.4886025119029199f;
+constexpr float kSh2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};
+constexpr float kSh3[5] = {0.5900435899266435f, 2.890611442640554f, 0.4570457994644658f, 0.3731763325901154f,
+                           1.445305721320277f};
+
+SPLAT_INLINE void sh_basis(int degree, const Vec3& d, Floats* basis) {
+    const Floats x = d.x, y = d.y, z = d.z;
+    basis[0] = fill(kSh0);
+    if (degree < 1) return;
+    basis[1] = fill(-kSh1) * y, basis[2] = fill(kSh1) * z, basis[3] = fill(-kSh1) * x;
+    if (degree < 2) return;
+    const Floats xx = x * x, yy = y * y, zz = z * z, two = fill(2.0f), three = fill(3.0f), four = fill(4.0f);
+    basis[4] = fill(kSh2[0]) * x * y, basis[5] = fill(-kSh2[0]) * y * z;
+    basis[6] = fill(kSh2[1]) * (two * zz - xx - yy);
+    basis[7] = fill(-kSh2[0]) * x * z, basis[8] = fill(kSh2[2]) * (xx - yy);
+    if (degree < 3) return;
+    basis[9] = fill(-kSh3[0]) * y * (three * xx - yy);
+    basis[10] = fill(kSh3[1]) * x * y * z;
+    basis[11] = fill(-kSh3[2]) * y * (four * zz - xx - yy);
+    basis[12] = fill(kSh3[3]) * z * (two * zz - three * xx - three * yy);
+    basis[13] = fill(-kSh3[2]) * x * (four * zz - xx - yy);
+    basis[14] = fill(kSh3[4]) * z * (xx - yy);
+    basis[15] = fill(-kSh3[0]) * x * (xx - three * yy);
+}
+
+// weights[k]: dL/d(basis k). Returns dL/d(direction), before it is confined to the sphere.
+SPLAT_INLINE Vec3 sh_direction_gradient(int degree, const Vec3& d, const Floats* weights) {
+    const Floats x = d.x, y = d.y, z = d.z, zero = fill(0.0f);
+    Vec3 g = {zero, zero, zero};
+    if (degree < 1) return g;
+    g = {fill(-kSh1) * weights[3], fill(-kSh1) * weights[1], fill(kSh1) * weights[2]};
+    if (degree < 2) return g;
+    const Floats w4 = fill(kSh2[0]) * weights[4], w5 = fill(-kSh2[0]) * weights[5], w6 = fill(2 * kSh2[1]) * weights[6];
+    const Floats w7 = fill(-kSh2[0]) * weights[7], w8 = fill(2 * kSh2[2]) * weights[8], two = fill(2.0f);
+    g = g + Vec3{w4 * y - w6 * x + w7 * z + w8 * x, w4 * x + w5 * z - w6 * y - w8 * y, w5 * y + two * w6 * z + w7 * x};
+    if (degree < 3) return g;
+    const Floats xx = x * x, yy = y * y, zz = z * z, three = fill(3.0f), four = fill(4.0f), six = fill(6.0f);
+    const Floats w9 = fill(-kSh3[0]) * weights[9], w10 = fill(kSh3[1]) * weights[10],
+                 w11 = fill(-kSh3[2]) * weights[11];
+    const Floats w12 = fill(kSh3[3]) * weights[12], w13 = fill(-kSh3[2]) * weights[13];
+    const Floats w14 = fill(kSh3[4]) * weights[14], w15 = fill(-kSh3[0]) * weights[15];
+    const Floats eight = fill(8.0f);
+    g.x = g.x + w9 * (six * x * y) + w10 * (y * z) - w11 * (two * x * y) - w12 * (six * x * z) +
+          w13 * (four * zz - three * xx - yy) + w14 * (two * x * z) + w15 * (three * xx - three * yy);
+    g.y = g.y + w9 * (three * xx - three * yy) + w10 * (x * z) + w11 * (four * zz - xx - three * yy) -
+          w12 * (six * y * z) - w13 * (two * x * y) - w14 * (two * y * z) - w15 * (six * x * y);
+    g.z = g.z + w10 * (x * y) + w11 * (eight * y * z) + w12 * (six * zz - three * xx - three * yy) +
+          w13 * (eight * x * z) + w14 * (xx - yy);
+    return g;
+}
+
+// What comes back for a splat, per lane.
+struct SplatGradient {
+    Floats s, su, sv, suu, suv, svv;  // sums over pixels of s = dL/d(ln alpha), times moments of (u, v)
+    Vec3 colour;
+    Floats depth;
+};
+
+// dL/d(raw parameters), SH apart.
+struct LanesGradient {
+    Vec3 mean, log_scale;
+    Floats qw, qx, qy, qz, logit, mean2d_x, mean2d_y;
+};
+
+SPLAT_INLINE void quat_gradient(const Projection& p, const Vec3& g0, const Vec3& g1, const Vec3& g2,
+                                LanesGradient* out) {
+    const Floats w = p.qw, x = p.qx, y = p.qy, z = p.qz, two = fill(2.0f);  // g0, g1, g2: rows of dL/dR
+    const Floats dw = two * (z * (g1.x - g0.y) + y * (g0.z - g2.x) + x * (g2.y - g1.z));
+    const Floats dx = two * (y * (g0.y + g1.x) + z * (g0.z + g2.x) - two * x * (g1.y + g2.z) + w * (g2.y - g1.z));
+    const Floats dy = two * (x * (g0.y + g1.x) + z * (g1.z + g2.y) - two * y * (g0.x + g2.z) + w * (g0.z - g2.x));
+    const Floats dz = two * (x * (g0.z + g2.x) + y * (g1.z + g2.y) - two * z * (g0.x + g1.y) + w * (g1.x - g0.y));
+    const Floats along = w * dw + x * dx + y * dy + z * dz;
+    out->qw = p.inv_norm * (dw - w * along), out->qx = p.inv_norm * (dx - x * along);
+    out->qy = p.inv_norm * (dy - y * along), out->qz = p.inv_norm * (dz - z * along);
+}
+
+// dL/dB from the sums: dL/dΣ' = 1/2 Σ s (Q d)(Q d)ᵀ with Q = Σ'⁻¹ = AᵀA / k, A = [[a, b], [0, c]], k = kHalfLog2E.
+SPLAT_INLINE void rows_gradient(const Projection& p, const SplatGradient& in, Floats a, Floats b, Floats c, Vec3* drow0,
+                                Vec3* drow1) {
+    const Floats half = fill(0.5f / (kHalfLog2E * kHalfLog2E));
+    Floats gxx = half * a * a * in.suu;
+    Floats gxy = half * a * (b * in.suu + c * in.suv);
+    Floats gyy = half * (b * b * in.suu + fill(2.0f) * b * c * in.suv + c * c * in.svv);
+    const Floats s = only(p.compensated, in.s);  // through ln of the compensation, 1/2 ln(sharp / det)
+    const Floats s_det = fill(0.5f) * s / p.det;
+    gxx = gxx - s_det * p.yy, gyy = gyy - s_det * p.xx, gxy = gxy + s_det * p.xy;
+    const Floats two = fill(2.0f), s_sharp = s / select(p.compensated, p.sharp, fill(1.0f));
+    *drow0 = two * (gxx * p.row0 + gxy * p.row1) + s_sharp * cross(p.row1, p.normal);
+    *drow1 = two * (gxy * p.row0 + gyy * p.row1) + s_sharp * cross(p.normal, p.row0);
+}
+
+// The derivative of project_lanes, the mean's share through the colour apart.
+SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projection& p, const SplatGradient& in) {
+    LanesGradient out;
+    const Floats a = sqrt(fill(kHalfLog2E) * p.yy / p.det), b = -a * p.xy / p.yy, c = sqrt(fill(kHalfLog2E) / p.yy);
+    Vec3 drow0, drow1;
+    rows_gradient(p, in, a, b, c, &drow0, &drow1);
+    out.log_scale = times(drow0, p.row0) + times(drow1, p.row1);
+    const Vec3 du0 = times(drow0, p.scale), du1 = times(drow1, p.scale);  // of J W R
+    quat_gradient(p, p.jw0.x * du0 + p.jw1.x * du1, p.jw0.y * du0 + p.jw1.y * du1, p.jw0.z * du0 + p.jw1.z * du1, &out);
+    out.logit = in.s * (fill(1.0f) - p.opacity);
+
+    const Floats inv_k = fill(1.0f / kHalfLog2E);
+    out.mean2d_x = inv_k * a * in.su;
+    out.mean2d_y = inv_k * (b * in.su + c * in.sv);
+    const Vec3 w0 = fill3(view.rotation), w1 = fill3(view.rotation + 3), w2 = fill3(view.rotation + 6);
+    const Vec3 djw0 = {dot(du0, p.r0), dot(du0, p.r1), dot(du0, p.r2)};
+    const Vec3 djw1 = {dot(du1, p.r0), dot(du1, p.r1), dot(du1, p.r2)};
+    const Floats fx = fill(view.fx), fy = fill(view.fy), zero = fill(0.0f);
+    Floats dinv_z = fx * dot(djw0, w0 - p.ratio_x * w2) + fy * dot(djw1, w1 - p.ratio_y * w2);
+    const Floats dratio_x = fx * out.mean2d_x + select(p.clamped_x, zero, -fx * p.inv_z * dot(djw0, w2));
+    const Floats dratio_y = fy * out.mean2d_y + select(p.clamped_y, zero, -fy * p.inv_z * dot(djw1, w2));
+    dinv_z = dinv_z + dratio_x * p.point.x + dratio_y * p.point.y;
+    const Floats dz = in.depth - p.inv_z * p.inv_z * dinv_z;
+    out.mean = (dratio_x * p.inv_z) * w0 + (dratio_y * p.inv_z) * w1 + dz * w2;
+    return out;
+}
+
+}  // namespace
+}  // namespace SPLAT_ISA_NAMESPACE
+}  // namespace splat

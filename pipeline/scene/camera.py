@@ -1,0 +1,79 @@
+"""A pinhole view, and the frames that the whole project uses.
+
+Frames, stated once:
+
+- Camera: OpenCV's and COLMAP's, x right, y down, z forward.
+- Pixels: the centre of the first pixel is (0.5, 0.5), COLMAP's convention; OpenCV's keypoints need half a pixel more.
+- Rotations: quaternions are (w, x, y, z), Hamilton's.
+- Poses: ``cam_from_world``; names read right to left, ``x_cam = cam_from_world @ x_world``.
+- World: up to georeferencing the normalised frame of the sparse model; after it local east, north, up in metres about
+  an origin kept in float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A photo's pinhole camera and where it stood.
+
+    Attributes:
+        name: The image's name in its dataset, POSIX form.
+        width: Image width, pixels.
+        height: Image height, pixels.
+        fx: Focal length along x, pixels.
+        fy: Focal length along y, pixels.
+        cx: Principal point x, pixels; the middle of the image is ``width / 2``.
+        cy: Principal point y, pixels.
+        cam_from_world: Rigid transform, world units.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    cam_from_world: Float64[np.ndarray, "4 4"]
+
+    def centre(self) -> Float64[np.ndarray, " 3"]:
+        """The projection centre in the world."""
+        return np.asarray(-self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3])
+
+    def k(self) -> Float64[np.ndarray, "3 3"]:
+        """The intrinsic matrix, pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same view resampled to another size.
+
+        Args:
+            width: New width, pixels.
+            height: New height, pixels.
+        """
+        by_x, by_y = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * by_x,
+            fy=self.fy * by_y,
+            cx=self.cx * by_x,
+            cy=self.cy * by_y,
+        )
+
+    def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
+        """Project world points to pixels.
+
+        Args:
+            points: World points; those at or behind the camera's plane have no meaningful projection.
+        """
+        in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
+        in_image = in_camera[:, :2] / in_camera[:, 2:]
+        return np.asarray(in_image * [self.fx, self.fy] + [self.cx, self.cy])

@@ -1,0 +1,175 @@
+"""What EXIF says about a photo, from untrusted bytes: every value is checked, a bad one is None."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from PIL import ExifTags, Image
+
+TAG = ExifTags.Base
+GPS = ExifTags.GPS
+MAX_TEXT_CHARS = 64
+MAX_SIDE_PX = 1_000_000
+MM_PER_FOCAL_PLANE_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF 2.32, FocalPlaneResolutionUnit; 4, 5 by TIFF/EP
+BELOW = (1, 3)  # GPSAltitudeRef: below sea level; EXIF 3.0 adds 3, below the ellipsoid
+VOID = "V"  # GPSStatus of a receiver without a fix
+
+
+@dataclass(frozen=True)
+class Gps:
+    """A position as EXIF states it: NaN where a value is there but is none; not yet checked for plausibility.
+
+    Attributes:
+        latitude: Degrees north, WGS84.
+        longitude: Degrees east, WGS84.
+        altitude_m: Metres above what AltitudeRef calls sea level, or None.
+        horizontal_error_m: GPSHPositioningError, or None.
+        void: The receiver said that it had no fix.
+    """
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None = None
+    horizontal_error_m: float | None = None
+    void: bool = False
+
+
+@dataclass(frozen=True)
+class Exif:
+    """The tags that photogrammetry uses.
+
+    Attributes:
+        make: Without NULs and blanks around; empty when unknown.
+        model: Likewise.
+        orientation: 1 to 8; 1 when unknown.
+        time: ISO 8601 local time, or None.
+        focal_mm: Focal length, or None.
+        focal_35mm: Rounded 35 mm equivalent, or None.
+        focal_plane_px_per_mm: FocalPlaneXResolution per millimetre, or None.
+        width: The picture's width when it was taken (PixelXDimension), or None.
+        height: Likewise.
+        gps: Position, or None when EXIF has none.
+    """
+
+    make: str = ""
+    model: str = ""
+    orientation: int = 1
+    time: str | None = None
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    focal_plane_px_per_mm: float | None = None
+    width: int | None = None
+    height: int | None = None
+    gps: Gps | None = None
+
+
+def read_exif(picture: Image.Image) -> Exif:
+    """Read a picture's EXIF. Never raises: what cannot be read is left at its default.
+
+    Args:
+        picture: Opened and not yet loaded (Pillow turns a TIFF, and forgets its orientation, when it loads).
+    """
+    base = _tags(picture, None)
+    tags = {**base, **_tags(picture, ExifTags.IFD.Exif)}
+    orientation = _number(base.get(TAG.Orientation), 1, 8)
+    width = _number(tags.get(TAG.ExifImageWidth), 1, MAX_SIDE_PX)
+    height = _number(tags.get(TAG.ExifImageHeight), 1, MAX_SIDE_PX)
+    return Exif(
+        make=_text(base.get(TAG.Make)),
+        model=_text(base.get(TAG.Model)),
+        orientation=int(orientation) if orientation is not None else 1,
+        time=_time(tags),
+        focal_mm=_number(tags.get(TAG.FocalLength), 0.1, 10_000),
+        focal_35mm=_number(tags.get(TAG.FocalLengthIn35mmFilm), 1, 10_000),
+        focal_plane_px_per_mm=_focal_plane(tags),
+        width=int(width) if width is not None else None,
+        height=int(height) if height is not None else None,
+        gps=_gps(_tags(picture, ExifTags.IFD.GPSInfo)),
+    )
+
+
+def _tags(picture: Image.Image, ifd: int | None) -> dict[int, Any]:
+    try:
+        exif = picture.getexif()
+        return dict(exif.items()) if ifd is None else dict(exif.get_ifd(ifd).items())
+    except Exception:  # Pillow's reader raises almost anything on hostile EXIF; the photo itself may be good
+        return {}
+
+
+def _number(value: Any, low: int | float, high: int | float) -> float | None:
+    """A finite number within bounds, else None; sequences of one count as their element."""
+    if isinstance(value, (tuple, list)) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, (str, bytes, bool)) or value is None:
+        return None
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and low <= number <= high else None
+
+
+def _text(value: Any) -> str:
+    """A short text without NULs, control characters and surrounding blanks."""
+    if isinstance(value, bytes):
+        value = value.decode("ascii", errors="replace")
+    if not isinstance(value, str):
+        return ""
+    kept = "".join(sign if sign.isprintable() else " " for sign in value.partition("\0")[0])
+    return " ".join(kept.split())[:MAX_TEXT_CHARS]
+
+
+def _time(tags: Mapping[int, Any]) -> str | None:
+    for tag, fraction in (
+        (TAG.DateTimeOriginal, TAG.SubsecTimeOriginal),
+        (TAG.DateTimeDigitized, TAG.SubsecTimeDigitized),
+        (TAG.DateTime, TAG.SubsecTime),
+    ):
+        try:
+            time = datetime.datetime.strptime(_text(tags.get(tag)), "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            continue
+        digits = _text(tags.get(fraction))
+        decimals = f".{digits[:6]}" if digits.isascii() and digits.isdigit() else ""
+        return time.isoformat() + decimals
+    return None
+
+
+def _focal_plane(tags: Mapping[int, Any]) -> float | None:
+    resolution = _number(tags.get(TAG.FocalPlaneXResolution), 1e-6, 1e9)
+    unit = _number(tags.get(TAG.FocalPlaneResolutionUnit), 2, 5)
+    if resolution is None:
+        return None
+    return resolution / MM_PER_FOCAL_PLANE_UNIT.get(int(unit) if unit is not None else 2, 25.4)
+
+
+def _gps(tags: Mapping[int, Any]) -> Gps | None:
+    if GPS.GPSLatitude not in tags or GPS.GPSLongitude not in tags:
+        return None
+    altitude = _number(tags.get(GPS.GPSAltitude), -1e9, 1e9)
+    reference = tags.get(GPS.GPSAltitudeRef)
+    if isinstance(reference, bytes):
+        reference = reference[0] if reference else 0
+    if altitude is not None and reference in BELOW:
+        altitude = -abs(altitude)
+    return Gps(
+        latitude=_degrees(tags[GPS.GPSLatitude], tags.get(GPS.GPSLatitudeRef), "S"),
+        longitude=_degrees(tags[GPS.GPSLongitude], tags.get(GPS.GPSLongitudeRef), "W"),
+        altitude_m=altitude,
+        horizontal_error_m=_number(tags.get(GPS.GPSHPositioningError), 1e-4, 1e5),
+        void=_text(tags.get(GPS.GPSStatus)).upper() == VOID,
+    )
+
+
+def _degrees(value: Any, reference: Any, negative: str) -> float:
+    """Degrees, minutes, seconds (or fewer of them) to signed degrees; NaN when they are none."""
+    parts = value if isinstance(value, (tuple, list)) else (value,)
+    numbers = [_number(part, -1e6, 1e6) for part in parts]
+    if not 1 <= len(numbers) <= 3 or any(number is None for number in numbers):
+        return math.nan
+    degrees = sum(number / 60.0**power for power, number in enumerate(numbers) if number is not None)
+    return -abs(degrees) if _text(reference).upper() == negative else degrees

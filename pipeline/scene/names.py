@@ -1,0 +1,67 @@
+"""Photo names: which photo a name from elsewhere means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import PurePosixPath
+
+PHOTO_SUFFIXES = ("jpg", "jpeg", "jpe", "jfif", "mpo", "png", "tif", "tiff")
+
+
+class NameFinder:
+    """The photo that a name means: the same, else the only one alike but for case, then suffix, then folder.
+
+    Programs that export models differ in what of the path, and of the suffix, they keep; so do people.
+
+    Args:
+        photos: Names of all photos.
+    """
+
+    def __init__(self, photos: Iterable[str]) -> None:
+        self._tables: list[tuple[Callable[[str], str], dict[str, str | None]]] = []
+        names = list(dict.fromkeys(photos))
+        for key in (str, _folded, _without_suffix, _last, lambda name: _without_suffix(_last(name))):
+            table: dict[str, str | None] = {}
+            for name in names:
+                table[key(name)] = None if key(name) in table else name
+            self._tables.append((key, table))
+
+    def __call__(self, name: str) -> str | None:
+        """The photo's name; None where there is none, or several."""
+        found = (table.get(key(name)) for key, table in self._tables)
+        return next((photo for photo in found if photo is not None), None)
+
+
+def match_names(names: Iterable[str], photos: Iterable[str]) -> dict[str, str]:
+    """The photos that a model's images mean, each photo at most once; names that are equal go first.
+
+    Args:
+        names: Of the model's images.
+        photos: Of all photos.
+
+    Returns:
+        The photo's name by the image's, without the images that have none.
+    """
+    known = set(photos)
+    find = NameFinder(sorted(known))
+    matched: dict[str, str] = {}
+    taken: set[str] = set()
+    for name in sorted(set(names), key=lambda name: (name not in known, name)):
+        photo = find(name)
+        if photo is not None and photo not in taken:
+            matched[name] = photo
+            taken.add(photo)
+    return matched
+
+
+def _folded(name: str) -> str:
+    return name.replace("\\", "/").casefold()
+
+
+def _last(name: str) -> str:
+    return PurePosixPath(_folded(name)).name
+
+
+def _without_suffix(name: str) -> str:
+    stem, dot, suffix = _folded(name).rpartition(".")
+    return stem if dot and suffix in PHOTO_SUFFIXES else _folded(name)

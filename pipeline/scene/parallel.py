@@ -1,0 +1,62 @@
+"""Work on many photos by threads: results in order, and only a few photos in memory at a time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+AHEAD = 2  # finished results that may wait for a slower one before them
+LOOK_S = 0.3
+
+
+def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """Apply a function to each item by threads, and yield the results in the items' order.
+
+    Only ``threads + AHEAD`` results exist at a time. Where the caller stops or fails, what has not begun is dropped and
+    what runs is not waited for, so that an interrupted stage ends at once.
+
+    Args:
+        function: Called from several threads at once; should spend its time outside the GIL.
+        items: Taken one by one.
+        threads: At least 1.
+    """
+    pool = ThreadPoolExecutor(max(1, threads))
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) >= threads + AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
+
+
+def watched(function: Callable[[], Result], look: Callable[[], None], cancel: Callable[[], None]) -> Result:
+    """Run one long call in a thread of its own, so that this one can tell of its progress and be interrupted.
+
+    Args:
+        function: Spends its time outside the GIL.
+        look: Called a few times a second while it runs.
+        cancel: Called when this thread is interrupted or ``look`` fails; the call is then not waited for.
+    """
+    pool = ThreadPoolExecutor(1)
+    job = pool.submit(function)
+    try:
+        while not job.done():
+            wait([job], LOOK_S)
+            look()
+        return job.result()
+    except BaseException:
+        cancel()
+        raise
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,221 @@
+"""The checked photo list that ingest leaves, and how its photos and masks are read.
+
+Pixels stay in the stored grid: the EXIF orientation is kept as a number, for pictures that people look at, and never
+applied to geometry. A photo is read from the user's folder when its file is plain 8-bit RGB or grey, else from the
+PNG that ingest converted it to.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+
+# MPO, a JPEG that carries a second picture, as DJI and phones write, is opened by Pillow's JPEG.
+PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
+LIST_NAME = "photos.json"
+CONVERTED_DIR = "converted"
+MASK_DIR = "masks"
+MODEL_FILES = ("cameras.bin", "cameras.txt")
+UNTURN = {  # the inverse of the turn that each EXIF orientation asks for
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo that takes part.
+
+    Attributes:
+        name: Path relative to the photo folder, in POSIX form; also its name in COLMAP's files.
+        sha256: Of the file's bytes, in hexadecimal.
+        width: Of the stored grid, pixels.
+        height: Of the stored grid, pixels.
+        camera: Index into the camera groups of ``ingest.cameras``.
+        time: When it was taken, ISO 8601 local time of the camera; None when EXIF does not say.
+        orientation: EXIF's, 1 to 8; how to turn the picture for people, and only for them.
+        converted: The 8-bit PNG to read instead of the file, relative to the part; None when the file itself is plain.
+        mask: The 8-bit PNG mask in the stored grid at full size, 0 where ignored, else 255; relative to the part.
+    """
+
+    name: str
+    sha256: str
+    width: int
+    height: int
+    camera: int
+    time: str | None = None
+    orientation: int = 1
+    converted: str | None = None
+    mask: str | None = None
+
+
+@dataclass(frozen=True)
+class PhotoList:
+    """The photos that take part, sorted by name."""
+
+    photos: tuple[Photo, ...]
+
+    def __len__(self) -> int:
+        return len(self.photos)
+
+    def by_name(self) -> Mapping[str, Photo]:
+        """The photos under their names."""
+        return {photo.name: photo for photo in self.photos}
+
+
+def save_photo_list(photo_list: PhotoList, part: Path) -> None:
+    """Write ``photos.json`` into a part's folder (which must exist); the bytes depend on the list alone."""
+    records = [asdict(photo) for photo in sorted(photo_list.photos, key=lambda photo: photo.name)]
+    text = json.dumps({"photos": records}, indent=1, ensure_ascii=False) + "\n"
+    (part / LIST_NAME).write_text(text, encoding="utf-8")
+
+
+def load_photo_list(part: Path) -> PhotoList:
+    """Read the photo list that ingest left.
+
+    Args:
+        part: The folder of the part ``ingest.photos``.
+
+    Raises:
+        SplatpipeError: if the list is missing or broken.
+    """
+    try:
+        records: list[dict[str, Any]] = json.loads((part / LIST_NAME).read_text(encoding="utf-8"))["photos"]
+        photos = tuple(Photo(**record) for record in records)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SplatpipeError(
+            f"The photo list in {part} cannot be read: {error}", hint="Run again with --rerun ingest."
+        ) from error
+    return PhotoList(tuple(sorted(photos, key=lambda photo: photo.name)))
+
+
+def colmap_model(photos_dir: Path) -> Path | None:
+    """The sparse model of a COLMAP-style folder (``images/`` beside ``sparse/0`` or ``sparse``), or None."""
+    if not (photos_dir / "images").is_dir():
+        return None
+    for model in (photos_dir / "sparse" / "0", photos_dir / "sparse"):
+        if any((model / name).is_file() for name in MODEL_FILES):
+            return model
+    return None
+
+
+def photo_root(photos_dir: Path) -> Path:
+    """The folder that photo names are relative to: ``images/`` in a COLMAP-style folder, else the folder itself."""
+    return photos_dir if colmap_model(photos_dir) is None else photos_dir / "images"
+
+
+def photo_path(photo: Photo, part: Path, photos_dir: Path) -> Path:
+    """The file whose pixels stand for a photo: its own, or the one it was converted to."""
+    if photo.converted is not None:
+        return _inside(part, photo.converted)
+    return _inside(photo_root(photos_dir), photo.name)
+
+
+def decode(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Read a photo's pixels.
+
+    Args:
+        photo: One of the list's.
+        part: The folder of the part ``ingest.photos``.
+        photos_dir: The user's folder.
+
+    Returns:
+        RGB in the stored grid (no EXIF turn), writable.
+
+    Raises:
+        SplatpipeError: if the file is gone or is no longer the one that was checked.
+    """
+    path = photo_path(photo, part, photos_dir)
+    pixels = _read(path, "RGB", photo.name)
+    if pixels.shape != (photo.height, photo.width, 3):
+        raise _changed(photo.name, f"it is {pixels.shape[1]} × {pixels.shape[0]} px now")
+    return pixels
+
+
+def decode_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None:
+    """Read a photo's mask in the stored grid at full size: 0 where ignored, else 255; None when it has none.
+
+    Raises:
+        SplatpipeError: if the mask is gone or has another size than the photo.
+    """
+    if photo.mask is None:
+        return None
+    mask = _read(_inside(part, photo.mask), "L", photo.mask)
+    if mask.shape != (photo.height, photo.width):
+        raise _changed(photo.mask, f"it is {mask.shape[1]} × {mask.shape[0]} px now")
+    return mask
+
+
+def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
+    """Open a JPEG, PNG or TIFF by its content, without Pillow's own size limit.
+
+    Args:
+        source: A path or a binary file object.
+        max_pixels: Refuse a picture with more pixels before any of them is decoded.
+
+    Raises:
+        ValueError: if it has more than ``max_pixels`` pixels.
+        OSError: if it is no such picture (Pillow's ``UnidentifiedImageError`` is one).
+    """
+    Image.MAX_IMAGE_PIXELS = None  # Pillow's limit is process wide and refuses 200 MP panoramas; ours is the line below
+    picture = Image.open(source, formats=PHOTO_FORMATS)
+    if max_pixels is not None and picture.width * picture.height > max_pixels:
+        raise ValueError(f"it has {picture.width} × {picture.height} pixels")
+    return picture
+
+
+def load_stored(picture: Image.Image, orientation: int) -> Image.Image:
+    """Decode an opened picture whole, in the stored grid.
+
+    Args:
+        picture: From ``open_picture``, not yet loaded.
+        orientation: Its EXIF orientation, 1 to 8.
+    """
+    picture.load()
+    # Pillow turns a TIFF by its orientation while loading it, and no other format.
+    return unturn(picture, orientation) if picture.format == "TIFF" else picture
+
+
+def unturn(picture: Image.Image, orientation: int) -> Image.Image:
+    """Bring a picture that is turned for people (by an EXIF orientation, 1 to 8) back into the stored grid."""
+    method = UNTURN.get(orientation)
+    return picture if method is None else picture.transpose(method)
+
+
+def _read(path: Path, mode: str, name: str) -> np.ndarray:
+    try:
+        # What is read here was written by ingest or found plain by it: never a turned TIFF.
+        with open_picture(path) as picture:
+            return np.array(picture.convert(mode))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise _changed(name, str(error)) from error
+
+
+def _inside(folder: Path, relative: str) -> Path:
+    parts = PurePosixPath(relative)
+    if parts.is_absolute() or ".." in parts.parts:
+        raise SplatpipeError(
+            f"The photo list names a file outside its folder: {relative}", hint="Run with --rerun ingest."
+        )
+    return folder / parts
+
+
+def _changed(name: str, what: str) -> SplatpipeError:
+    return SplatpipeError(
+        f"{name} is not what it was when the photos were checked: {what}",
+        hint="Bring the photo back, or run again so that the photos are checked anew.",
+    )

@@ -1,0 +1,119 @@
+"""Similarities: scale, rotation and translation; and the least-squares one between two sets of points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``x_target = scale * rotation @ x_source + translation``.
+
+    Attributes:
+        scale: Positive.
+        rotation: (3, 3), proper.
+        translation: (3,), in the target's units.
+    """
+
+    scale: float
+    rotation: Float64[np.ndarray, "3 3"]
+    translation: Float64[np.ndarray, " 3"]
+
+    @staticmethod
+    def identity() -> Similarity:
+        """The one that changes nothing."""
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: Float64[np.ndarray, "4 4"]) -> Similarity:
+        """From a homogeneous matrix.
+
+        Raises:
+            ValueError: if it is no similarity: sheared, mirrored or not finite.
+        """
+        linear = matrix[:3, :3]
+        determinant = float(np.linalg.det(linear)) if np.isfinite(matrix).all() else 0.0
+        if determinant <= 0.0 or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            raise ValueError("not a similarity: mirrored, degenerate or not affine")
+        scale = determinant ** (1.0 / 3.0)
+        rotation = linear / scale
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise ValueError("not a similarity: sheared")
+        return Similarity(scale, rotation, matrix[:3, 3].copy())
+
+    def matrix(self) -> Float64[np.ndarray, "4 4"]:
+        """The homogeneous matrix."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    def apply(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Points of the source frame in the target frame."""
+        return np.asarray(self.scale * (points @ self.rotation.T) + self.translation)
+
+    def inverse(self) -> Similarity:
+        """Target to source."""
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def compose(self, first: Similarity) -> Similarity:
+        """``first``, then this one: ``(self.compose(first)).matrix() == self.matrix() @ first.matrix()``."""
+        return Similarity(
+            self.scale * first.scale,
+            self.rotation @ first.rotation,
+            self.scale * (self.rotation @ first.translation) + self.translation,
+        )
+
+    def camera_pose(self, cam_from_source: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+        """A rigid camera pose with its world changed from the source to the target frame; depths grow by the scale."""
+        pose = np.eye(4)
+        pose[:3, :3] = cam_from_source[:3, :3] @ self.rotation.T
+        pose[:3, 3] = self.scale * cam_from_source[:3, 3] - pose[:3, :3] @ self.translation
+        return pose
+
+
+def fit_similarity(
+    source: Float64[np.ndarray, "*batch n 3"],
+    target: Float64[np.ndarray, "*batch n 3"],
+    weights: Float64[np.ndarray, "*batch n"],
+) -> tuple[Float64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch 3 3"], Float64[np.ndarray, "*batch 3"]]:
+    """Weighted least-squares similarity in closed form (Umeyama, PAMI 1991, eqs. 40 to 42); also for a batch.
+
+    Returns:
+        Scale, rotation (always proper), translation.
+    """
+    weights = weights[..., None] / weights.sum(axis=-1)[..., None, None]
+    source_mean, target_mean = (weights * source).sum(axis=-2), (weights * target).sum(axis=-2)
+    source_from_mean, target_from_mean = source - source_mean[..., None, :], target - target_mean[..., None, :]
+    covariance = np.swapaxes(weights * target_from_mean, -1, -2) @ source_from_mean
+    u, singular, vt = np.linalg.svd(covariance)
+    signs = np.ones_like(singular)
+    signs[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation = (u * signs[..., None, :]) @ vt
+    variance = (weights * source_from_mean**2).sum(axis=(-1, -2))
+    scale = (singular * signs).sum(axis=-1) / np.where(variance > 0.0, variance, 1.0)
+    translation = target_mean - scale[..., None] * (rotation @ source_mean[..., None])[..., 0]
+    return np.asarray(scale), rotation, translation
+
+
+def rotation_from_vector(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Rodrigues' formula: the rotation about a vector by its length in radians."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.asarray(np.eye(3) + cross_matrix(vector))
+    k = cross_matrix(vector / angle)
+    return np.asarray(np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k))
+
+
+def cross_matrix(vectors: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
+    """``cross_matrix(a) @ b == cross(a, b)``."""
+    matrix = np.zeros((*vectors.shape[:-1], 3, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -vectors[..., 2], vectors[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = vectors[..., 2], -vectors[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -vectors[..., 1], vectors[..., 0]
+    return matrix

@@ -1,0 +1,201 @@
+"""Which way is up, and north, by the cameras alone: from how photographers hold them, or from a drone's gimbal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+# In the stored grid (x right, y down): where the top of the picture is that people are to see, by EXIF orientation.
+TOP_OF_ORIENTATION = {
+    1: (0.0, -1.0),
+    2: (0.0, -1.0),
+    3: (0.0, 1.0),
+    4: (0.0, 1.0),
+    5: (-1.0, 0.0),
+    6: (-1.0, 0.0),
+    7: (1.0, 0.0),
+    8: (1.0, 0.0),
+}
+ALIKE = 0.9  # length of the mean of unit vectors within some 25°
+STEADY = 0.997  # within some 4°: a gimbal, which points down better than the ground is level
+SCATTERED = 0.5  # of vectors that rather cancel
+GRID = 0.3  # spread of the cameras along the picture's height over that along its width, from which on it is a survey
+LEAST_WIDTH = 0.2  # of the fan of the cameras' horizontal axes: narrower, it does not show the plane it lies in
+MOST_THICKNESS = 0.35  # of that fan, over its width
+GROUND_POINTS = 5000
+LEAST_GROUND_POINTS = 50
+GROUND_SAMPLES = 500
+GROUND_COSINE = math.cos(math.radians(40.0))  # between the ground's normal and the cameras' mean view
+GROUND_THICKNESS = 0.015  # over the cameras' height above it
+GROUND_SHARE = 0.2  # of the points
+ROBUST_ROUNDS = 20
+LEAST_WEIGHT_RAD = 0.01
+
+
+@dataclass(frozen=True)
+class CameraAxes:
+    """Directions of upright cameras in the model's frame, unit vectors.
+
+    Attributes:
+        right: Of the picture that people are to see.
+        up: Its top.
+        forward: Viewing directions.
+    """
+
+    right: Float64[np.ndarray, "n 3"]
+    up: Float64[np.ndarray, "n 3"]
+    forward: Float64[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
+class Upright:
+    """An estimate of up in the model's frame and, in a few words, what it was taken from."""
+
+    up: Float64[np.ndarray, " 3"]
+    source: str
+
+
+def display_from_stored(orientation: int) -> Float64[np.ndarray, "3 3"]:
+    """Rotation from the stored grid's camera frame to that of the picture turned by EXIF (mirroring left aside)."""
+    top = np.array([*TOP_OF_ORIENTATION.get(orientation, (0.0, -1.0)), 0.0])
+    forward = np.array([0.0, 0.0, 1.0])
+    return np.stack([np.cross(-top, forward), -top, forward])
+
+
+def camera_axes(cam_from_world: Float64[np.ndarray, "n 3 3"], orientations: Int64[np.ndarray, " n"]) -> CameraAxes:
+    """Axes of the turned pictures in the world.
+
+    Args:
+        cam_from_world: Rotations of the stored grids.
+        orientations: EXIF's, 1 to 8.
+    """
+    turns = np.stack([display_from_stored(int(orientation)) for orientation in orientations])
+    rows = turns @ cam_from_world
+    return CameraAxes(rows[:, 0], -rows[:, 1], rows[:, 2])
+
+
+def up_from_cameras(
+    axes: CameraAxes, centres: Float64[np.ndarray, "n 3"], points: Float64[np.ndarray, "m 3"]
+) -> Upright:
+    """Up by the habit of holding cameras level: their horizontal axes lie in one plane, whatever they look at.
+
+    Cameras that are all turned alike do not show that plane. Then only the layout of their positions tells cameras that
+    look at a façade from those that look down: a survey spreads along both sides of its pictures. Down is where they
+    look or, when they sway (a kite), across the ground that most of the points lie on.
+
+    Args:
+        axes: Of the cameras.
+        centres: Their positions in the model.
+        points: The sparse cloud.
+    """
+    mean_up, mean_forward = axes.up.mean(axis=0), axes.forward.mean(axis=0)
+    normal, thickness, width = _plane_normal(axes.right)
+    if width > LEAST_WIDTH and thickness < MOST_THICKNESS * width:
+        sign = float(np.sign(((axes.up - axes.forward) @ normal).sum())) or 1.0
+        return Upright(sign * normal, "the horizontal edges of the pictures")
+    alike_up, alike_forward = float(np.linalg.norm(mean_up)), float(np.linalg.norm(mean_forward))
+    if alike_forward > ALIKE and (alike_up < SCATTERED or _is_survey(centres, _unit(mean_up), _unit(mean_forward))):
+        ground = _ground_normal(points, centres, -_unit(mean_forward))
+        if ground is not None and alike_forward < STEADY:
+            return Upright(ground, "the ground below cameras that look down")
+        return Upright(-_unit(mean_forward), "the viewing direction of cameras that look down")
+    if alike_up > SCATTERED:
+        return Upright(_unit(mean_up), "the upper edges of the pictures")
+    return Upright(_unit(mean_up - mean_forward), "the pictures' upper edges and viewing directions")
+
+
+def enu_from_gimbal(
+    yaw_deg: Float64[np.ndarray, " n"], pitch_deg: Float64[np.ndarray, " n"], roll_deg: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, "n 3 3"]:
+    """Rotations from the camera (x right, y down, z forward) to east-north-up.
+
+    Args:
+        yaw_deg: Clockwise from north.
+        pitch_deg: 0 level, -90 straight down (then the picture's top points to the yaw).
+        roll_deg: Clockwise seen from behind.
+    """
+    yaw, pitch, roll = np.radians(yaw_deg), np.radians(pitch_deg), np.radians(roll_deg)
+    forward = np.stack([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
+    level_right = np.stack([np.cos(yaw), -np.sin(yaw), np.zeros_like(yaw)], axis=1)
+    level_down = np.cross(forward, level_right)
+    right = np.cos(roll)[:, None] * level_right + np.sin(roll)[:, None] * level_down
+    return np.stack([right, np.cross(forward, right), forward], axis=2)
+
+
+def mean_rotation(rotations: Float64[np.ndarray, "n 3 3"]) -> tuple[Float64[np.ndarray, "3 3"], float]:
+    """Robust mean (least sum of chordal distances, by reweighting) and the median angle to it in radians."""
+    weights = np.ones(len(rotations))
+    for _ in range(ROBUST_ROUNDS):
+        u, _, vt = np.linalg.svd((weights[:, None, None] * rotations).sum(axis=0))
+        mean = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
+        cosines = (np.einsum("nij,ij->n", rotations, mean) - 1.0) / 2.0
+        angles = np.arccos(np.clip(cosines, -1.0, 1.0))
+        weights = 1.0 / np.maximum(angles, LEAST_WEIGHT_RAD)
+    return mean, float(np.median(angles))
+
+
+def rotation_to_up(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The least rotation that brings a unit vector to +z."""
+    cosine = float(up[2])
+    if cosine < -1.0 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = np.array([up[1], -up[0], 0.0])  # up × z
+    k = np.array([[0.0, 0.0, axis[1]], [0.0, 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.asarray(np.eye(3) + k + k @ k / (1.0 + cosine))
+
+
+def _plane_normal(vectors: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarray, " 3"], float, float]:
+    """The plane that unit vectors lie in, robust to some that do not.
+
+    Returns:
+        Its normal; how far the vectors are from it (its thickness) and how far from one line in it (their fan's width):
+        root mean squares, as sines of angles.
+    """
+    weights = np.ones(len(vectors))
+    for _ in range(ROBUST_ROUNDS):
+        values, axes = np.linalg.eigh((vectors * weights[:, None]).T @ vectors / weights.sum())
+        weights = 1.0 / np.maximum(np.abs(vectors @ axes[:, 0]), LEAST_WEIGHT_RAD)
+    return axes[:, 0], math.sqrt(max(float(values[0]), 0.0)), math.sqrt(max(float(values[1]), 0.0))
+
+
+def _is_survey(
+    centres: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"], forward: Float64[np.ndarray, " 3"]
+) -> bool:
+    """Whether cameras that look one way spread along both sides of their pictures."""
+    right = np.cross(forward, up)
+    return float(np.std(centres @ up)) > GRID * float(np.std(centres @ right))
+
+
+def _ground_normal(
+    points: Float64[np.ndarray, "m 3"], centres: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"]
+) -> Float64[np.ndarray, " 3"] | None:
+    """Normal of the plane that holds most points, by RANSAC from a fixed seed; None where no plane below holds many."""
+    if len(points) < LEAST_GROUND_POINTS:
+        return None
+    generator = np.random.Generator(np.random.PCG64(0))
+    chosen = points[np.sort(generator.choice(len(points), min(len(points), GROUND_POINTS), replace=False))]
+    height = float(np.median(centres @ up) - np.median(chosen @ up))
+    corners = chosen[generator.integers(0, len(chosen), (GROUND_SAMPLES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    normals = normals / np.maximum(lengths, 1e-300)[:, None]
+    normals *= np.where(normals @ up < 0.0, -1.0, 1.0)[:, None]
+    best, near = 0, np.zeros(len(chosen), dtype=bool)
+    for normal, corner in zip(normals, corners[:, 0], strict=True):
+        if normal @ up > GROUND_COSINE:
+            on_plane = np.abs((chosen - corner) @ normal) < GROUND_THICKNESS * abs(height)
+            if int(on_plane.sum()) > best:
+                best, near = int(on_plane.sum()), on_plane
+    if best < GROUND_SHARE * len(chosen):
+        return None
+    ground = chosen[near]
+    normal = np.linalg.eigh(np.cov(ground.T))[1][:, 0]
+    return np.asarray(normal if normal @ up > 0.0 else -normal)
+
+
+def _unit(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-12 else np.array([0.0, 0.0, 1.0])

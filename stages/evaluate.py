@@ -1,0 +1,180 @@
+"""evaluate: the held-out photos, rendered and measured; everything that is measured is kept as 8-bit PNG."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatpipe.pipeline import raster
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.scene import metrics
+from splatpipe.pipeline.scene.dataset import View, load_views, split_views
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.scene.images import Mask, Pixels, load_colour, load_mask
+from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages.line import EvaluateConfig
+
+ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
+EQUAL_DB = 100.0  # stands for the infinite PSNR of pictures that are equal: JSON has no infinity
+MASKED_GREY = 128
+LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
+
+
+def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `metrics.json` and `views/`: photo, render, error and mask of every held-out view.
+
+    The pictures stay in the stored grid, not turned by EXIF's orientation: every figure comes out of them again.
+    """
+    views = load_views(inputs["undistort.dataset"])
+    _, held_out = split_views([view.camera.name for view in views], config.every, config.views)
+    chosen = [view for view in views if view.camera.name in set(held_out)]
+    gaussians = read_splat(inputs["train.model"])
+    options = render_options(inputs["train.plan"], gaussians)
+    folder = out / "views"
+    folder.mkdir(parents=True, exist_ok=True)
+    if not chosen:
+        report.warning(
+            "No photo was held out, so nothing is measured.",
+            hint="Set evaluate.every or evaluate.views to hold some out.",
+        )
+    raster.set_threads(inputs.machine.threads)
+    stems = flat_stems([view.camera.name for view in chosen])
+    per_view = []
+    for done, (view, stem) in enumerate(zip(chosen, stems, strict=True), start=1):
+        per_view.append(evaluate_view(view, gaussians, options, folder / stem))
+        report.progress(done, len(chosen), "measuring held-out photos", "photos")
+    means = mean_measures(per_view)
+    result = {"test_views": len(per_view), "mean": means, "per_view": per_view}
+    text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False)
+    (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
+    summary: dict[str, Any] = {"test_views": len(per_view)}
+    return summary | {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
+
+
+def render_options(plan: Path, gaussians: Gaussians) -> raster.RenderOptions:
+    """How the model was trained to be rendered, from training's `plan.json`.
+
+    Raises:
+        StageError: if the plan is not one.
+    """
+    try:
+        fields = json.loads(plan.read_text(encoding="utf-8"))
+        white = fields["options"]["background"] == "white"
+        return raster.RenderOptions(
+            sh_degree=gaussians.sh_degree,
+            background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
+            antialias=bool(fields["options"]["antialias"]),
+            near=float(fields["near"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StageError("Training's plan.json cannot be read.", hint="Run again with --rerun-from train.") from error
+
+
+def render_pixels(gaussians: Gaussians, view: View, options: raster.RenderOptions) -> Pixels:
+    """Render a view to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
+    with torch.no_grad():
+        colour = raster.render(gaussians, view.camera, options).colour
+        return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
+
+
+def evaluate_view(view: View, gaussians: Gaussians, options: raster.RenderOptions, stem: Path) -> dict[str, Any]:
+    """Render and measure one view, and keep its pictures.
+
+    Args:
+        view: The held-out photo.
+        gaussians: The model.
+        options: How it is rendered.
+        stem: Path of the pictures without their endings.
+
+    Returns:
+        Its name, the pictures' common stem, its size, and a figure a measure.
+    """
+    photo, mask = load_colour(view), load_mask(view)
+    render = render_pixels(gaussians, view, options)
+    _write_png(stem, "photo", photo)
+    _write_png(stem, "render", render)
+    _write_png(stem, "error", error_picture(render, photo, mask))
+    if mask is not None:
+        _write_png(stem, "mask", np.where(mask, 255, 0).astype(np.uint8))
+    counted = 1.0 if mask is None else round(float(mask.mean()), 6)
+    facts = {"name": view.camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
+    return facts | {"counted": counted} | measure(render, photo, mask)
+
+
+def measure(render: Pixels, photo: Pixels, mask: Mask | None) -> dict[str, float | None]:
+    """All measures of an 8-bit render against an 8-bit photo; None where one is not defined (too few pixels).
+
+    Args:
+        render: (h, w, 3).
+        photo: (h, w, 3).
+        mask: (h, w), True where pixels count.
+    """
+    x, y = (torch.from_numpy(pixels.astype(np.float32) / np.float32(255.0)) for pixels in (render, photo))
+    counted = None if mask is None else torch.from_numpy(mask)
+    return {name: _measured(function, x, y, counted) for name, function in metrics.METRICS.items()}
+
+
+def _measured(function: Callable[..., float], render: Tensor, photo: Tensor, mask: Tensor | None) -> float | None:
+    try:
+        value = float(function(render, photo, mask))
+    except ValueError:  # too few pixels for this measure
+        return None
+    value = min(value, EQUAL_DB) if function in (metrics.psnr, metrics.psnr_cc) else value
+    return round(value, 6) if math.isfinite(value) else None
+
+
+def mean_measures(per_view: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Each measure's mean over the views in which it is defined; None without any."""
+    means: dict[str, float | None] = {}
+    for name in metrics.METRICS:
+        values = [view[name] for view in per_view if view[name] is not None]
+        means[name] = round(math.fsum(values) / len(values), 6) if values else None
+    return means
+
+
+def error_picture(render: Pixels, photo: Pixels, mask: Mask | None) -> Pixels:
+    """Mean absolute error over the channels as a heat map of fixed scale, masked pixels grey; (h, w, 3) RGB."""
+    error = np.abs(render.astype(np.int16) - photo.astype(np.int16)).mean(axis=2) / 255.0
+    scaled = np.clip(error / ERROR_FULL_SCALE * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+    picture = np.asarray(cv2.applyColorMap(scaled, cv2.COLORMAP_INFERNO)[:, :, ::-1], np.uint8).copy()
+    if mask is not None:
+        picture[~mask] = MASKED_GREY
+    return picture
+
+
+def flat_stems(names: Sequence[str]) -> list[str]:
+    """File names without endings for photos whose names may have folders: safe and unique, also without case.
+
+    Args:
+        names: Photo names, in POSIX form.
+    """
+    taken: set[str] = set()
+    stems = []
+    for name in names:
+        flat = name.rpartition(".")[0] or name
+        flat = "".join("_" if letter in '/\\:*?"<>|' or ord(letter) < 32 else letter for letter in flat)
+        flat = flat.strip(". ")[-LONGEST_STEM:] or "photo"
+        stem, copies = flat, 1
+        while stem.casefold() in taken:
+            copies += 1
+            stem = f"{flat}~{copies}"
+        taken.add(stem.casefold())
+        stems.append(stem)
+    return stems
+
+
+def _write_png(stem: Path, kind: str, pixels: Pixels) -> None:
+    ordered = pixels if pixels.ndim == 2 else pixels[:, :, ::-1]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(ordered))
+    if not done:
+        raise StageError(f"The {kind} of {stem.name} could not be coded as PNG.")
+    stem.with_name(f"{stem.name}.{kind}.png").write_bytes(data.tobytes())

@@ -1,0 +1,193 @@
+"""Which photos share a camera, and what is known of its focal length before calibration."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.scene.exif import Exif
+from splatpipe.pipeline.scene.sensors import sensor_size_mm
+from splatpipe.pipeline.scene.xmp import xmp_number
+from splatpipe.stages.ingest.check import CheckedPhoto
+
+MODEL = "SIMPLE_RADIAL"
+DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's guess where nothing is known: a lens of 43 mm on 35 mm film
+FOCAL_BOUNDS = (0.2, 30.0)  # of the longer side; a value outside is no focal length of a camera
+ASPECT_TOLERANCE = 0.01
+SHAPE_TOLERANCE = 0.03  # between a sensor's specified shape and that of the pictures that use all of it
+FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+WIDEST_SENSOR = 1.51  # width over height; wider pictures are cut from a sensor of 4:3
+PANORAMA = 2.5  # wider still, no sensor's shape
+
+
+@dataclass(frozen=True)
+class Focal:
+    """A focal length in pixels of the stored grid.
+
+    Attributes:
+        px: Its value.
+        source: Where it is from, as FOCAL_SOURCES.
+        has_prior: Whether it is more than a guess.
+    """
+
+    px: float
+    source: str
+    has_prior: bool
+
+
+# In order of trust. A maker's calibration comes first. Rounded 35 mm equivalents err by up to 5 %.
+# FocalPlaneXResolution of a photo that was resized afterwards may or may not have been changed with it, so comes last.
+FOCAL_SOURCES = (
+    "xmp-calibrated",
+    "sensor-table",
+    "focal-plane-resolution",
+    "35mm-equivalent",
+    "focal-plane-resolution-resized",
+    "guess",
+)
+
+
+@dataclass(frozen=True)
+class CameraGroup:
+    """Photos that were taken by one camera with one setting of its lens.
+
+    Attributes:
+        model: COLMAP's camera model to start from.
+        width: Of the stored grid, pixels.
+        height: Likewise.
+        params: The model's parameters to start from: focal length, principal point, distortion.
+        focal_px: The focal length to start from.
+        focal_source: Where it is from.
+        has_prior: Whether it is more than a guess.
+        make: From EXIF; empty when unknown.
+        model_name: Likewise.
+        photos: How many there are.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+    focal_px: float
+    focal_source: str
+    has_prior: bool
+    make: str
+    model_name: str
+    photos: int
+
+
+def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> Focal:
+    """The most trustworthy focal length that a photo's metadata give.
+
+    Args:
+        exif: Its EXIF; the size in it is the picture's before any resizing.
+        xmp: Its XMP properties.
+        width: Of the stored grid, pixels.
+        height: Likewise.
+    """
+    scale = _resize_scale(exif, width, height)
+    longer = max(width, height)
+    aspect = longer / min(width, height)
+    if aspect < PANORAMA and scale is not None:
+        plane = "focal-plane-resolution" if scale == 1.0 else "focal-plane-resolution-resized"
+        found = {
+            "xmp-calibrated": _times(xmp_number(xmp, "drone-dji:CalibratedFocalLength", 1.0, 1e6), scale),
+            "sensor-table": _from_sensor(exif, width, height),
+            plane: _times(exif.focal_mm, exif.focal_plane_px_per_mm, scale),
+            "35mm-equivalent": _from_35mm(exif.focal_35mm, longer, aspect),
+        }
+        for source in FOCAL_SOURCES:
+            focal = found.get(source)
+            if focal is not None and FOCAL_BOUNDS[0] <= focal / longer <= FOCAL_BOUNDS[1]:
+                return Focal(focal, source, True)
+    return Focal(DEFAULT_FOCAL * longer, "guess", False)
+
+
+def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], dict[str, int]]:
+    """Group photos by make, model, size and focal length.
+
+    Args:
+        photos: Those that take part, sorted by name.
+
+    Returns:
+        The groups in the order of their first photos, and each photo's group by its name.
+    """
+    members: dict[tuple[object, ...], list[CheckedPhoto]] = {}
+    for photo in photos:
+        exif = photo.exif
+        focal_mm = round(exif.focal_mm, 2) if exif.focal_mm is not None else None
+        key = (exif.make, exif.model, photo.width, photo.height, focal_mm, exif.focal_35mm)
+        members.setdefault(key, []).append(photo)
+    groups = [_group(list(group)) for group in members.values()]
+    index = {photo.name: number for number, group in enumerate(members.values()) for photo in group}
+    return groups, index
+
+
+def cameras_json(groups: Sequence[CameraGroup]) -> JSON:
+    """What ``cameras.json`` holds."""
+    return {"cameras": [asdict(group) for group in groups]}
+
+
+def _group(photos: Sequence[CheckedPhoto]) -> CameraGroup:
+    first = photos[0]
+    priors = [focal_prior(photo.exif, photo.xmp, photo.width, photo.height) for photo in photos]
+    counts = Counter(prior.source for prior in priors)
+    source = min(counts, key=lambda name: (-counts[name], FOCAL_SOURCES.index(name)))
+    focal = float(np.median([prior.px for prior in priors if prior.source == source]))
+    return CameraGroup(
+        model=MODEL,
+        width=first.width,
+        height=first.height,
+        params=(focal, first.width / 2, first.height / 2, 0.0),
+        focal_px=focal,
+        focal_source=source,
+        has_prior=source != "guess",
+        make=first.exif.make,
+        model_name=first.exif.model,
+        photos=len(photos),
+    )
+
+
+def _resize_scale(exif: Exif, width: int, height: int) -> float | None:
+    """Stored pixels per pixel of the picture that the camera took; None when the picture was cropped.
+
+    A turn by 90° in between does not matter. Without a size in EXIF the picture counts as the camera's own.
+    """
+    if exif.width is None or exif.height is None:
+        return 1.0
+    longer, shorter = max(width, height), min(width, height)
+    taken_longer, taken_shorter = max(exif.width, exif.height), min(exif.width, exif.height)
+    scale = longer / taken_longer
+    if abs(shorter - scale * taken_shorter) > max(1.0, ASPECT_TOLERANCE * shorter):
+        return None
+    return scale
+
+
+def _from_sensor(exif: Exif, width: int, height: int) -> float | None:
+    size = sensor_size_mm(exif.make, exif.model)
+    if size is None or exif.focal_mm is None:
+        return None
+    longer, shorter = max(width, height), min(width, height)
+    # A picture that is narrower than the sensor was cut at its sides, a wider one at top and bottom.
+    used_mm = size[1] * longer / shorter
+    if used_mm > size[0] * (1.0 - SHAPE_TOLERANCE):
+        used_mm = size[0]
+    return exif.focal_mm * longer / used_mm
+
+
+def _from_35mm(focal_35mm: float | None, longer: int, aspect: float) -> float | None:
+    """By the diagonal of the sensor (which is how the equivalent is defined), not of a 16:9 picture cut from it."""
+    if focal_35mm is None:
+        return None
+    shape = aspect if aspect <= WIDEST_SENSOR else 4 / 3
+    return focal_35mm * longer / (FILM_DIAGONAL_MM * shape / math.hypot(shape, 1.0))
+
+
+def _times(*factors: float | None) -> float | None:
+    known = [factor for factor in factors if factor is not None]
+    return math.prod(known) if len(known) == len(factors) else None

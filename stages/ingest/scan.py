@@ -1,0 +1,153 @@
+"""Finds the files of the photo folder that are photos, or pretend to be."""
+
+from __future__ import annotations
+
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+PHOTO_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"}
+OTHER_PICTURES = {
+    ".heic": "HEIC",
+    ".heif": "HEIF",
+    ".avif": "AVIF",
+    ".webp": "WebP",
+    ".jxl": "JPEG XL",
+    ".jp2": "JPEG 2000",
+    ".bmp": "BMP",
+    ".exr": "OpenEXR",
+}
+RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".iiq", ".3fr"}
+MASK_FOLDER = "masks"
+HEAD_BYTES = 16
+MAX_NAME_BYTES = 250
+TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A file to be checked: its name (POSIX path relative to the photo folder) and where it is."""
+
+    name: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A photo that takes no part, and why: ``reason`` ends a sentence that starts with the name."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a folder holds.
+
+    Attributes:
+        candidates: Files to be checked, sorted by name.
+        left_out: Files that pretend to be photos and cannot be ones, sorted by name.
+        others: How many other files were passed over.
+    """
+
+    candidates: tuple[Candidate, ...]
+    left_out: tuple[LeftOut, ...]
+    others: int
+
+
+def scan_folder(root: Path) -> Scan:
+    """Look through a folder and the folders in it.
+
+    Hidden files and folders and ``masks/`` are passed over, and so are links to folders (they may lead in circles, and
+    what they lead to is not what the run's digests pin). A file is a photo by its first bytes, whatever it is called.
+
+    Args:
+        root: The folder that names are relative to.
+    """
+    candidates: list[Candidate] = []
+    left_out: list[LeftOut] = []
+    others = 0
+
+    def unreadable(error: OSError) -> None:
+        left_out.append(LeftOut(_name(Path(error.filename), root), "is a folder that may not be read"))
+
+    for folder, folders, files in os.walk(root, onerror=unreadable):
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and name.casefold() != MASK_FOLDER)
+        links = [Path(folder) / name for name in folders if (Path(folder) / name).is_symlink()]
+        left_out += [LeftOut(_name(link, root), "is a link to a folder, which is not followed") for link in links]
+        for name in files:
+            if name.startswith("."):
+                continue
+            path = Path(folder) / name
+            reason = _why_not(path)
+            if reason == "":
+                others += 1
+                continue
+            reason = reason or _why_not_name(path.relative_to(root))
+            if reason is None:
+                candidates.append(Candidate(_name(path, root), path))
+            else:
+                left_out.append(LeftOut(_name(path, root), reason))
+    return Scan(
+        tuple(sorted(candidates, key=lambda candidate: candidate.name)),
+        tuple(sorted(left_out, key=lambda entry: entry.name)),
+        others,
+    )
+
+
+def _name(path: Path, root: Path) -> str:
+    """The POSIX path relative to the root; bytes that are no UTF-8 show as ``\\xNN``."""
+    return os.fsencode(path.relative_to(root).as_posix()).decode("utf-8", errors="backslashreplace")
+
+
+def _why_not(path: Path) -> str | None:
+    """None for a candidate; why not for what pretends to be a photo; an empty text for any other file."""
+    suffix = path.suffix.casefold()
+    pretends = suffix in PHOTO_SUFFIXES or suffix in RAW_SUFFIXES or suffix in OTHER_PICTURES
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            return "is not a regular file" if pretends else ""
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError as error:
+        return f"cannot be read ({error.strerror})" if pretends else ""
+    if suffix in RAW_SUFFIXES:  # most raw formats are TIFF files with a thumbnail in front
+        return "is a camera's raw file: develop it to JPEG or TIFF"
+    kind = _kind(head)
+    if kind == "photo":
+        return None
+    if kind:
+        return f"is a {kind} picture, which is not read: convert it to JPEG or PNG"
+    if not pretends:
+        return ""
+    return "is empty" if not head else f"is no {_claim(suffix)} picture, whatever its name says"
+
+
+def _why_not_name(relative: Path) -> str | None:
+    try:
+        str(relative).encode()
+    except UnicodeEncodeError:
+        return "has a name that is no UTF-8: rename it"
+    # Masks and converted photos are called NAME.png, and file systems take 255 bytes.
+    return "has too long a name: rename it" if len(relative.name.encode()) > MAX_NAME_BYTES else None
+
+
+def _claim(suffix: str) -> str:
+    if suffix in OTHER_PICTURES:
+        return OTHER_PICTURES[suffix]
+    return {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}.get(suffix, "JPEG")
+
+
+def _kind(head: bytes) -> str:
+    """``photo`` for what is read, the format's name for other pictures, empty for no picture."""
+    if head.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", *TIFF_HEADS)):
+        return "photo"
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        return "WebP"
+    if head[4:8] == b"ftyp" and head[8:12] in (b"heic", b"heix", b"mif1", b"msf1", b"hevc"):
+        return "HEIC"
+    if head[4:12] in (b"ftypavif", b"ftypavis"):
+        return "AVIF"
+    return ""

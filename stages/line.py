@@ -1,0 +1,273 @@
+"""The line from photos to splat: every stage's options and contract, in order. Light to import."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from splatpipe.pipeline.engine.stage import Stage, StageConfig
+
+PositiveInt = Annotated[int, Field(ge=1)]
+NonNegativeInt = Annotated[int, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+PositiveFloat = Annotated[float, Field(gt=0.0)]
+NonNegativeFloat = Annotated[float, Field(ge=0.0)]
+Length = Literal["auto"] | PositiveInt
+LengthOrZero = Literal["auto"] | NonNegativeInt
+
+
+class IngestConfig(StageConfig):
+    masks: bool = True
+    """Honour `masks/` beside or inside the photo folder (same name as the photo, black is ignored)."""
+    min_size: PositiveInt = 320
+    """Pictures whose longer side is shorter, in pixels, are left out: thumbnails and icons."""
+    max_megapixels: Annotated[float, Field(gt=0.0, le=4000.0)] = 500.0
+    """Larger pictures are left out undecoded: a small file can claim any size."""
+
+
+class FeaturesConfig(StageConfig):
+    extractor: Literal["sift", "opencv-sift"] = "sift"
+    """`sift` is COLMAP's, the most points; `opencv-sift` takes a third of the time for a few points less."""
+    max_image_size: Annotated[int, Field(ge=320, le=20000)] = 2000
+    """Photos are reduced to this longer side, in pixels, before keypoints are looked for."""
+    max_features: Annotated[int, Field(ge=100, le=100_000)] = 8192
+    """Keypoints wanted a photo, the largest first; `sift` takes whole scales, so gives up to twice as many."""
+
+
+class MatchesConfig(StageConfig):
+    pairing: Literal["auto", "exhaustive", "spatial", "sequential", "retrieval"] = "auto"
+    """Which pairs are matched: `auto` takes all for small sets, neighbours by position where there is GPS,
+    sequence where names and times agree on one, else look-alikes."""
+    exhaustive_up_to: PositiveInt = 30
+    """`auto` matches every pair up to this many photos."""
+    neighbours: Annotated[int, Field(ge=2, le=200)] = 20
+    """Pairs a photo, for `spatial`, `sequential` and `retrieval`."""
+    seed: NonNegativeInt = 0
+    """Seed of the geometric verification (RANSAC)."""
+
+
+class SparseConfig(StageConfig):
+    min_model_size: Annotated[int, Field(ge=3)] = 3
+    """Models of fewer photos are dropped."""
+    parallel_adjustment: bool = False
+    """Let bundle adjustment use every thread: faster, but no longer the same bits for any number of threads."""
+    seed: NonNegativeInt = 0
+    """Seed of the incremental mapper."""
+
+
+class GeorefConfig(StageConfig):
+    max_position_error_m: PositiveFloat = 10.0
+    """Photo positions further than this from the robust fit are named and left out of it."""
+
+
+class UndistortConfig(StageConfig):
+    max_megapixels: Annotated[float, Field(gt=0.005, le=200.0)] = 0.5
+    """Photos are reduced to this size for training and evaluation."""
+
+
+class InitializeConfig(StageConfig):
+    max_gaussians: PositiveInt = 1_000_000
+    """At most this many sparse points become Gaussians, those seen in most photos first."""
+    opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.1
+    """Opacity at the start."""
+    max_angle: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+    """Cap on a Gaussian's size for outliers, as a share of its distance to the nearest camera."""
+
+
+class TrainConfig(StageConfig):
+    """The published 3D Gaussian splatting schedule; `auto` lengths are resolved from `iterations` (see plan.json).
+
+    At 30,000 iterations and more every `auto` is the published value; shorter runs shrink it as its text says.
+    """
+
+    iterations: PositiveInt = 30_000
+    """Optimisation steps, one photo each."""
+    seed: NonNegativeInt = 0
+    """Seed of the order of photos and of density control."""
+    max_gaussians: PositiveInt = 1_000_000
+    """Hard cap on Gaussians, about 1 kB of memory each; where it binds, the largest gradients are densified first."""
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
+    """Degree of the spherical harmonics that are trained."""
+    sh_every: Length = "auto"
+    """Iterations until one degree more is trained. Auto: 1000, at most a fifth of the run."""
+    ssim_weight: Fraction = 0.2
+    """Share of 1 - SSIM in the loss; the rest is L1."""
+    antialias: bool = False
+    """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
+    background: Literal["black", "white", "random"] = "black"
+    """What is behind the Gaussians in training; `random` (a colour an iteration) forbids holes."""
+    coarse_levels: Annotated[int, Field(ge=0, le=4)] = 0
+    """Start with photos halved this many times and double them on the way: faster, a little smoother."""
+    coarse_until: LengthOrZero = "auto"
+    """Iteration from which photos have their full size. Auto: `densify_until`."""
+    densify: bool = True
+    """Clone, split and prune Gaussians (adaptive density control)."""
+    densify_from: Length = "auto"
+    """First iteration of density control. Auto: 500, at most a fifth of the run."""
+    densify_until: Length = "auto"
+    """Last iteration of density control. Auto: half of the run."""
+    densify_every: Length = "auto"
+    """Iterations between its steps. Auto: 100, at most a tenth of the run."""
+    densify_gradient: PositiveFloat = 2e-4
+    """Gaussians whose mean image-plane gradient (NDC) is above this are densified."""
+    split_extent: PositiveFloat = 0.01
+    """Those larger than this share of the scene's extent are split, smaller ones cloned."""
+    split_shrink: Annotated[float, Field(ge=1.0, le=10.0)] = 1.6
+    """The two halves of a split are this many times smaller."""
+    prune_opacity: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.005
+    """Gaussians below this opacity are removed."""
+    prune_extent: NonNegativeFloat = 0.1
+    """Those larger than this share of the extent are removed after the first opacity reset; 0 for never."""
+    prune_screen_px: NonNegativeFloat = 0.0
+    """Those with a larger radius on screen are removed, too (published: 20); 0 for never: it eats aerial ground."""
+    reset_every: LengthOrZero = "auto"
+    """Iterations between opacity resets, 0 for none. Auto: 3000; below 10,000 iterations none."""
+    reset_opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01
+    """An opacity reset leaves no Gaussian above this."""
+    lr_boost: Literal["auto"] | PositiveFloat = "auto"
+    """All learning rates but opacity's are multiplied by this, the last one of positions by its square. Auto:
+    the root of 30,000 / `iterations`, from 1 to 4: a short run needs longer steps to get as far."""
+    lr_means: PositiveFloat = 1.6e-4
+    """Learning rate of positions at the start, times the scene's extent."""
+    lr_means_final: PositiveFloat = 1.6e-6
+    """The same at the end; exponential in between."""
+    lr_sh: PositiveFloat = 2.5e-3
+    """Learning rate of colour (degree 0)."""
+    lr_sh_rest_divisor: Annotated[float, Field(ge=1.0)] = 20.0
+    """Higher degrees learn this many times slower."""
+    lr_opacity: PositiveFloat = 5e-2
+    """Learning rate of opacity logits."""
+    lr_scales: PositiveFloat = 5e-3
+    """Learning rate of log-scales."""
+    lr_quats: PositiveFloat = 1e-3
+    """Learning rate of rotations."""
+    sparse_adam: bool = True
+    """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
+
+
+class EvaluateConfig(StageConfig):
+    every: NonNegativeInt = 8
+    """Every n-th registered photo in name order, starting with the first, is held out of training; 0 for none."""
+    views: str = ""
+    """Names of photos to hold out instead, separated by commas."""
+
+
+class ExportConfig(StageConfig):
+    """Export has no options yet."""
+
+
+class LineConfig(StageConfig):
+    """Everything that changes the answer, a section a stage."""
+
+    ingest: IngestConfig = IngestConfig()
+    features: FeaturesConfig = FeaturesConfig()
+    matches: MatchesConfig = MatchesConfig()
+    sparse: SparseConfig = SparseConfig()
+    georef: GeorefConfig = GeorefConfig()
+    undistort: UndistortConfig = UndistortConfig()
+    initialize: InitializeConfig = InitializeConfig()
+    train: TrainConfig = TrainConfig()
+    evaluate: EvaluateConfig = EvaluateConfig()
+    export: ExportConfig = ExportConfig()
+
+
+INGEST = Stage(
+    "ingest",
+    version=1,
+    config=IngestConfig,
+    reads=("source.photos",),
+    parts={"photos": "photos", "cameras": "cameras.json", "positions": "positions.json", "left_out": "left_out.json"},
+    entry="splatpipe.stages.ingest:run",
+)
+FEATURES = Stage(
+    "features",
+    version=1,
+    config=FeaturesConfig,
+    reads=("ingest.photos", "ingest.cameras"),
+    parts={"database": "database.db", "colours": "colours.npy"},
+    entry="splatpipe.stages.features:run",
+)
+MATCHES = Stage(
+    "matches",
+    version=1,
+    config=MatchesConfig,
+    reads=("features.database", "ingest.photos", "ingest.positions"),
+    parts={"database": "database.db", "pairs": "pairs.json"},
+    entry="splatpipe.stages.matches:run",
+)
+SPARSE = Stage(
+    "sparse",
+    version=1,
+    config=SparseConfig,
+    reads=("matches.database", "features.colours"),
+    parts={"model": "sparse/0", "summary": "models.json"},
+    entry="splatpipe.stages.sparse:run",
+)
+GEOREF = Stage(
+    "georef",
+    version=1,
+    config=GeorefConfig,
+    reads=("sparse.model", "ingest.positions", "ingest.photos"),
+    parts={"frame": "frame.json", "model": "sparse/0"},
+    entry="splatpipe.stages.georef:run",
+)
+UNDISTORT = Stage(
+    "undistort",
+    version=1,
+    config=UndistortConfig,
+    reads=("georef.model", "ingest.photos"),
+    parts={"dataset": "dataset"},
+    entry="splatpipe.stages.undistort:run",
+)
+INITIALIZE = Stage(
+    "initialize",
+    version=1,
+    config=InitializeConfig,
+    reads=("undistort.dataset",),
+    parts={"splat": "init.ply"},
+    entry="splatpipe.stages.initialize:run",
+)
+TRAIN = Stage(
+    "train",
+    version=1,
+    config=TrainConfig,
+    reads=("undistort.dataset", "initialize.splat"),
+    parts={"model": "model.ply", "history": "history.json", "plan": "plan.json"},
+    entry="splatpipe.stages.train:run",
+    borrows=("evaluate.every", "evaluate.views"),
+    resumable=True,
+)
+EVALUATE = Stage(
+    "evaluate",
+    version=1,
+    config=EvaluateConfig,
+    reads=("train.model", "train.plan", "undistort.dataset"),
+    parts={"metrics": "metrics.json", "views": "views"},
+    entry="splatpipe.stages.evaluate:run",
+)
+EXPORT = Stage(
+    "export",
+    version=1,
+    config=ExportConfig,
+    reads=(
+        "train.model",
+        "train.plan",
+        "georef.frame",
+        "georef.model",
+        "undistort.dataset",
+        "evaluate.metrics",
+        "ingest.photos",
+        "ingest.left_out",
+    ),
+    parts={
+        "splat": "splat.ply",
+        "cameras": "cameras.json",
+        "metrics": "metrics.json",
+        "sparse": "sparse.glb",
+    },
+    entry="splatpipe.stages.export:run",
+    deliverables=("splat", "cameras", "metrics", "sparse"),
+)
+
+LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)

@@ -1,0 +1,229 @@
+"""Which photos are matched with which: pure functions of what is known before matching."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+
+Pair = tuple[int, int]
+Costs = Callable[[int], Float64[np.ndarray, " n"]]
+"""How unlikely each photo is to see what photo i sees; infinite where nothing is known."""
+
+LOCATED_SHARE = 0.8  # of the photos must have positions for these to lead
+SPREAD_OVER_SIGMA = 2.0  # positions that scatter no wider than this say nothing about who is whose neighbour
+SAME_PLACE_M = 0.1
+LEAST_FACING = 0.01  # cos² of half the angle between views: opposite views count as ten times further apart or more
+SEQUENCE_LENGTH = 8  # photos a folder; shorter ones are no sequence
+LOOP_SHARE = 4  # one pair in so many of a sequence looks for places seen before
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What is known of the photos before matching.
+
+    Attributes:
+        names: Their names, sorted.
+        times: When each was taken, seconds of any epoch; NaN where not known.
+        positions_m: (n, 3) east, north, up about any origin; NaN where not known.
+        sigmas_m: Standard deviation of each position, NaN where not known.
+        directions: (n, 3) unit viewing directions in the same axes; NaN where not known.
+    """
+
+    names: Sequence[str]
+    times: Float64[np.ndarray, " n"]
+    positions_m: Float64[np.ndarray, "n 3"]
+    sigmas_m: Float64[np.ndarray, " n"]
+    directions: Float64[np.ndarray, "n 3"]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def located(self) -> np.ndarray:
+        """(n,) whether each position is known."""
+        return np.asarray(np.isfinite(self.positions_m).all(axis=1))
+
+
+def choose_pairing(layout: Layout, exhaustive_up_to: int) -> str:
+    """What `auto` means for these photos: ``exhaustive``, ``spatial``, ``sequential`` or ``retrieval``."""
+    if len(layout) <= exhaustive_up_to:
+        return "exhaustive"
+    if positions_tell(layout):
+        return "spatial"
+    return "sequential" if sequences(layout) else "retrieval"
+
+
+def positions_tell(layout: Layout) -> bool:
+    """Whether most photos have positions, and these spread wider than their noise."""
+    located = layout.located()
+    if np.count_nonzero(located) < LOCATED_SHARE * len(layout):
+        return False
+    positions = layout.positions_m[located]
+    places = len(np.unique(np.round(positions / SAME_PLACE_M), axis=0))
+    spread = float(np.sqrt(positions[:, :2].var(axis=0).sum()))
+    return places >= len(positions) / 2 and spread > SPREAD_OVER_SIGMA * float(np.nanmedian(layout.sigmas_m[located]))
+
+
+def sequences(layout: Layout) -> list[list[int]]:
+    """The photos of each folder in the order of their names, if they were taken in that order; else nothing.
+
+    Names are compared as people read them: ``2`` before ``10``.
+    """
+    folders: dict[str, list[int]] = {}
+    for number, name in enumerate(layout.names):
+        folders.setdefault(str(PurePosixPath(name).parent), []).append(number)
+    ordered = [sorted(members, key=lambda i: _natural(layout.names[i])) for members in folders.values()]
+    if any(len(members) < SEQUENCE_LENGTH for members in ordered):
+        return []
+    for members in ordered:
+        times = layout.times[members]
+        if not np.isfinite(times).all() or (np.diff(times) < 0).any() or len(np.unique(times)) < len(times) / 2:
+            return []
+    return ordered
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorting key: runs of digits as numbers."""
+    pieces = re.findall(r"([0-9]{1,18})|([^0-9]+|[0-9]+)", name)
+    return [(0, int(digits), "") if digits else (1, 0, other) for digits, other in pieces]
+
+
+def select_pairs(layout: Layout, pairing: str, neighbours: int, look_alike: Callable[[], Costs]) -> list[Pair]:
+    """Choose the pairs to match, so that they connect all photos.
+
+    Args:
+        layout: What is known of the photos.
+        pairing: ``exhaustive``, ``spatial``, ``sequential`` or ``retrieval``.
+        neighbours: Partners chosen for each photo.
+        look_alike: Makes the costs from the photos' content; called only where they are needed.
+
+    Returns:
+        Sorted pairs (i, j), i < j, each once.
+
+    Raises:
+        SplatpipeError: if the pairing needs something that the photos do not have.
+    """
+    count = len(layout)
+    if pairing == "exhaustive":
+        return [(i, j) for i in range(count) for j in range(i + 1, count)]
+    if pairing == "spatial":
+        return _spatial(layout, neighbours, look_alike)
+    costs = look_alike()
+    if pairing == "retrieval":
+        return connect(nearest(range(count), costs, neighbours), count, costs)
+    ordered = sequences(layout) or [sorted(range(count), key=lambda i: _natural(layout.names[i]))]
+    pairs = {
+        _pair(members[at], later)
+        for members in ordered
+        for at in range(len(members))
+        for later in members[at + 1 : at + 1 + max(1, neighbours // 2)]
+    }
+    loops = nearest(range(count), _without(costs, pairs), max(1, neighbours // LOOP_SHARE))
+    return connect(pairs | loops, count, costs)
+
+
+def _spatial(layout: Layout, neighbours: int, look_alike: Callable[[], Costs]) -> list[Pair]:
+    located = layout.located()
+    if np.count_nonzero(located) < 2:
+        raise SplatpipeError(
+            "matches.pairing=spatial needs photos with positions, and these have none.",
+            hint="Leave matches.pairing at auto.",
+        )
+    costs = spatial_costs(layout)
+    pairs = nearest(np.flatnonzero(located).tolist(), costs, neighbours)
+    if located.all():
+        return connect(pairs, len(layout), costs)
+    alike = look_alike()
+    pairs |= nearest(np.flatnonzero(~located).tolist(), alike, neighbours)
+    return connect(pairs, len(layout), alike)
+
+
+def spatial_costs(layout: Layout) -> Costs:
+    """Distance between two photos, the longer the more their views part: over cos² of half the angle between them.
+
+    A typical spacing is added to it, so that opposite views from one place are not neighbours either.
+    """
+    known = layout.positions_m[layout.located()]
+    spacing = float(np.sqrt(known.var(axis=0).sum() / len(known)))
+
+    def costs(i: int) -> Float64[np.ndarray, " n"]:
+        distances = np.sqrt(((layout.positions_m - layout.positions_m[i]) ** 2).sum(axis=1))
+        facing = (1.0 + (layout.directions * layout.directions[i]).sum(axis=1)) / 2.0
+        facing = np.where(np.isfinite(facing), facing, 1.0)
+        return np.asarray(np.nan_to_num((distances + spacing) / np.maximum(facing, LEAST_FACING), nan=np.inf))
+
+    return costs
+
+
+def _without(costs: Costs, pairs: set[Pair]) -> Costs:
+    partners: dict[int, list[int]] = {}
+    for i, j in pairs:
+        partners.setdefault(i, []).append(j)
+        partners.setdefault(j, []).append(i)
+
+    def others(i: int) -> Float64[np.ndarray, " n"]:
+        row = costs(i).copy()
+        row[partners.get(i, [])] = np.inf
+        return row
+
+    return others
+
+
+def nearest(photos: Iterable[int], costs: Costs, neighbours: int) -> set[Pair]:
+    """Each of the photos with its cheapest partners; equal costs in the photos' order."""
+    pairs: set[Pair] = set()
+    for i in photos:
+        row = costs(i).copy()
+        row[i] = np.inf
+        for j in np.argsort(row, kind="stable")[:neighbours].tolist():
+            if np.isfinite(row[j]):
+                pairs.add(_pair(i, j))
+    return pairs
+
+
+def connect(pairs: set[Pair], count: int, costs: Costs) -> list[Pair]:
+    """Add the cheapest pairs that make the graph of photos one piece (Borůvka's algorithm).
+
+    Args:
+        pairs: The pairs chosen so far.
+        count: Photos.
+        costs: Infinite ones are taken where there are no others.
+    """
+    pairs = set(pairs)
+    while True:
+        labels = components(pairs, count)
+        if labels.max(initial=0) == 0:
+            return sorted(pairs)
+        best: dict[int, tuple[float, Pair]] = {}
+        for i in range(count):
+            row = np.where(labels == labels[i], np.inf, np.minimum(costs(i), np.finfo(np.float64).max))
+            j = int(row.argmin())
+            candidate = float(row[j]), _pair(i, j)
+            best[int(labels[i])] = min(best.get(int(labels[i]), candidate), candidate)
+        pairs |= {pair for _, pair in best.values()}
+
+
+def components(pairs: Iterable[Pair], count: int) -> np.ndarray:
+    """(count,) number of the connected piece that each photo is in; pieces by their first photo."""
+    parents = list(range(count))
+
+    def root(i: int) -> int:
+        while parents[i] != i:
+            parents[i] = parents[parents[i]]
+            i = parents[i]
+        return i
+
+    for i, j in pairs:
+        first, second = sorted((root(i), root(j)))
+        parents[second] = first
+    return np.unique([root(i) for i in range(count)], return_inverse=True)[1]
+
+
+def _pair(i: int, j: int) -> Pair:
+    return (i, j) if i < j else (j, i)

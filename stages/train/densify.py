@@ -1,0 +1,206 @@
+"""Adaptive density control: where Gaussians are cloned, split, pruned and their opacity reset.
+
+Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023,
+section 5 and its published settings; with a hard cap, where the largest gradients come first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.draws import SPLIT_POSITION, normal
+
+MIN_AFTER_PRUNE = 1  # a model is never emptied: there would be nothing left to learn from
+
+
+@dataclass(frozen=True)
+class Growth:
+    """New rows for the model: which old Gaussian each is made from, and what differs.
+
+    Attributes:
+        source: (m,) old row of each new Gaussian.
+        fresh: (m,) True where it is new, so that its optimiser state starts at zero.
+        means: (m, 3) world units.
+        log_scales: (m, 3).
+    """
+
+    source: Int64[Tensor, " m"]
+    fresh: Bool[Tensor, " m"]
+    means: Float[Tensor, "m 3"]
+    log_scales: Float[Tensor, "m 3"]
+
+
+@dataclass(frozen=True)
+class DensityEvent:
+    """What a step of density control did.
+
+    Attributes:
+        iteration: When.
+        cloned: Gaussians copied.
+        split: Gaussians replaced by two.
+        pruned: Gaussians removed.
+        held_back: Gaussians that the cap kept from being densified.
+        gaussians: How many there are now.
+    """
+
+    iteration: int
+    cloned: int
+    split: int
+    pruned: int
+    held_back: int
+    gaussians: int
+
+    def to_json(self) -> dict[str, int]:
+        """For `history.json`."""
+        return asdict(self)
+
+
+class DensityStatistics:
+    """Running sums over the photos since the last step.
+
+    Attributes:
+        gradient_sum: (n,) sum of the norm of dL/d(mean2D), NDC.
+        seen: (n,) photos that saw the Gaussian.
+        max_radius_px: (n,) largest radius on screen.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.gradient_sum = torch.zeros(count)
+        self.seen = torch.zeros(count)
+        self.max_radius_px = torch.zeros(count)
+
+    def observe(self, gradient_px: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"], width: int, height: int) -> None:
+        """Add an iteration's image-plane gradients.
+
+        Args:
+            gradient_px: dL/d(mean2D), per pixel.
+            visible: Which Gaussians the photo saw.
+            width: Of the render, pixels.
+            height: Of the render, pixels.
+        """
+        ndc = torch.hypot(gradient_px[:, 0] * (0.5 * width), gradient_px[:, 1] * (0.5 * height))
+        self.gradient_sum += torch.where(visible & torch.isfinite(ndc), ndc, 0.0)
+        self.seen += visible
+
+    def observe_radii(self, radii_px: Float[Tensor, " n"]) -> None:
+        """Add an iteration's sizes on screen, pixels (0 where unseen)."""
+        torch.maximum(self.max_radius_px, radii_px, out=self.max_radius_px)
+
+    def mean_gradient(self) -> Float[Tensor, " n"]:
+        """The statistic: averaged over the photos that saw the Gaussian."""
+        return self.gradient_sum / self.seen.clamp(min=1.0)
+
+    def to_arrays(self) -> dict[str, Tensor]:
+        """Its tensors by name, for a checkpoint."""
+        return {"gradient_sum": self.gradient_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
+
+
+def grow(
+    gaussians: Gaussians, gradient: Float[Tensor, " n"], options: TrainConfig, extent: float, iteration: int
+) -> tuple[Growth, dict[str, int]]:
+    """Clone the small and split the large Gaussians whose gradient asks for it.
+
+    Args:
+        gaussians: The model.
+        gradient: Mean image-plane gradient of each, NDC.
+        options: Resolved.
+        extent: Of the scene, world units.
+        iteration: Names the random numbers.
+
+    Returns:
+        The new rows (kept ones in their order, then clones, then two children for each split), and the counts
+        ``cloned``, ``split`` and ``held_back``.
+    """
+    wanted = torch.nonzero(gradient > options.densify_gradient).flatten()
+    chosen = _largest(wanted, gradient, max(0, options.max_gaussians - len(gaussians)))
+    size = gaussians.log_scales.amax(dim=1)
+    large = size[chosen] > math.log(options.split_extent * extent)
+    cloned, split = chosen[~large], chosen[large]
+
+    kept = torch.ones(len(gaussians), dtype=torch.bool)
+    kept[split] = False
+    old = torch.nonzero(kept).flatten()
+    source = torch.cat((old, cloned, split, split))
+    fresh = torch.arange(len(source)) >= len(old)
+    means, log_scales = gaussians.means[source], gaussians.log_scales[source]
+    children = len(old) + len(cloned)
+    means[children:] += _split_offsets(gaussians, split, options.seed, iteration)
+    log_scales[children:] -= math.log(options.split_shrink)
+    counts = {"cloned": len(cloned), "split": len(split), "held_back": len(wanted) - len(chosen)}
+    return Growth(source, fresh, means, log_scales), counts
+
+
+def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit: int) -> Int64[Tensor, " k"]:
+    """Up to ``limit`` candidates of the largest value (ties: the first row), in row order."""
+    if len(candidates) <= limit:
+        return candidates
+    ranked = torch.argsort(value[candidates], descending=True, stable=True)
+    return candidates[ranked[:limit]].sort().values
+
+
+def _split_offsets(gaussians: Gaussians, rows: Int64[Tensor, " s"], seed: int, iteration: int) -> Float[Tensor, "t 3"]:
+    """Draw two positions within each parent, relative to its mean: the first of all, then the second of all."""
+    parents = rows.numpy().astype(np.uint64)
+    children = np.concatenate((2 * parents, 2 * parents + np.uint64(1)))
+    index = (3 * children)[:, None] + np.arange(3, dtype=np.uint64)
+    unit = torch.from_numpy(normal(seed, iteration, SPLIT_POSITION, index).astype(np.float32))  # (2s, 3)
+    both = torch.cat((rows, rows))
+    local = unit * torch.exp(gaussians.log_scales[both])
+    w, vector = gaussians.quats[both, :1], gaussians.quats[both, 1:]  # q v q⁻¹ = v + 2 u×(u×v + w v) for |q| = 1
+    norm = gaussians.quats[both].norm(dim=1, keepdim=True).clamp(min=1e-12)
+    w, vector = w / norm, vector / norm
+    return local + 2.0 * torch.cross(vector, torch.cross(vector, local, dim=1) + w * local, dim=1)
+
+
+def prune_mask(
+    gaussians: Gaussians,
+    options: TrainConfig,
+    extent: float,
+    iteration: int,
+    radius_px: Float[Tensor, " n"],
+) -> Bool[Tensor, " n"]:
+    """Which Gaussians go: nearly transparent, too large in the world (after the first reset), or broken.
+
+    Args:
+        gaussians: The model.
+        options: Resolved.
+        extent: Of the scene, world units.
+        iteration: Now.
+        radius_px: Largest radius on screen since the last step, pixels; 0 for new ones.
+    """
+    gone = torch.sigmoid(gaussians.opacity_logits) < options.prune_opacity
+    size = gaussians.log_scales.amax(dim=1)
+    after_reset = 0 < int(options.reset_every) < iteration
+    if options.prune_extent > 0.0 and after_reset:
+        gone |= size > math.log(options.prune_extent * extent)
+    if options.prune_screen_px > 0.0 and after_reset:
+        gone |= radius_px > options.prune_screen_px
+    gone |= ~torch.isfinite(gaussians.means).all(dim=1) | ~torch.isfinite(size)
+    if len(gaussians) - int(gone.sum()) < MIN_AFTER_PRUNE:
+        gone[torch.argmax(torch.nan_to_num(gaussians.opacity_logits, nan=-math.inf))] = False
+    return gone
+
+
+def is_density_step(options: TrainConfig, iteration: int) -> bool:
+    """Whether density control acts after this iteration."""
+    within = int(options.densify_from) <= iteration <= int(options.densify_until)
+    return options.densify and within and iteration % int(options.densify_every) == 0
+
+
+def is_opacity_reset(options: TrainConfig, iteration: int) -> bool:
+    """Whether opacities are reset after this iteration: never in the last step of density control or later."""
+    every = int(options.reset_every)
+    return options.densify and every > 0 and iteration % every == 0 and iteration < int(options.densify_until)
+
+
+def reset_opacity(opacity_logits: Float[Tensor, " n"], limit: float) -> None:
+    """Leave no opacity above ``limit``, in place."""
+    opacity_logits.clamp_(max=math.log(limit / (1.0 - limit)))

@@ -1,0 +1,82 @@
+"""What happened in a training, without clocks: the same for every run of a plan."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from splatpipe.stages.train.densify import DensityEvent
+
+CURVE_EVERY = 50  # iterations that a point of the curve is the mean of
+
+
+@dataclass
+class History:
+    """The curve of the loss and the events of density control.
+
+    Attributes:
+        curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and halvings of the photos.
+        density: Steps of density control.
+        resets: Iterations after which opacities were reset.
+        skipped_gradients: Gaussians' gradients left out because they were not finite, over all iterations.
+        loss_sum: Of the losses since the last point.
+        loss_count: How many those are.
+    """
+
+    curve: list[dict[str, float | int | None]] = field(default_factory=list)
+    density: list[dict[str, int]] = field(default_factory=list)
+    resets: list[int] = field(default_factory=list)
+    skipped_gradients: int = 0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+
+    def add_loss(self, loss: float) -> None:
+        """Count an iteration's loss; one that is not finite is left out."""
+        if math.isfinite(loss):
+            self.loss_sum += loss
+            self.loss_count += 1
+
+    def add_density(self, event: DensityEvent) -> None:
+        """Note a step of density control."""
+        self.density.append(event.to_json())
+
+    def end_iteration(self, iteration: int, last: bool, facts: Mapping[str, int]) -> None:
+        """Close a point of the curve where one is due.
+
+        Args:
+            iteration: Now.
+            last: Whether the training ends here.
+            facts: What else the point says.
+        """
+        if iteration % CURVE_EVERY != 0 and not last:
+            return
+        loss = self.loss_sum / self.loss_count if self.loss_count else None
+        self.curve.append({"iteration": iteration, "loss": loss, **facts})
+        self.loss_sum, self.loss_count = 0.0, 0
+
+    def recent_loss(self) -> float | int | None:
+        """Mean loss since the last point of the curve, or that point's."""
+        return self.loss_sum / self.loss_count if self.loss_count else self.last_loss()
+
+    def last_loss(self) -> float | int | None:
+        """The curve's last value."""
+        return self.curve[-1]["loss"] if self.curve else None
+
+    def state(self) -> dict[str, Any]:
+        """All of it as JSON values, for a checkpoint."""
+        return {
+            "curve": self.curve,
+            "density": self.density,
+            "resets": self.resets,
+            "skipped_gradients": self.skipped_gradients,
+            "loss_sum": self.loss_sum,
+            "loss_count": self.loss_count,
+        }
+
+    def to_json(self) -> str:
+        """The text of `history.json`."""
+        kept = {name: value for name, value in self.state().items() if not name.startswith("loss_")}
+        return json.dumps(kept, indent=1, allow_nan=False) + "\n"

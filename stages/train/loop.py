@@ -1,0 +1,221 @@
+"""train: from the sparse points to a splat, one photo an iteration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from splatpipe.pipeline import raster
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
+from splatpipe.pipeline.engine.worker import peak_memory_bytes
+from splatpipe.pipeline.raster.loss import photo_loss
+from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
+from splatpipe.stages.train.draws import BACKGROUND, uniform
+from splatpipe.stages.train.interrupts import deferred_interrupts
+from splatpipe.stages.train.plan import (
+    Plan,
+    coarse_levels,
+    load_or_write_plan,
+    make_plan,
+    means_rate,
+    sh_degree_at,
+)
+from splatpipe.stages.train.state import TrainState
+from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
+
+CHECKPOINT = "checkpoint.npz"
+CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
+CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
+REPORT_EVERY = 10  # iterations
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `model.ply`, `history.json` and `plan.json`; go on from a checkpoint where a killed run left one.
+
+    Raises:
+        SplatpipeError: if nothing is left to train on.
+        MachineError: if the device asked for is not there.
+        KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
+    """
+    check_device(inputs.machine)
+    views = load_views(inputs["undistort.dataset"])
+    start = read_splat(inputs["initialize.splat"])
+    every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
+    plan = load_or_write_plan(out / "plan.json", make_plan(config, views, every, names, len(start)))
+    kept = set(plan.train_views)
+    trained_on = [view for view in views if view.camera.name in kept]
+    levels = coarse_levels(plan.options)
+    with same_bits(inputs.machine.threads):
+        state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan.options)
+        with PhotoStream(trained_on, levels, plan.options.seed, state.iteration + 1) as photos:
+            optimise(state, plan, photos, out / CHECKPOINT, report)
+        gaussians = state.finished()
+    write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
+    (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
+    return {
+        "gaussians": len(gaussians),
+        "iterations": plan.options.iterations,
+        "loss": state.history.last_loss(),
+        "train_seconds": round(state.seconds, 1),
+        "train_megapixels": plan.train_megapixels,
+        "peak_memory_bytes": peak_memory_bytes(),
+        "device": "cpu",
+        "instruction_set": raster.isa_name(),
+    }
+
+
+def check_device(machine: Machine) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        MachineError: for `cuda`, for which this build has no kernels.
+    """
+    if machine.device == "cuda":
+        raise MachineError(
+            "This build of splatpipe has no CUDA kernels, so it cannot train on a CUDA device.",
+            hint="Leave --device out, or give --device cpu.",
+        )
+
+
+@contextmanager
+def same_bits(threads: int) -> Iterator[None]:
+    """Give the native kernels their threads and torch one: its sums depend on how many there are."""
+    before = torch.get_num_threads()
+    raster.set_threads(threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def resume(path: Path, plan: Plan, report: Reporter) -> TrainState | None:
+    """The state that a killed run left, or None; a broken one is told and ignored."""
+    try:
+        checkpoint = load_checkpoint(path, plan.digest())
+        state = TrainState.restore(checkpoint, plan.options)
+    except FileNotFoundError:
+        return None
+    except BrokenCheckpointError as error:
+        report.warning(f"The checkpoint of the training cannot be used: {error}. It starts afresh.")
+        return None
+    begun, here = checkpoint.facts.get("instruction_set"), raster.isa_name()
+    if begun != here:
+        report.warning(f"The training goes on with {here} from {begun}: as good, but not the same to the last bit.")
+    return state
+
+
+def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Path, report: Reporter) -> None:
+    """Train to the plan's last iteration, leaving checkpoints on the way.
+
+    When a checkpoint is written depends on the clock; what is computed does not.
+
+    Raises:
+        KeyboardInterrupt: when asked to end, after a checkpoint.
+    """
+    clock = _Clock(state.seconds)
+    with deferred_interrupts() as interrupt:
+        for photo in photos:
+            train_step(state, plan, photo)
+            state.seconds = clock.seconds()
+            if interrupt.requested:
+                break
+            if clock.checkpoint_due() and state.iteration < plan.options.iterations:
+                with clock.checkpointing():
+                    save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
+            if state.iteration % REPORT_EVERY == 0 or state.iteration == plan.options.iterations:
+                tell(state, plan, report)
+    if interrupt.requested:  # asked of once more: it may have come after the last iteration's look
+        save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
+        raise KeyboardInterrupt
+
+
+def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
+    """Report how far the training is."""
+    report.progress(state.iteration, plan.options.iterations, "training", "iterations")
+    if (loss := state.history.recent_loss()) is not None:
+        report.metric("loss", loss, state.iteration)
+    report.metric("gaussians", len(state.gaussians), state.iteration)
+
+
+def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    """One iteration: render, compare, step the parameters, then density control where it is due.
+
+    Args:
+        state: Changed in place; afterwards it is of the next iteration.
+        plan: The training's.
+        photo: What to compare with.
+    """
+    options, iteration = plan.options, state.iteration + 1
+    if photo.mask is None or bool(photo.mask.any()):
+        descend(state, plan, photo, iteration)
+    state.control_density(options, plan.extent, iteration)
+    state.iteration = iteration
+    facts = {
+        "gaussians": len(state.gaussians),
+        "sh_degree": sh_degree_at(options, iteration),
+        "width": photo.camera.width,
+    }
+    state.history.end_iteration(iteration, iteration == options.iterations, facts)
+
+
+def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
+    """Render the photo's view and step the parameters against the loss's gradient."""
+    options = plan.options
+    settings = raster.RenderOptions(
+        sh_degree=sh_degree_at(options, iteration),
+        background=background(options, iteration),
+        antialias=options.antialias,
+        near=plan.near,
+        depth=False,
+    )
+    probe = state.probe()
+    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
+    loss = photo_loss(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
+    loss.backward()  # type: ignore[no-untyped-call]
+    state.history.add_loss(float(loss.detach()))
+    with torch.no_grad():
+        state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
+        if options.densify and iteration <= int(options.densify_until) and probe.grad is not None:
+            state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
+            if options.prune_screen_px > 0.0:
+                state.statistics.observe_radii(rendered.radii)
+
+
+def background(options: TrainConfig, iteration: int) -> tuple[float, float, float]:
+    """What is behind the Gaussians in an iteration, red, green, blue."""
+    if options.background == "random":
+        red, green, blue = uniform(options.seed, iteration, BACKGROUND, [0, 1, 2]).tolist()
+        return red, green, blue
+    return BACKGROUNDS[options.background]
+
+
+class _Clock:
+    """Seconds of a training over all its runs, and when a checkpoint is due."""
+
+    def __init__(self, before: float) -> None:
+        self._began = time.monotonic() - before
+        self._last = time.monotonic()
+        self._cost = 0.0
+
+    def seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def checkpoint_due(self) -> bool:
+        return time.monotonic() - self._last >= max(CHECKPOINT_SECONDS, self._cost / CHECKPOINT_SHARE)
+
+    @contextmanager
+    def checkpointing(self) -> Iterator[None]:
+        started = time.monotonic()
+        yield
+        self._last = time.monotonic()
+        self._cost = self._last - started

@@ -1,0 +1,172 @@
+"""The plan of a training: every schedule resolved, written once before it begins and taken as it is on resume."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import View, split_views
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.durable import write_durably
+
+PLAN_FORMAT = 1
+EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
+NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones see nothing that near
+PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
+LARGEST_BOOST = 4.0  # of learning rates: measured best at 1,500 iterations, and beyond it Gaussians overshoot
+SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a training does, resolved.
+
+    Attributes:
+        options: The configuration with every `auto` replaced by a number.
+        extent: Radius of the cameras, world units.
+        near: Near plane, world units.
+        train_views: Names of the photos trained on, sorted.
+        test_views: Names of those held out, sorted.
+        train_megapixels: Mean size of the training photos.
+        initial_gaussians: Gaussians at the start.
+    """
+
+    options: TrainConfig
+    extent: float
+    near: float
+    train_views: tuple[str, ...]
+    test_views: tuple[str, ...]
+    train_megapixels: float
+    initial_gaussians: int
+
+    def to_json(self) -> str:
+        """The plan as canonical JSON."""
+        fields = asdict(self) | {"format": PLAN_FORMAT, "options": self.options.model_dump(mode="json")}
+        return json.dumps(fields, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+
+    def digest(self) -> str:
+        """sha256 of ``to_json``: names the plan in its checkpoints."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()
+
+    @staticmethod
+    def from_json(text: str) -> Plan:
+        """Read ``to_json``'s text back.
+
+        Raises:
+            ValueError: if it is no plan of this format.
+        """
+        fields = json.loads(text)
+        if not isinstance(fields, dict) or fields.pop("format", None) != PLAN_FORMAT:
+            raise ValueError("not a plan of this version")
+        try:
+            fields["options"] = TrainConfig.model_validate(fields["options"])
+            fields["train_views"] = tuple(fields["train_views"])
+            fields["test_views"] = tuple(fields["test_views"])
+            return Plan(**fields)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"not a plan: {error}") from error
+
+
+def resolve_schedule(config: TrainConfig) -> TrainConfig:
+    """Replace every `auto` by the published value, changed for short runs as the option's text says."""
+    run = config.iterations
+    until = config.densify_until if config.densify_until != "auto" else run // 2
+    auto = {
+        "sh_every": max(1, min(1000, run // 5)),
+        "densify_from": max(1, min(500, run // 5)),
+        "densify_until": max(1, until),
+        "densify_every": max(1, min(100, run // 10)),
+        "reset_every": 3000 if run >= SHORT_RUN else 0,
+        "coarse_until": until,
+        "lr_boost": round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / run))), 4),
+    }
+    resolved = {name: value for name, value in auto.items() if getattr(config, name) == "auto"}
+    return config.model_copy(update=resolved)
+
+
+def scene_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 times the largest distance of a camera from the cameras' mean, world units."""
+    centres = np.array([camera.centre() for camera in cameras])
+    radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    return EXTENT_MARGIN * radius
+
+
+def make_plan(config: TrainConfig, views: Sequence[View], every: int, names: str, gaussians: int) -> Plan:
+    """Resolve a training's plan.
+
+    Args:
+        config: The options.
+        views: All photos of the dataset.
+        every: `evaluate.every`.
+        names: `evaluate.views`.
+        gaussians: Gaussians at the start.
+
+    Raises:
+        SplatpipeError: if nothing is left to train on, a held-out name is unknown, or all cameras stand in one place.
+    """
+    train, test = split_views([view.camera.name for view in views], every, names)
+    kept = set(train)
+    cameras = [view.camera for view in views if view.camera.name in kept]
+    extent = scene_extent(cameras)
+    if not math.isfinite(extent) or extent <= 0.0:
+        raise SplatpipeError(
+            f"All {len(cameras)} cameras stand in one place, so the scene has no size.",
+            hint="Take the photos from different places, and hold out fewer of them.",
+        )
+    pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
+    return Plan(
+        options=resolve_schedule(config),
+        extent=extent,
+        near=NEAR_PER_EXTENT * extent,
+        train_views=tuple(sorted(train)),
+        test_views=tuple(sorted(test)),
+        train_megapixels=round(pixels / 1e6, 4),
+        initial_gaussians=gaussians,
+    )
+
+
+def load_or_write_plan(path: Path, fresh: Plan) -> Plan:
+    """The plan already at ``path``, or ``fresh``, written there.
+
+    The folder belongs to one key of configuration and inputs, so a plan in it is of this training.
+    """
+    try:
+        return Plan.from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        write_durably(path, lambda file: file.write(fresh.to_json().encode()))
+        return fresh
+
+
+def coarse_levels(options: TrainConfig) -> list[int]:
+    """How often each iteration's photo is halved: equal shares of ``coarse_until``, coarsest first.
+
+    Args:
+        options: Resolved.
+    """
+    until = int(options.coarse_until)
+    levels = []
+    for iteration in range(options.iterations):
+        step = iteration * options.coarse_levels // until if iteration < until else options.coarse_levels
+        levels.append(options.coarse_levels - step)
+    return levels
+
+
+def means_rate(plan: Plan, iteration: int) -> float:
+    """Learning rate of the positions at an iteration (from 1), world units: exponential from start to end."""
+    share = min(1.0, iteration / plan.options.iterations)
+    boost = float(plan.options.lr_boost)
+    first, last = boost * plan.options.lr_means, boost * boost * plan.options.lr_means_final
+    return plan.extent * math.exp(math.log(first) * (1.0 - share) + math.log(last) * share)
+
+
+def sh_degree_at(options: TrainConfig, iteration: int) -> int:
+    """The degree trained at an iteration (from 1): one more every ``sh_every``."""
+    return min(options.sh_degree, iteration // int(options.sh_every))

@@ -1,0 +1,32 @@
+"""Runs the line like the command does, and kills itself in the middle of a stage; a program for test_line.py.
+
+Arguments: photos, out, the stage to die in, "alone" or "group", then --set assignments.
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+from splatpipe.pipeline.engine.config import parse_set, resolve
+from splatpipe.pipeline.engine.events import Event
+from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.stage import Machine
+from splatpipe.stages.line import LINE, LineConfig
+
+
+def main(photos: str, out: str, stage: str, how: str, *assignments: str) -> None:
+    def die(event: Event) -> None:
+        # The runner commits an artifact only after the stage's last event: dying in a progress event is dying within.
+        if event.stage == stage and event.kind == "progress" and event.data["done"] > 0:
+            if how == "group":
+                os.killpg(os.getpgid(0), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    config = resolve(LineConfig, [parse_set(text, LineConfig) for text in assignments])
+    with open_session(Request(LINE, config, Path(photos), Path(out), Machine("cpu", 2)), die) as runner:
+        runner.walk()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,100 @@
+"""The command line: exit codes, messages without tracebacks, one JSON object, quick help."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def splatpipe(*arguments: object, **how: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **how)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    return folder
+
+
+def test_help_names_every_command_and_imports_nothing_heavy() -> None:
+    done = splatpipe("--help")
+    assert done.returncode == 0
+    for command in ("run", "stage", "demo", "status", "clean", "doctor", "options"):
+        assert command in done.stdout
+    code = (
+        "import sys; from splatpipe.pipeline import cli; from splatpipe.stages import line\n"
+        "print([name for name in ('torch', 'numpy', 'pycolmap', 'cv2', 'kornia') if name in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["run", "{tmp}/none", "{tmp}/out"], 1, "There is no folder"),
+        (["run", "{tmp}/file", "{tmp}/out"], 1, "is a file"),
+        (["run", "{photos}", "{tmp}/file"], 2, "is a file"),
+        (["run", "{photos}", "{photos}/out"], 2, "inside the photo folder"),
+        (["run", "{photos}", "/proc/out"], 4, "Cannot write"),
+        (["run", "{photos}"], 2, "Missing argument"),
+        (["run", "{photos}", "{tmp}/out", "--fast"], 2, "No such option"),
+        (["run", "{photos}", "{tmp}/out", "--preset", "fast"], 2, "no preset"),
+        (["run", "{photos}", "{tmp}/out", "--device", "tpu"], 2, "no device"),
+        (["run", "{photos}", "{tmp}/out", "--threads", "-1"], 2, "--threads"),
+        (["run", "{photos}", "{tmp}/out", "--set", "train.iterations=0"], 2, "train.iterations = 0"),
+        (["run", "{photos}", "{tmp}/out", "--set", "train.iteration=9"], 2, "Did you mean train.iterations?"),
+        (["run", "{photos}", "{tmp}/out", "--config", "{tmp}/broken.toml"], 2, "not valid TOML"),
+        (["run", "{photos}", "{tmp}/out", "--until", "finish"], 2, "no stage"),
+        (["run", "{photos}", "{tmp}/out", "--rerun", "finish"], 2, "no stage"),
+        (["stage", "train", "{tmp}/out"], 2, "holds no run"),
+        (["stage", "trains", "{tmp}/out"], 2, "no stage"),
+        (["status", "{tmp}/out"], 2, "holds no run"),
+        (["clean", "{photos}"], 2, "holds no run"),
+        (["fly"], 2, "No such command"),
+    ],
+)
+def test_a_wrong_call_gets_one_message_and_its_exit_code(
+    tmp_path: Path, photos: Path, arguments: list[str], code: int, message: str
+) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "broken.toml").write_text("[train\n")
+    done = splatpipe(*(text.format(tmp=tmp_path, photos=photos) for text in arguments), cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert message in " ".join(done.stderr.replace("│", " ").split())
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out" / "splat.ply").exists()
+
+
+def test_json_is_one_object_on_stdout_also_when_it_fails(tmp_path: Path, photos: Path) -> None:
+    done = splatpipe("run", photos, tmp_path / "out", "--json")
+    assert done.returncode == 1
+    told = json.loads(done.stdout)
+    assert told["exit_code"] == 1
+    assert told["error"]["message"]
+    assert told["error"]["hint"]
+
+
+def test_doctor_names_the_instruction_set() -> None:
+    done = splatpipe("doctor", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["rasterizer"].startswith("native, ")
+
+
+def test_options_lists_every_option() -> None:
+    done = splatpipe("options", "--preset", "preview", env={**os.environ, "COLUMNS": "200"})
+    assert done.returncode == 0, done.stderr
+    assert "train.iterations" in done.stdout
+
+
+def test_the_package_is_a_namespace_of_its_own() -> None:
+    code = (
+        "import splatpipe.pipeline, splatpipe.stages, splatpipe.demo\n"
+        "import importlib.util; print(importlib.util.find_spec('pipeline'))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd="/")
+    assert done.stdout.strip() == "None"

@@ -1,0 +1,114 @@
+"""Pinhole views, and how a dataset's views are read and divided."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import image_path, load_points, load_views, mask_path, split_views
+
+
+def a_camera() -> Camera:
+    pose = np.eye(4)
+    pose[:3, :3] = pycolmap.Rotation3d(np.array([0.1, -0.2, 0.3])).matrix()
+    pose[:3, 3] = [0.5, -1.0, 4.0]
+    return Camera("a.jpg", 40, 30, 50.0, 51.0, 19.0, 16.0, pose)
+
+
+def test_the_centre_is_where_the_camera_frame_begins() -> None:
+    camera = a_camera()
+    assert camera.cam_from_world[:3, :3] @ camera.centre() + camera.cam_from_world[:3, 3] == pytest.approx(0, abs=1e-12)
+
+
+def test_projection_agrees_with_the_matrices_and_scales_with_the_image() -> None:
+    camera = a_camera()
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    in_camera = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    homogeneous = in_camera @ camera.k().T
+    assert camera.project(points) == pytest.approx(homogeneous[:, :2] / homogeneous[:, 2:])
+    half = camera.scaled(20, 15)
+    assert half.project(points) == pytest.approx(camera.project(points) / 2)
+    assert (half.width, half.height) == (20, 15)
+
+
+def write_model(folder: Path, kind: str = "PINHOLE") -> None:
+    model = pycolmap.Reconstruction()
+    parameters = [50.0, 51.0, 19.0, 16.0] if kind == "PINHOLE" else [50.0, 19.0, 16.0, 0.1]
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, model=kind, width=40, height=30, params=parameters))
+    for number, name in enumerate(("b.jpg", "a/ü 1.jpg"), start=1):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.0, 0.2])), np.array([0.0, float(number), 4.0]))
+        model.add_image_with_trivial_frame(pycolmap.Image(name, np.array([[3.0, 4.0]]), 1, number), pose)
+    track = pycolmap.Track([pycolmap.TrackElement(1, 0), pycolmap.TrackElement(2, 0)])
+    model.add_point3D(np.array([0.1, 0.2, 0.3]), track, np.array([1, 2, 3], np.uint8))
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(folder / "sparse" / "0")
+
+
+def test_views_come_in_name_order_with_the_models_cameras(tmp_path: Path) -> None:
+    write_model(tmp_path)
+    mask_path(tmp_path, "b.jpg").parent.mkdir()
+    mask_path(tmp_path, "b.jpg").touch()
+    views = load_views(tmp_path)
+    assert [view.camera.name for view in views] == ["a/ü 1.jpg", "b.jpg"]
+    assert views[0].image_path == image_path(tmp_path, "a/ü 1.jpg") == tmp_path / "images" / "a" / "ü 1.jpg"
+    assert [view.mask_path for view in views] == [None, tmp_path / "masks" / "b.jpg.png"]
+    image = next(
+        image for image in pycolmap.Reconstruction(tmp_path / "sparse/0").images.values() if image.image_id == 2
+    )
+    assert views[0].camera.centre() == pytest.approx(image.projection_center())
+    point = np.array([[0.3, 0.2, 0.1]])
+    assert views[0].camera.project(point)[0] == pytest.approx(image.project_point(point[0]))
+
+
+def test_points_have_colours_and_track_lengths(tmp_path: Path) -> None:
+    write_model(tmp_path)
+    points = load_points(tmp_path)
+    assert len(points) == 1
+    assert points.xyz.tolist() == [[0.1, 0.2, 0.3]]
+    assert points.rgb.tolist() == [[1, 2, 3]]
+    assert points.track_lengths.tolist() == [2]
+
+
+def test_a_missing_broken_or_distorted_model_is_a_failed_stage(tmp_path: Path) -> None:
+    with pytest.raises(StageError, match="sparse/0"):
+        load_views(tmp_path)
+    write_model(tmp_path / "radial", "SIMPLE_RADIAL")
+    with pytest.raises(StageError, match="not PINHOLE"):
+        load_views(tmp_path / "radial")
+    write_model(tmp_path / "cut")
+    cut = tmp_path / "cut" / "sparse" / "0" / "images.bin"
+    cut.write_bytes(cut.read_bytes()[:20])
+    with pytest.raises(StageError):
+        load_views(tmp_path / "cut")
+
+
+def test_every_eighth_view_is_held_out_starting_with_the_first() -> None:
+    names = [f"{number:02d}" for number in range(20)]
+    training, held_out = split_views(names[::-1], 8, "")
+    assert held_out == ["00", "08", "16"]
+    assert training == sorted(set(names) - set(held_out))
+    assert split_views(names, 0, "") == (names, [])
+
+
+def test_named_views_are_held_out_instead() -> None:
+    assert split_views(["a b", "c", "d"], 8, " c, a b,") == (["d"], ["a b", "c"])
+    with pytest.raises(SplatpipeError, match="names x, which") as error:
+        split_views(["a", "b"], 8, "x")
+    assert "a, b" in error.value.hint
+
+
+def test_views_may_be_named_without_suffix_case_and_folder() -> None:
+    names = ["100_7105.JPG", "100_7106.JPG", "a/1.jpg", "b/1.jpg", "b/2.png"]
+    assert split_views(names, 8, "100_7105, A/1,2")[1] == ["100_7105.JPG", "a/1.jpg", "b/2.png"]
+    for unclear in ("1", "1.jpg", "100_710", "c/1"):
+        with pytest.raises(SplatpipeError, match=f"names {unclear}, which"):
+            split_views(names, 8, unclear)
+    assert split_views(["x", "x.jpg", "X.jpg"], 8, "x,x.jpg")[1] == ["x", "x.jpg"]
+
+
+def test_something_must_be_left_to_train_on() -> None:
+    with pytest.raises(SplatpipeError, match="none is left"):
+        split_views(["a", "b"], 1, "")

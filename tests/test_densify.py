@@ -1,0 +1,136 @@
+"""Density control: who is cloned, split, pruned and held back, and that its random numbers repeat."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.densify import (
+    DensityStatistics,
+    grow,
+    is_density_step,
+    is_opacity_reset,
+    prune_mask,
+    reset_opacity,
+)
+from splatpipe.stages.train.draws import normal, permutation, uniform
+from splatpipe.stages.train.plan import resolve_schedule
+
+OPTIONS = resolve_schedule(TrainConfig(reset_every=100))
+EXTENT = 10.0  # so that sizes above 0.1 are split, and above 1 pruned
+
+
+def model(sizes: list[float]) -> Gaussians:
+    gaussians = Gaussians.empty(len(sizes), 0)
+    gaussians.log_scales = torch.tensor(sizes).log()[:, None].repeat(1, 3)
+    gaussians.means = torch.arange(3.0 * len(sizes)).reshape(-1, 3)
+    return gaussians
+
+
+def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
+    gaussians = model([0.05, 0.5, 0.05, 0.5])
+    growth, counts = grow(gaussians, torch.tensor([1.0, 1.0, 0.0, 0.0]), OPTIONS, EXTENT, 7)
+    assert counts == {"cloned": 1, "split": 1, "held_back": 0}
+    assert growth.source.tolist() == [0, 2, 3, 0, 1, 1]
+    assert growth.fresh.tolist() == [False, False, False, True, True, True]
+    assert torch.equal(growth.means[3], gaussians.means[0])
+    torch.testing.assert_close(growth.log_scales[4:].exp(), torch.full((2, 3), 0.5 / 1.6))
+    assert not torch.equal(growth.means[4], growth.means[5])
+    assert ((growth.means[4:] - gaussians.means[1]).abs() < 5 * 0.5).all()
+
+
+def test_children_of_a_split_are_drawn_from_their_parent() -> None:
+    gaussians = model([1.0] * 4000)
+    gaussians.means.zero_()
+    gaussians.log_scales[:] = torch.tensor([4.0, 1.0, 0.25]).log()
+    half = math.radians(30.0) / 2.0
+    gaussians.quats[:] = 3.0 * torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)])
+    growth, _ = grow(gaussians, torch.ones(4000), OPTIONS, EXTENT, 1)
+    c, s = math.cos(2 * half), math.sin(2 * half)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    expected = turn @ np.diag([16.0, 1.0, 0.0625]) @ turn.T
+    # 8000 draws: a covariance entry is known to 1.6 % of its scale, so 8 % is five sigma.
+    np.testing.assert_allclose(np.cov(growth.means.numpy().T), expected, atol=0.08 * 16)
+    assert growth.means.mean(dim=0).abs().max() < 0.25
+
+
+def test_cap_takes_the_largest_gradients_and_counts_the_rest() -> None:
+    options = OPTIONS.model_copy(update={"max_gaussians": 7})
+    gradient = torch.tensor([0.1, 0.5, 0.3, 0.5, 0.0])
+    growth, counts = grow(model([0.05] * 5), gradient, options, EXTENT, 1)
+    assert growth.source.tolist() == [0, 1, 2, 3, 4, 1, 3]
+    assert counts == {"cloned": 2, "split": 0, "held_back": 2}
+    _, counts = grow(model([0.05] * 9), torch.ones(9), options, EXTENT, 1)
+    assert counts == {"cloned": 0, "split": 0, "held_back": 9}
+
+
+def test_transparent_huge_and_broken_gaussians_are_pruned() -> None:
+    gaussians = model([0.5, 0.5, 2.0, 0.5, 0.5])
+    gaussians.opacity_logits[1] = math.log(0.004 / 0.996)
+    gaussians.means[3, 1] = math.nan
+    radii = torch.tensor([0.0, 0.0, 0.0, 0.0, 50.0])
+    assert prune_mask(gaussians, OPTIONS, EXTENT, 200, radii).tolist() == [False, True, True, True, False]
+    assert prune_mask(gaussians, OPTIONS, EXTENT, 50, radii).tolist() == [False, True, False, True, False]
+    on_screen = OPTIONS.model_copy(update={"prune_screen_px": 20.0})
+    assert prune_mask(gaussians, on_screen, EXTENT, 200, radii).tolist() == [False, True, True, True, True]
+
+
+def test_the_last_gaussian_is_never_pruned() -> None:
+    gaussians = model([0.5, 0.5])
+    gaussians.opacity_logits[:] = torch.tensor([-20.0, -19.0])
+    assert prune_mask(gaussians, OPTIONS, EXTENT, 50, torch.zeros(2)).tolist() == [True, False]
+
+
+def test_statistic_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
+    statistics = DensityStatistics(3)
+    gradient = torch.tensor([[3e-3, 4e-3], [1.0, 1.0], [math.nan, 0.0]])
+    statistics.observe(gradient, torch.tensor([True, False, True]), 200, 200)
+    statistics.observe(torch.zeros(3, 2), torch.tensor([True, False, True]), 200, 200)
+    torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([0.25, 0.0, 0.0]))
+    statistics.observe_radii(torch.tensor([1.0, 2.0, 0.0]))
+    statistics.observe_radii(torch.tensor([2.0, 1.0, 0.0]))
+    assert statistics.max_radius_px.tolist() == [2.0, 2.0, 0.0]
+
+
+def test_published_schedule_of_density_control() -> None:
+    steps = [i for i in range(1, 30_001) if is_density_step(resolve_schedule(TrainConfig()), i)]
+    assert (steps[0], steps[1], steps[-1]) == (500, 600, 15_000)
+    resets = [i for i in range(1, 30_001) if is_opacity_reset(resolve_schedule(TrainConfig()), i)]
+    assert resets == [3000, 6000, 9000, 12_000]
+    short = resolve_schedule(TrainConfig(iterations=9999))
+    assert not any(is_opacity_reset(short, i) for i in range(1, 10_000))
+
+
+def test_opacity_reset_lowers_only_what_is_above() -> None:
+    logits = torch.tensor([2.0, -9.0])
+    reset_opacity(logits, 0.01)
+    torch.testing.assert_close(torch.sigmoid(logits), torch.tensor([0.01, 1.0 / (1.0 + math.exp(9.0))]))
+
+
+def test_random_numbers_depend_on_their_key_alone() -> None:
+    everything = uniform(3, 100, 2, np.arange(1000))
+    np.testing.assert_array_equal(uniform(3, 100, 2, [5, 999]), everything[[5, 999]])
+    for other in (
+        uniform(4, 100, 2, np.arange(1000)),
+        uniform(3, 101, 2, np.arange(1000)),
+        uniform(3, 100, 1, np.arange(1000)),
+    ):
+        assert not (other == everything).any()
+        assert abs(np.corrcoef(other, everything)[0, 1]) < 0.15  # 1000 pairs: σ is 0.032
+
+
+def test_random_numbers_have_their_distribution() -> None:
+    flat = np.sort(uniform(0, 1, 1, np.arange(20_000)))
+    assert np.abs(flat - (np.arange(20_000) + 0.5) / 20_000).max() < 1.63 / math.sqrt(20_000)  # Kolmogorov, 1 %
+    bell = normal(0, 1, 1, np.arange(20_000))
+    assert abs(bell.mean()) < 0.03 and abs(bell.std() - 1.0) < 0.02 and abs((bell**4).mean() - 3.0) < 0.3
+
+
+@pytest.mark.parametrize("count", [1, 2, 37])
+def test_every_epoch_sees_every_photo_once_in_its_own_order(count: int) -> None:
+    orders = [tuple(permutation(0, epoch, count)) for epoch in range(3)]
+    assert all(sorted(order) == list(range(count)) for order in orders)
+    assert count < 5 or len(set(orders)) == 3

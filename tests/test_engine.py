@@ -1,0 +1,326 @@
+"""The engine on a small real line: what is reused, what is rerun, and what survives a crash, a kill and a full disk."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine.config import resolve
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
+from splatpipe.pipeline.engine.events import Event
+from splatpipe.pipeline.engine.runner import Outcome, survey
+from splatpipe.pipeline.engine.session import Request, load_run, open_session, survey_line
+from splatpipe.pipeline.engine.stage import Machine
+from splatpipe.pipeline.engine.store import open_store
+
+LINES = Path(__file__).parent / "lines"
+sys.path.insert(0, str(LINES))
+import arithmetic  # noqa: E402
+
+Walk = Callable[..., Outcome]
+
+
+@pytest.fixture(autouse=True)
+def _workers_find_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(LINES), os.environ.get("PYTHONPATH", "")]))
+
+
+@pytest.fixture
+def numbers(tmp_path: Path) -> Path:
+    folder = tmp_path / "numbers"
+    folder.mkdir()
+    for name, value in (("a", 1), ("b", 20), ("c", 300)):
+        (folder / f"{name}.txt").write_text(str(value))
+    return folder
+
+
+def request_of(numbers: Path, out: Path, **sections: dict[str, object]) -> Request:
+    config = resolve(arithmetic.LineConfig, [sections])
+    return Request(arithmetic.LINE, config, numbers, out, Machine("cpu", 1))
+
+
+def walk(request: Request, **how: object) -> tuple[Outcome, list[Event]]:
+    events: list[Event] = []
+    with open_session(request, events.append) as runner:
+        return runner.walk(**how), events
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "out"
+
+
+def test_a_run_leaves_its_deliverable_and_a_second_one_runs_nothing(numbers: Path, out: Path) -> None:
+    first, _ = walk(request_of(numbers, out))
+    assert first.ran == ["read", "add", "count", "tell"]
+    assert (out / "telling.txt").read_text() == "3 1 False 21"
+    second, events = walk(request_of(numbers, out))
+    assert second.ran == []
+    assert [event.kind for event in events] == ["run_started", *["stage_reused"] * 4]
+
+
+def test_a_changed_option_is_felt_exactly_as_far_as_it_changes_bytes(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    outcome, _ = walk(request_of(numbers, out, add={"offset": 2}))
+    assert outcome.ran == ["add", "tell"]  # the parity stayed, so the count did
+    assert (out / "telling.txt").read_text() == "3 1 False 23"
+
+
+def test_going_back_to_an_earlier_option_reuses_its_artifacts(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    walk(request_of(numbers, out, add={"offset": 1}))
+    outcome, _ = walk(request_of(numbers, out))
+    assert outcome.ran == []
+    assert (out / "telling.txt").read_text() == "3 1 False 21"
+
+
+def test_a_borrowed_setting_reruns_the_stage_that_borrows_it(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    outcome, _ = walk(request_of(numbers, out, tell={"loud": True}))
+    assert outcome.ran == ["count", "tell"]
+
+
+def test_a_changed_photo_reruns_but_a_touched_or_copied_one_does_not(numbers: Path, out: Path, tmp_path: Path) -> None:
+    walk(request_of(numbers, out))
+    os.utime(numbers / "a.txt")
+    assert walk(request_of(numbers, out))[0].ran == []
+    elsewhere = shutil.copytree(numbers, tmp_path / "elsewhere")
+    assert walk(request_of(elsewhere, out))[0].ran == []
+    (numbers / "a.txt").write_text("2")
+    assert walk(request_of(numbers, out))[0].ran == ["read", "add", "count", "tell"]
+
+
+def test_strays_are_dropped_and_the_manifest_describes_every_file(numbers: Path, out: Path) -> None:
+    outcome, _ = walk(request_of(numbers, out))
+    folder = outcome.artifacts["read"].folder
+    assert sorted(path.name for path in folder.iterdir()) == ["left_out.json", "manifest.json", "numbers.json"]
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert {"versions", "machine", "seconds", "cpu_seconds", "peak_memory_bytes", "inputs"} <= set(manifest)
+
+
+def test_a_damaged_artifact_is_made_again(numbers: Path, out: Path) -> None:
+    outcome, _ = walk(request_of(numbers, out))
+    (outcome.artifacts["add"].folder / "total.txt").unlink()
+    again, _ = walk(request_of(numbers, out))
+    assert again.ran == ["add"]
+
+
+def test_rerun_runs_again_and_what_follows_is_reused_when_the_bytes_are_the_same(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    outcome, _ = walk(request_of(numbers, out), rerun=frozenset({"add"}))
+    assert outcome.ran == ["add"]
+
+
+def test_until_stops_there(numbers: Path, out: Path) -> None:
+    outcome, _ = walk(request_of(numbers, out), until="add")
+    assert outcome.ran == ["read", "add"]
+
+
+def test_one_stage_alone(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    with open_session(request_of(numbers, out), lambda event: None) as runner:
+        assert runner.run_alone("count").ran == ["count"]
+
+
+def test_one_stage_alone_needs_what_it_reads(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out), until="read")
+    with (
+        pytest.raises(UsageError, match="reads what add leaves"),
+        open_session(request_of(numbers, out), lambda event: None) as runner,
+    ):
+        runner.run_alone("count")
+
+
+@pytest.mark.parametrize(
+    ("fail", "error", "message"),
+    [
+        ("abort", StageError, "SIGABRT"),
+        ("kill", StageError, "SIGKILL"),
+        ("raise", StageError, "out of order"),
+        ("disk", MachineError, "No space left"),
+        ("forget", StageError, "left no count.txt"),
+    ],
+)
+def test_a_failed_stage_has_a_reason_and_what_came_before_it_stays(
+    numbers: Path, out: Path, fail: str, error: type[SplatpipeError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        walk(request_of(numbers, out, count={"fail": fail}))
+    outcome, _ = walk(request_of(numbers, out))
+    assert outcome.ran == ["count", "tell"]
+
+
+def test_an_error_of_the_input_keeps_its_hint(tmp_path: Path, out: Path) -> None:
+    (tmp_path / "none").mkdir()
+    with pytest.raises(SplatpipeError, match="no numbers") as caught:
+        walk(request_of(tmp_path / "none", out))
+    assert caught.value.hint == "Put some in."
+    assert caught.value.exit_code == 1
+
+
+def run_in_background(numbers: Path, out: Path, **count: object) -> subprocess.Popen[bytes]:
+    code = (
+        "import arithmetic, sys; from pathlib import Path\n"
+        "from splatpipe.pipeline.engine.config import resolve\n"
+        "from splatpipe.pipeline.engine.session import Request, open_session\n"
+        "from splatpipe.pipeline.engine.stage import Machine\n"
+        f"config = resolve(arithmetic.LineConfig, [{{'count': {count!r}}}])\n"
+        f"request = Request(arithmetic.LINE, config, Path({str(numbers)!r}), Path({str(out)!r}), Machine('cpu', 1))\n"
+        "def show(event):\n"
+        "    if event.kind == 'progress' and event.stage == 'count' and event.data['done'] >= 2:\n"
+        "        print('counting', flush=True)\n"
+        "with open_session(request, show) as runner:\n"
+        "    runner.walk()\n"
+    )
+    command = [sys.executable, "-c", code]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True, preexec_fn=hear_ctrl_c)
+
+
+def hear_ctrl_c() -> None:
+    """In the child: a test run in the background has SIGINT ignored, and so would all that it starts."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@pytest.mark.parametrize("whole_group", [False, True])
+def test_a_killed_run_goes_on_from_its_checkpoint(numbers: Path, out: Path, whole_group: bool) -> None:
+    slow = {"steps": 200, "step_s": 0.15}
+    with run_in_background(numbers, out, **slow) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        if whole_group:
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    partial = next((out / "stages" / ".partial").glob("count-*"))
+    reached = int((partial / "checkpoint").read_text())
+    assert reached < 200
+    (partial / "checkpoint").write_text("198")
+    outcome, _ = walk(request_of(numbers, out, count=slow))  # the lock is free, so no orphan writes
+    assert outcome.ran == ["count", "tell"]
+    assert outcome.artifacts["count"].summary == {"began_at": 198}
+
+
+def test_interrupt_ends_a_stage_that_ignores_signals(numbers: Path, out: Path) -> None:
+    with run_in_background(numbers, out, steps=3, step_s=0.2, fail="deaf") as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) != 0
+    assert walk(request_of(numbers, out))[0].ran == ["count", "tell"]
+
+
+def test_a_second_process_is_refused_and_told_who_works_there(
+    numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatpipe.pipeline.engine.store.LOCK_PATIENCE_S", 0.2)
+    with run_in_background(numbers, out, steps=600, step_s=0.1) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        with pytest.raises(UsageError, match=f"process {process.pid}"):
+            walk(request_of(numbers, out))
+        process.kill()
+
+
+def test_a_commit_cut_between_its_renames_is_finished(numbers: Path, out: Path) -> None:
+    outcome, _ = walk(request_of(numbers, out))
+    folder = outcome.artifacts["add"].folder
+    partial = out / "stages" / ".partial" / folder.name
+    folder.rename(partial)
+    assert walk(request_of(numbers, out))[0].ran == []
+    assert folder.exists()
+    assert not partial.exists()
+
+
+def test_survey_says_why(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    standings = list(survey(*survey_line(request_of(numbers, out, add={"offset": 5}))))
+    assert [(standing.stage.name, standing.state) for standing in standings] == [
+        ("read", "valid"), ("add", "stale"), ("count", "waiting"), ("tell", "waiting"),
+    ]  # fmt: skip
+    assert standings[1].reason == "add.offset changed from 0 to 5"
+
+
+def test_clean_removes_only_what_nothing_asks_for(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    walk(request_of(numbers, out, add={"offset": 1}))
+    request = request_of(numbers, out, add={"offset": 1})
+    line, store = survey_line(request)
+    removed, freed = store.remove_stale((standing.stage.name, standing.key) for standing in survey(line, store))
+    assert removed == 3  # the first add, count and tell
+    assert freed > 0
+    assert walk(request)[0].ran == []
+
+
+def test_the_run_can_be_taken_up_from_its_out_alone(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out, add={"offset": 3}))
+    photos, table = load_run(out)
+    assert photos == numbers
+    assert resolve(arithmetic.LineConfig, [table]).add.offset == 3
+
+
+def test_out_that_cannot_be_used(numbers: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="is a file"):
+        walk(request_of(numbers, tmp_path / "file"))
+    with pytest.raises(UsageError, match="inside the photo folder"):
+        walk(request_of(numbers, numbers / "out"))
+    with pytest.raises(MachineError, match="Cannot write"):
+        walk(request_of(numbers, Path("/proc/splatpipe-out")))
+    with pytest.raises(UsageError, match="holds no run"):
+        open_store(tmp_path / "nowhere", create=False)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "splat.ply").write_text("mine")
+    with pytest.raises(UsageError, match="files of something else"):
+        walk(request_of(numbers, tmp_path / "taken"))
+
+
+def test_out_of_another_version_is_left_untouched(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    (out / "stages" / "format.json").write_text('{"format": 99}')
+    before = sorted(out.rglob("*"))
+    with pytest.raises(UsageError, match="another layout"):
+        walk(request_of(numbers, out))
+    assert sorted(out.rglob("*")) == before
+
+
+def test_events_are_logged_as_json_lines(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    kinds = [json.loads(line)["kind"] for line in (out / "events.jsonl").read_text().splitlines()]
+    assert kinds.count("stage_started") == kinds.count("stage_finished") == 4
+
+
+def test_hostile_names_do_not_disturb(numbers: Path, out: Path) -> None:
+    for name in ("näme mit leer", "写真", "new\nline", "quote'\"`$(x)"):
+        (numbers / f"{name}.txt").write_text("1")
+    Path(os.fsdecode(os.fsencode(numbers) + b"/\xff\xfe.txt")).write_text("1")
+    outcome, _ = walk(request_of(numbers, out))
+    assert outcome.artifacts["read"].summary == {"numbers": 7}
+    assert walk(request_of(numbers, out))[0].ran == []
+
+
+def test_a_refused_stage_leaves_the_configuration_as_it_was(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    changed = request_of(numbers, out, add={"offset": 1})
+    with pytest.raises(UsageError), open_session(changed, lambda event: None) as runner:
+        runner.run_alone("tell")
+    assert resolve(arithmetic.LineConfig, [load_run(out)[1]]).add.offset == 0
+
+
+def test_looking_writes_nothing(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    (numbers / "d.txt").write_text("4")
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    list(survey(*survey_line(request_of(numbers, out))))
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+
+
+def test_a_photo_that_cannot_be_read_is_for_ingest_to_name(numbers: Path, out: Path) -> None:
+    (numbers / "dangling.md").symlink_to(numbers / "nothing")
+    (numbers / "pipe.md").symlink_to("/proc/self/mem")
+    assert walk(request_of(numbers, out))[0].ran == ["read", "add", "count", "tell"]

@@ -1,0 +1,174 @@
+"""The plan and the checkpoints of training: schedules, round trips, and files that are broken."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import View
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.checkpoint import (
+    BrokenCheckpointError,
+    Checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
+from splatpipe.stages.train.plan import (
+    Plan,
+    coarse_levels,
+    load_or_write_plan,
+    make_plan,
+    means_rate,
+    resolve_schedule,
+    scene_extent,
+    sh_degree_at,
+)
+
+
+def camera_at(name: str, centre: tuple[float, float, float]) -> Camera:
+    pose = np.eye(4)
+    pose[:3, 3] = -np.array(centre)
+    return Camera(name, 100, 50, 80.0, 80.0, 50.0, 25.0, pose)
+
+
+def views(count: int = 4) -> list[View]:
+    cameras = [camera_at(f"{i}.png", (2.0 * i, 0.0, 0.0)) for i in range(count)]
+    return [View(camera, Path(camera.name), None) for camera in cameras]
+
+
+def test_long_runs_have_the_published_schedule() -> None:
+    options = resolve_schedule(TrainConfig())
+    lengths = (options.sh_every, options.densify_from, options.densify_until, options.densify_every)
+    assert lengths == (1000, 500, 15_000, 100)
+    assert options.reset_every == 3000
+
+
+@pytest.mark.parametrize("iterations", [1, 7, 100, 999, 3000, 7000, 9999])
+def test_short_runs_have_every_phase_and_no_reset(iterations: int) -> None:
+    options = resolve_schedule(TrainConfig(iterations=iterations))
+    assert options.reset_every == 0
+    assert 1 <= int(options.densify_from) <= max(1, int(options.densify_until)) <= iterations
+    assert iterations < 10 or sh_degree_at(options, iterations) == 3
+
+
+def test_given_lengths_are_taken_as_they_are() -> None:
+    options = resolve_schedule(TrainConfig(iterations=100, densify_every=7, reset_every=40))
+    assert (options.densify_every, options.reset_every) == (7, 40)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"iterations": 0},
+        {"densify_every": 0},
+        {"sh_degree": 4},
+        {"lr_means": -1.0},
+        {"reset_every": "never"},
+        {"colour": 1},
+    ],
+)
+def test_options_out_of_bounds_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        TrainConfig.model_validate(wrong)
+
+
+def test_extent_is_a_tenth_more_than_the_farthest_camera() -> None:
+    assert scene_extent([view.camera for view in views(3)]) == pytest.approx(1.1 * 2.0)
+
+
+def test_rate_of_positions_falls_exponentially_with_the_extent() -> None:
+    plan = make_plan(TrainConfig(iterations=100, lr_boost=1.0), views(), 0, "", 9)
+    assert means_rate(plan, 0) == pytest.approx(1.6e-4 * plan.extent)
+    assert means_rate(plan, 50) == pytest.approx(1.6e-5 * plan.extent)
+    assert means_rate(plan, 100) == pytest.approx(1.6e-6 * plan.extent)
+
+
+def test_short_runs_take_longer_steps() -> None:
+    boosts = [resolve_schedule(TrainConfig(iterations=run)).lr_boost for run in (100, 7500, 30_000, 100_000)]
+    assert boosts == [4.0, 2.0, 1.0, 1.0]
+    plan = make_plan(TrainConfig(iterations=7500), views(), 0, "", 9)
+    assert means_rate(plan, 0) == pytest.approx(2.0 * 1.6e-4 * plan.extent)
+    assert means_rate(plan, 7500) == pytest.approx(4.0 * 1.6e-6 * plan.extent)
+
+
+def test_coarse_photos_come_first_in_equal_shares() -> None:
+    options = resolve_schedule(TrainConfig(iterations=10, coarse_levels=2, coarse_until=6))
+    assert coarse_levels(options) == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
+    assert coarse_levels(resolve_schedule(TrainConfig(iterations=3))) == [0, 0, 0]
+
+
+def test_held_out_photos_are_not_trained_on() -> None:
+    plan = make_plan(TrainConfig(), views(), 2, "", 9)
+    assert (plan.train_views, plan.test_views) == (("1.png", "3.png"), ("0.png", "2.png"))
+
+
+def test_cameras_in_one_place_are_refused_with_a_hint() -> None:
+    same = [View(camera_at(f"{i}.png", (1.0, 2.0, 3.0)), Path("x"), None) for i in range(3)]
+    with pytest.raises(SplatpipeError, match="one place") as raised:
+        make_plan(TrainConfig(), same, 0, "", 9)
+    assert raised.value.hint
+
+
+def test_plan_is_written_once_and_taken_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    first = make_plan(TrainConfig(iterations=50), views(), 2, "", 9)
+    assert load_or_write_plan(path, first) == first
+    text = path.read_bytes()
+    assert load_or_write_plan(path, make_plan(TrainConfig(iterations=99), views(), 0, "", 8)) == first
+    assert path.read_bytes() == text
+    assert Plan.from_json(text.decode()).digest() == first.digest()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"format": 1}', '{"format": 99}', '{"format": 1, "options": {}}']
+)
+def test_broken_plan_is_written_anew(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "plan.json"
+    path.write_text(text)
+    fresh = make_plan(TrainConfig(), views(), 2, "", 9)
+    assert load_or_write_plan(path, fresh) == fresh
+    assert json.loads(path.read_text())["format"] == 1
+
+
+def test_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.npz"
+    arrays = {"means": np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)}
+    save_checkpoint(path, "plan", Checkpoint(arrays, {"iteration": 7, "loss": 0.1}))
+    back = load_checkpoint(path, "plan")
+    assert back.facts == {"iteration": 7, "loss": 0.1}
+    np.testing.assert_array_equal(back.arrays["means"], arrays["means"])
+    assert [item.name for item in tmp_path.iterdir()] == ["checkpoint.npz"]
+
+
+def test_damaged_and_foreign_checkpoints_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.npz"
+    with pytest.raises(FileNotFoundError):
+        load_checkpoint(path, "plan")
+    save_checkpoint(path, "plan", Checkpoint({"means": np.ones((100, 3))}, {}))
+    with pytest.raises(BrokenCheckpointError, match="another plan"):
+        load_checkpoint(path, "other")
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for broken in (b"", b"rubbish", whole[: len(whole) // 2], whole[:-10], bytes(flipped)):
+        path.write_bytes(broken)
+        with pytest.raises(BrokenCheckpointError, match="damaged"):
+            load_checkpoint(path, "plan")
+
+
+def test_failed_save_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "checkpoint.npz"
+    save_checkpoint(path, "plan", Checkpoint({}, {"iteration": 1}))
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        save_checkpoint(path, "plan", Checkpoint({}, {"iteration": 2}))
+    assert load_checkpoint(path, "plan").facts == {"iteration": 1}
+    assert [item.name for item in tmp_path.iterdir()] == ["checkpoint.npz"]
