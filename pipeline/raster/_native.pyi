@@ -57,6 +57,7 @@ class Frame:
         gradients: Sequence[Tensor | None],
         outputs: Sequence[Tensor],
         means2d: Tensor,
+        magnitudes: bool = False,
     ) -> None:
         """Gradients of the last forward(); can be repeated.
 
@@ -65,11 +66,15 @@ class Frame:
             gradients: dL/d(colour), dL/d(alpha), dL/d(depth_sum); None for zero.
             outputs: Written: gradients of the parameters, laid out like them.
             means2d: Written: dL/d(centres on screen), pixels (n, 2).
+            magnitudes: Make that the sum of its absolute values over the pixels, x and y apart.
         """
 
     @property
     def pairs(self) -> int:
         """Splat-tile pairs of the render."""
+
+    def contributing_pairs(self) -> int:
+        """Pairs of a pixel and a splat blended into it; slow, for benchmarks."""
 
 def photo_loss(render: Tensor, photo: Tensor, mask: Tensor | None, ssim_weight: float, gradient: Tensor) -> float:
     """(1 - w) L1 + w (1 - SSIM) of two float32 (h, w, 3) images; its gradient by the render goes to `gradient`.

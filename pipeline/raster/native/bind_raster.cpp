@@ -128,7 +128,7 @@ class Frame {
     }
 
     void backward(const ParameterArrays<const float>& arrays, const PictureGradientArrays& gradients,
-                  const ParameterArrays<float>& outputs, const Grid<float>& means2d) {
+                  const ParameterArrays<float>& outputs, const Grid<float>& means2d, bool magnitudes) {
         const splat::Parameters in = parameters_of(arrays);
         const size_t n = in.count, k = view_.sh_count, h = view_.height, w = view_.width;
         if (in.count != count_ || std::get<4>(arrays).shape(1) != k)
@@ -138,15 +138,23 @@ class Frame {
                                                   alpha ? checked(*alpha, h, w, "alpha") : nullptr,
                                                   depth_sum ? checked(*depth_sum, h, w, "depth_sum") : nullptr};
         const auto& [means, log_scales, quats, opacity_logits, sh] = outputs;
-        const splat::ParameterGradients out = {
-            checked(means, n, 3, "means"), checked(log_scales, n, 3, "log_scales"),
-            checked(quats, n, 4, "quats"), checked(opacity_logits, n, "opacity_logits"),
-            checked(sh, n, k, "sh"),       checked(means2d, n, 2, "means2d")};
+        const splat::ParameterGradients out = {checked(means, n, 3, "means"),
+                                               checked(log_scales, n, 3, "log_scales"),
+                                               checked(quats, n, 4, "quats"),
+                                               checked(opacity_logits, n, "opacity_logits"),
+                                               checked(sh, n, k, "sh"),
+                                               checked(means2d, n, 2, "means2d"),
+                                               magnitudes};
         nb::gil_scoped_release release;
         frame_->backward(in, pictures, out);
     }
 
     int64_t pairs() const { return frame_->pairs(); }
+
+    int64_t contributing_pairs() const {
+        if (count_ < 0) throw nb::value_error("nothing is rendered yet");
+        return frame_->contributions();
+    }
 
   private:
     std::shared_ptr<splat::RasterFrame> frame_ = splat::borrow_frame();
@@ -163,6 +171,7 @@ void bind_raster(nb::module_& m) {
         .def("forward", &Frame::forward, nb::arg("parameters").noconvert(), nb::arg("camera").noconvert(), "options"_a,
              nb::arg("outputs").noconvert())
         .def("backward", &Frame::backward, nb::arg("parameters").noconvert(), nb::arg("gradients").noconvert(),
-             nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert())
-        .def_prop_ro("pairs", &Frame::pairs);
+             nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert(), "magnitudes"_a = false)
+        .def_prop_ro("pairs", &Frame::pairs)
+        .def("contributing_pairs", &Frame::contributing_pairs, nb::call_guard<nb::gil_scoped_release>());
 }

@@ -32,7 +32,7 @@ constexpr int kTile = 16;  // pixels along a tile's side
 constexpr int kTilePixels = kTile * kTile;
 constexpr float kHalfLog2E = 0.72134752044448170f;  // exp(-x/2) = 2^(-kHalfLog2E x)
 constexpr uint32_t kCulled = 0xffffffffu;           // sort key of a Gaussian that is not visible
-constexpr int kSlotFloats = 12;                     // 10 gradients and padding to whole quarter-vectors
+constexpr int kSlotFloats = 12;                     // a pair's gradients: SplatGradient's fields in their order
 
 // A camera and what to render, in the kernels' precision.
 struct View {
@@ -57,7 +57,8 @@ struct Parameters {
 // Their gradients, laid out alike; every row is written.
 struct ParameterGradients {
     float *means, *log_scales, *quats, *opacity_logits, *sh;
-    float* means2d;  // (n, 2), pixels
+    float* means2d;   // (n, 2), pixels
+    bool magnitudes;  // means2d is the sum of each pixel's |dL/d(mean2D)|, not of dL/d(mean2D)
 };
 
 // A Gaussian on the screen. In the whitened offset from its centre,
@@ -69,12 +70,11 @@ struct alignas(64) Splat {
     float log2_opacity;
     float colour[3];
     float depth;
-    float slope;                   // -b / a: the ellipse's chord in row dy has its middle at slope dy
-    float inv_a;                   // and the half-length inv_a sqrt(reach - v^2)
-    float reach;                   // u^2 + v^2 <= reach is where alpha >= 1/255
-    float rows_dy;                 // dy of the ellipse's rightmost point; the leftmost's is its negative
-    uint16_t first_row, last_row;  // tile rows that it touches; none if first > last
-    uint32_t unused;
+    float slope;    // -b / a: the ellipse's chord in row dy has its middle at slope dy
+    float inv_a;    // and the half-length inv_a sqrt(reach - v^2)
+    float reach;    // u^2 + v^2 <= reach is where alpha >= 1/255
+    float rows_dy;  // dy of the ellipse's rightmost point; the leftmost's is its negative
+    uint32_t unused[2];
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
@@ -83,15 +83,25 @@ struct Span {
     uint16_t first, last;
 };
 
+// Where a splat lies on the screen's tiles, apart from the splat: sorting the splats into tiles reads this at random.
+struct Touched {
+    uint32_t spans;            // index of the first of its spans, one for each of its tile rows
+    int32_t slots;             // index of the first of its slots; the next Gaussian's begin where these end
+    uint16_t first_row, rows;  // tile rows; 0 of them where the Gaussian is not visible
+};
+
 // Where a frame's results live; all of these are owned by the driver.
 struct FrameData {
-    Splat* splats;         // (n); meaningful where visible
-    uint32_t* keys;        // (n): bits of the depth, or kCulled
-    int64_t* tile_begin;   // (tiles + 1): each tile's pairs, near to far
-    int32_t* pair_splat;   // (pairs): index of the splat
-    int32_t* pair_slot;    // (pairs): where the pair's gradient goes
-    int64_t* slot_begin;   // (n + 1): a Gaussian's slots
-    float* slots;          // (pairs, kSlotFloats); only for the backward pass
+    Splat* splats;     // (n); meaningful where visible
+    uint32_t* keys;    // (n): bits of the depth, or kCulled
+    Touched* touched;  // (n + 1)
+    Span* spans;
+    int64_t* tile_begin;  // (tiles + 1): each tile's pairs, near to far
+    int32_t* pair_splat;  // (pairs): index of the splat
+    int32_t* pair_slot;   // (pairs): where the pair's gradient goes
+    uint8_t*
+        pair_blocks;  // (pairs, mask_bytes): the blocks of pixels that a pair was blended into, as the kernels like
+    float* slots;     // (pairs, kSlotFloats); only for the backward pass
     float* transmittance;  // (tiles, 256): what is left behind everything
     int32_t* pixel_end;    // (tiles, 256): number of the tile's pairs that the pixel looked at before it ended
 };
@@ -106,11 +116,12 @@ struct PictureGradients {
 };
 
 struct ProjectKernels {
-    // Gaussians begin..end-1: fills splats, keys, radii and visible.
+    // Gaussians begin..end-1: fills splats, keys, rows of touched, radii and visible.
     void (*project)(const View&, const Parameters&, int64_t begin, int64_t end, const FrameData&, float* radii,
                     uint8_t* visible);
-    // The tiles that a splat touches in each of its tile rows, exactly. Returns how many.
-    int64_t (*find_spans)(const View&, const Splat&, Span* spans);
+    // The tiles that each splat touches in each of its tile rows, exactly, to the spans from `first_span` on. Returns
+    // how many; slots are counted from 0.
+    int64_t (*find_spans)(const View&, int64_t begin, int64_t end, const FrameData&, int64_t first_span);
     // Sums the slots of Gaussians begin..end-1 and carries them back to the parameters.
     void (*project_backward)(const View&, const Parameters&, int64_t begin, int64_t end, const FrameData&,
                              const ParameterGradients&);
@@ -118,8 +129,11 @@ struct ProjectKernels {
 
 struct BlendKernels {
     void (*blend_tile)(const View&, const FrameData&, int tile, const Pictures&);
-    // Writes every slot of the tile.
-    void (*blend_tile_backward)(const View&, const FrameData&, int tile, const PictureGradients&);
+    // Writes every slot of the tile; magnitudes are zero where they are not wanted.
+    void (*blend_tile_backward)(const View&, const FrameData&, int tile, const PictureGradients&, bool magnitudes);
+    // Pixels that the tile's pairs were blended into, summed over the pairs.
+    int64_t (*count_contributions)(const View&, const FrameData&, int tile);
+    int mask_bytes;  // of pair_blocks
 };
 
 }  // namespace splat

@@ -1,7 +1,7 @@
 // Blending a tile, forward and backward, with SIMD over its pixels. Compiled once per ISA (see isa.h for what that
 // forbids).
 //
-// A tile's pixels are kept in blocks of kLanes: 8 x 2 pixels with 16 lanes, 8 x 1 with 8, 4 x 1 with 4. Pair by pair,
+// A tile's pixels are kept in blocks of kLanes: 4 x 4 pixels with 16 lanes, 4 x 2 with 8, 4 x 1 with 4. Pair by pair,
 // the blocks that the splat touches are found from the chord of its ellipse in every row, and only they are worked on.
 #include "raster.h"
 #include "simd.h"
@@ -10,27 +10,30 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kBlockWidth = kLanes >= 8 ? 8 : 4;
+constexpr int kBlockWidth = 4;
 constexpr int kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlockRows = kTile / kBlockHeight;  // rows of blocks
 constexpr int kBlockColumns = kTile / kBlockWidth;
 constexpr int kBlocks = kBlockRows * kBlockColumns;  // block = column * kBlockRows + row; at most 64
 using BlockMask = uint64_t;
 constexpr BlockMask kAllBlocks = kBlocks == 64 ? ~BlockMask{0} : (BlockMask{1} << kBlocks) - 1;
+constexpr int kMaskBytes = kBlocks / 8;  // of a BlockMask in memory
 
 // Where pixel p of a tile, counted block by block, lies in it.
 constexpr int column_of(int p) { return p / kLanes / kBlockRows * kBlockWidth + p % kBlockWidth; }
 constexpr int row_of(int p) { return p / kLanes % kBlockRows * kBlockHeight + p % kLanes / kBlockWidth; }
 
+// Offsets of pixel centres from the tile's first: a pixel's is that of its lane in block 0 and that of its block.
 struct Offsets {
-    alignas(64) float x[kTilePixels], y[kTilePixels];  // of pixel centres from the tile's first
-    alignas(
-        64) float rows[kTile];  // rows as the block mask wants them: of each block row the first, then the second ones
+    alignas(64) float lane_x[kLanes], lane_y[kLanes], block_x[kBlocks], block_y[kBlocks];
+    // Rows as touched_blocks wants them: of each block row the first, then the second ones, and so on.
+    alignas(64) float rows[kTile];
 };
 
 constexpr Offsets make_offsets() {
     Offsets o{};
-    for (int p = 0; p < kTilePixels; ++p) o.x[p] = column_of(p), o.y[p] = row_of(p);
+    for (int p = 0; p < kLanes; ++p) o.lane_x[p] = column_of(p), o.lane_y[p] = row_of(p);
+    for (int b = 0; b < kBlocks; ++b) o.block_x[b] = column_of(b * kLanes), o.block_y[b] = row_of(b * kLanes);
     for (int i = 0; i < kTile; ++i) o.rows[i] = i % kBlockRows * kBlockHeight + i / kBlockRows;
     return o;
 }
@@ -47,33 +50,66 @@ SPLAT_INLINE TilePlace place_of(const View& view, int tile) {
     return {tile, left, top, width < kTile ? width : kTile, height < kTile ? height : kTile};
 }
 
-// A splat as a tile sees it, a vector a field.
+// A splat as a tile sees it. (u, v) of a pixel is a sum: most of a CPU's multipliers are wanted elsewhere.
 struct TileSplat {
-    Floats a, b, c, u0, v0, log2_opacity;
+    Floats b, c, u, v, log2_opacity;  // u, v: of the lanes in block 0
+    alignas(64) float block_u[kBlocks], block_v[kBlocks];
 
     SPLAT_METHOD TileSplat(const Splat& s, const TilePlace& at) {
         const float dx = at.left + 0.5f - s.x, dy = at.top + 0.5f - s.y;
-        a = fill(s.a), b = fill(s.b), c = fill(s.c);
-        u0 = fill(s.a * dx + s.b * dy), v0 = fill(s.c * dy), log2_opacity = fill(s.log2_opacity);
+        const Floats a = fill(s.a);
+        b = fill(s.b), c = fill(s.c), log2_opacity = fill(s.log2_opacity);
+        u = fma(a, load(kOffsets.lane_x), fma(b, load(kOffsets.lane_y), fill(s.a * dx + s.b * dy)));
+        v = fma(c, load(kOffsets.lane_y), fill(s.c * dy));
+        for (int i = 0; i < kBlocks; i += kLanes) {
+            const Floats y = load(kOffsets.block_y + i);
+            store(block_u + i, fma(a, load(kOffsets.block_x + i), b * y));
+            store(block_v + i, c * y);
+        }
     }
-    SPLAT_METHOD void offset(int block, Floats* u, Floats* v) const {
-        const Floats dy = load(kOffsets.y + block * kLanes);
-        *u = fma(a, load(kOffsets.x + block * kLanes), fma(b, dy, u0));
-        *v = fma(c, dy, v0);
+    SPLAT_METHOD Floats u_of(int block) const { return u + fill(block_u[block]); }
+    SPLAT_METHOD Floats v_of(int block) const { return v + fill(block_v[block]); }
+    SPLAT_METHOD Floats log2_alpha(int block) const {
+        const Floats u = u_of(block), v = v_of(block);
+        return fnma(u, u, fnma(v, v, log2_opacity));
     }
-    SPLAT_METHOD Floats log2_alpha(Floats u, Floats v) const { return fnma(u, u, fnma(v, v, log2_opacity)); }
 };
 
+// The chords of a splat's ellipse in the rows of a tile: columns first..last, where `crossed`.
+struct Chords {
+    Floats first, last;  // not rounded
+    Mask crossed;
+};
+
+SPLAT_INLINE Chords chords(const Splat& s, const TilePlace& at, int row) {
+    const Floats dy0 = fill(at.top + 0.5f - s.y), x0 = fill(s.x - at.left - 0.5f), zero = fill(0.0f);
+    const Floats dy = load(kOffsets.rows + row) + dy0, v = fill(s.c) * dy, rest = fnma(v, v, fill(s.reach));
+    const Floats half = fill(s.inv_a) * sqrt(max(rest, zero)), middle = fma(fill(s.slope), dy, x0);
+    return {middle - half, middle + half, at_most(zero, rest)};
+}
+
 // Blocks with a pixel centre inside the ellipse.
+#if SPLAT_ISA_AVX512
 SPLAT_INLINE BlockMask touched_blocks(const Splat& s, const TilePlace& at) {
-    const Floats dy0 = fill(at.top + 0.5f - s.y), x0 = fill(s.x - at.left - 0.5f), slope = fill(s.slope), c = fill(s.c);
-    const Floats inv_a = fill(s.inv_a), reach = fill(s.reach), zero = fill(0.0f);
+    const Chords rows = chords(s, at, 0);
+    const __m512i first = ceil_to_ints(max(rows.first, fill(0.0f))), last = floor_to_ints(min(rows.last, fill(15.0f)));
+    const __m512i all = _mm512_set1_epi32(0xffff), beyond = _mm512_sub_epi32(_mm512_set1_epi32(kTile - 1), last);
+    // A row's columns as bits; then the rows of a block together, which lie in the vector's quarters.
+    __m512i columns =
+        _mm512_maskz_and_epi32(rows.crossed, _mm512_sllv_epi32(all, first), _mm512_srlv_epi32(all, beyond));
+    columns = _mm512_or_epi32(columns, _mm512_shuffle_i32x4(columns, columns, 0x4e));
+    columns = _mm512_or_epi32(columns, _mm512_shuffle_i32x4(columns, columns, 0xb1));
+    const __m512i of_block = _mm512_sllv_epi32(_mm512_set1_epi32(0xf),
+                                               _mm512_setr_epi32(0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12));
+    return _mm512_test_epi32_mask(columns, of_block);
+}
+#else
+SPLAT_INLINE BlockMask touched_blocks(const Splat& s, const TilePlace& at) {
     uint64_t rows_in[kBlockColumns] = {};
     for (int i = 0; i < kTile; i += kLanes) {
-        const Floats dy = load(kOffsets.rows + i) + dy0, v = c * dy, rest = fnma(v, v, reach);
-        const Floats half = inv_a * sqrt(max(rest, zero)), middle = fma(slope, dy, x0);
-        const Floats first = ceil(middle - half), last = floor(middle + half);  // columns
-        const Mask crossed = both(at_most(zero, rest), at_most(first, last));
+        const Chords rows = chords(s, at, i);
+        const Floats first = ceil(rows.first), last = floor(rows.last);
+        const Mask crossed = both(rows.crossed, at_most(first, last));
         for (int j = 0; j < kBlockColumns; ++j) {
             const Mask in = both(at_most(first, fill(j * kBlockWidth + kBlockWidth - 1.0f)),
                                  at_most(fill(static_cast<float>(j * kBlockWidth)), last));
@@ -83,11 +119,12 @@ SPLAT_INLINE BlockMask touched_blocks(const Splat& s, const TilePlace& at) {
     BlockMask mask = 0;
     for (int j = 0; j < kBlockColumns; ++j) {
         uint64_t rows = rows_in[j];
-        if (kBlockHeight == 2) rows = (rows | rows >> kBlockRows) & ((1u << kBlockRows) - 1);
-        mask |= rows << (j * kBlockRows);
+        for (int half = kTile / 2; half >= kBlockRows; half /= 2) rows |= rows >> half;
+        mask |= (rows & ((1u << kBlockRows) - 1)) << (j * kBlockRows);
     }
     return mask;
 }
+#endif
 
 // A tile's pixels on their way from front to back. The transmittance of a pixel that has ended is kept as its negative.
 struct Canvas {
@@ -131,51 +168,59 @@ __attribute__((noinline)) void end_pixels(Canvas* canvas, int block, uint32_t wh
 
 SPLAT_INLINE void add_to(float* sum, Floats weight, Floats value) { store(sum, fma(weight, value, load(sum))); }
 
-template <bool kDepth>
-SPLAT_INLINE void blend_block(const TileSplat& splat, const Splat& s, int block, int32_t pair, Canvas* canvas) {
-    Floats u, v;
-    splat.offset(block, &u, &v);
-    const Floats log2_alpha = splat.log2_alpha(u, v), zero = fill(0.0f);
-    const int at = block * kLanes;
-    const Floats before = load(canvas->transmittance + at);
-    const Mask met = both(at_most(fill(kLog2AlphaMin), log2_alpha), less(zero, before));
-    const Floats alpha = min(exp2(log2_alpha), fill(kAlphaMax)), weighted = alpha * before, after = before - weighted;
-    const Mask blended = both(met, at_most(fill(kTransmittanceMin), after));
-    const Floats weight = only(blended, weighted);
-    add_to(canvas->red + at, weight, fill(s.colour[0]));
-    add_to(canvas->green + at, weight, fill(s.colour[1]));
-    add_to(canvas->blue + at, weight, fill(s.colour[2]));
-    store(canvas->transmittance + at, select(blended, after, before));
-    if (kDepth) {
-        const Floats depth = fill(s.depth), half = fill(kMedianTransmittance);
-        add_to(canvas->depth + at, weight, depth);
-        const Mask passes = both(blended, both(less(half, before), at_most(after, half)));
-        if (any(passes)) store(canvas->median + at, select(passes, depth, load(canvas->median + at)));
+// Takes the next kCount blocks out of a mask. Work on several of them is written step by step side by side: one block
+// is a chain of some 25 dependent operations, of which a CPU's scheduler holds too few to find the next block's by
+// itself.
+template <int kCount>
+SPLAT_INLINE void take_blocks(BlockMask* blocks, int (&block)[kCount]) {
+    for (int& b : block) b = __builtin_ctzll(*blocks), *blocks &= *blocks - 1;
+}
+
+template <bool kDepth, int kCount>
+SPLAT_INLINE void blend_blocks(const TileSplat& splat, const Splat& s, BlockMask* blocks, int32_t pair,
+                               Canvas* canvas) {
+    int block[kCount];
+    take_blocks(blocks, block);
+    Floats alpha[kCount], before[kCount], after[kCount], weight[kCount];
+    Mask met[kCount], blended[kCount];
+    for (int k = 0; k < kCount; ++k) alpha[k] = splat.log2_alpha(block[k]);
+    for (int k = 0; k < kCount; ++k) before[k] = load(canvas->transmittance + block[k] * kLanes);
+    for (int k = 0; k < kCount; ++k) met[k] = both(at_most(fill(kLog2AlphaMin), alpha[k]), less(fill(0.0f), before[k]));
+    exp2_each(alpha);
+    for (int k = 0; k < kCount; ++k) weight[k] = min(alpha[k], fill(kAlphaMax)) * before[k];
+    for (int k = 0; k < kCount; ++k) after[k] = before[k] - weight[k];
+    for (int k = 0; k < kCount; ++k) blended[k] = both(met[k], at_most(fill(kTransmittanceMin), after[k]));
+    for (int k = 0; k < kCount; ++k) weight[k] = only(blended[k], weight[k]);
+    for (int k = 0; k < kCount; ++k) {
+        const int at = block[k] * kLanes;
+        add_to(canvas->red + at, weight[k], fill(s.colour[0]));
+        add_to(canvas->green + at, weight[k], fill(s.colour[1]));
+        add_to(canvas->blue + at, weight[k], fill(s.colour[2]));
+        store(canvas->transmittance + at, select(blended[k], after[k], before[k]));
+        if (kDepth) {
+            const Floats depth = fill(s.depth), half = fill(kMedianTransmittance);
+            add_to(canvas->depth + at, weight[k], depth);
+            const Mask passes = both(blended[k], both(less(half, before[k]), at_most(after[k], half)));
+            if (any(passes)) store(canvas->median + at, select(passes, depth, load(canvas->median + at)));
+        }
+        const Mask ended = without(met[k], blended[k]);
+        if (__builtin_expect(any(ended), 0)) end_pixels(canvas, block[k], bits(ended), pair);
     }
-    const Mask ended = without(met, blended);
-    if (__builtin_expect(any(ended), 0)) end_pixels(canvas, block, bits(ended), pair);
 }
 
-// Pixels column..column+kLanes-1 of a row of a plane of blocks.
-SPLAT_INLINE const float* segment(const float* plane, int row, int column) {
-    const int block = column / kBlockWidth * kBlockRows + row / kBlockHeight;
-    return plane + block * kLanes + row % kBlockHeight * kBlockWidth;
+// Pixels column..column+kLanes-1 of a row of a plane of blocks: pieces of kBlockWidth, a column of blocks apart.
+constexpr int kPieceStep = kBlockRows * kLanes;
+
+constexpr int piece(int row, int column) {
+    return column / kBlockWidth * kPieceStep + row / kBlockHeight * kLanes + row % kBlockHeight * kBlockWidth;
 }
 
-SPLAT_INLINE Floats get_pixels(const float* plane, int row, [[maybe_unused]] int column) {
-#if SPLAT_ISA_AVX512
-    return load_halves(segment(plane, row, 0), segment(plane, row, kBlockWidth));
-#else
-    return load(segment(plane, row, column));
-#endif
+SPLAT_INLINE Floats get_pixels(const float* plane, int row, int column) {
+    return load_pieces(plane + piece(row, column), kPieceStep);
 }
 
-SPLAT_INLINE void put_pixels(float* plane, int row, [[maybe_unused]] int column, Floats v) {
-#if SPLAT_ISA_AVX512
-    store_halves(const_cast<float*>(segment(plane, row, 0)), const_cast<float*>(segment(plane, row, kBlockWidth)), v);
-#else
-    store(const_cast<float*>(segment(plane, row, column)), v);
-#endif
+SPLAT_INLINE void put_pixels(float* plane, int row, int column, Floats v) {
+    store_pieces(plane + piece(row, column), kPieceStep, v);
 }
 
 // A tile's rows of the pictures, 16 pixels each.
@@ -219,15 +264,33 @@ void put_pictures(const View& view, const TilePlace& at, const Canvas& canvas, c
 
 constexpr int kAhead = 4;  // pairs whose splat is fetched in advance
 
+// Masks of blocks as the backward pass finds them, little-endian.
+SPLAT_INLINE void put_mask(uint8_t* masks, int64_t pair, BlockMask blocks) {
+    __builtin_memcpy(masks + pair * kMaskBytes, &blocks, kMaskBytes);
+}
+SPLAT_INLINE BlockMask get_mask(const uint8_t* masks, int64_t pair) {
+    BlockMask blocks = 0;
+    __builtin_memcpy(&blocks, masks + pair * kMaskBytes, kMaskBytes);
+    return blocks;
+}
+
 template <bool kDepth>
 SPLAT_INLINE void walk(const FrameData& frame, const TilePlace& at, int32_t pairs, Canvas* canvas) {
-    const int32_t* list = frame.pair_splat + frame.tile_begin[at.index];
+    const int64_t first = frame.tile_begin[at.index];
+    const int32_t* list = frame.pair_splat + first;
+    uint8_t* masks = frame.pair_blocks + first * kMaskBytes;
+    // A pair's blocks are found before the one in front of it is blended: how many blocks that has is hard to predict
+    // for the CPU, which would otherwise wait for this long chain at every turn.
+    BlockMask touched = pairs ? touched_blocks(frame.splats[list[0]], at) : 0;
     for (int32_t pair = 0; pair < pairs && canvas->alive; ++pair) {
         if (pair + kAhead < pairs) __builtin_prefetch(frame.splats + list[pair + kAhead]);
         const Splat& s = frame.splats[list[pair]];
-        BlockMask blocks = touched_blocks(s, at) & canvas->alive;
+        BlockMask blocks = touched & canvas->alive;
+        put_mask(masks, pair, blocks);
+        if (pair + 1 < pairs) touched = touched_blocks(frame.splats[list[pair + 1]], at);
         const TileSplat splat(s, at);
-        for (; blocks; blocks &= blocks - 1) blend_block<kDepth>(splat, s, __builtin_ctzll(blocks), pair, canvas);
+        while (blocks & (blocks - 1)) blend_blocks<kDepth, 2>(splat, s, &blocks, pair, canvas);
+        if (blocks) blend_blocks<kDepth, 1>(splat, s, &blocks, pair, canvas);
     }
 }
 
@@ -253,7 +316,6 @@ struct BackCanvas {
     alignas(64) float behind[kTilePixels];
     alignas(64) float red[kTilePixels], green[kTilePixels], blue[kTilePixels], depth[kTilePixels];  // dL/d(pictures)
     const int32_t* end;
-    int32_t block_end[kBlocks];  // the largest of the block
 };
 
 SPLAT_INLINE void get_row(const View& view, const PictureGradients& in, int64_t pixel, int row, BackCanvas* canvas) {
@@ -300,93 +362,131 @@ int32_t start_back(const View& view, const FrameData& frame, const TilePlace& at
         const int p = b * kLanes;
         store(canvas->transmittance + p, load(left + p));
         store(canvas->behind + p, load(canvas->behind + p) * load(left + p));
-        int32_t end = 0;
-        for (int lane = 0; lane < kLanes; ++lane) end = end > canvas->end[p + lane] ? end : canvas->end[p + lane];
-        canvas->block_end[b] = end;
-        last = last > end ? last : end;
+        for (int lane = 0; lane < kLanes; ++lane) last = last > canvas->end[p + lane] ? last : canvas->end[p + lane];
     }
     return last;
 }
 
 // A pair's gradients, a lane a share.
 struct Moments {
-    Floats s, su, sv, suu, suv, svv, red, green, blue, depth;
+    Floats s, su, sv, suu, suv, svv, red, green, blue, depth, size_x, size_y;
 };
 
-template <bool kDepth>
-SPLAT_INLINE void blend_block_backward(const TileSplat& splat, const Splat& s, int block, int32_t pair,
-                                       BackCanvas* canvas, Moments* m) {
-    Floats u, v;
-    splat.offset(block, &u, &v);
-    const Floats log2_alpha = splat.log2_alpha(u, v), one = fill(1.0f);
-    const int at = block * kLanes;
-    const Mask met = both(at_most(fill(kLog2AlphaMin), log2_alpha), below(pair, canvas->end + at));
-    const Floats alpha = only(met, min(exp2(log2_alpha), fill(kAlphaMax)));  // with 0, nothing below changes anything
-    const Floats inv_rest = inverse(one - alpha);
-    const Floats before = load(canvas->transmittance + at) * inv_rest, weight = alpha * before;
-    const Floats red = load(canvas->red + at), green = load(canvas->green + at), blue = load(canvas->blue + at);
-    Floats value = fma(fill(s.colour[0]), red, fma(fill(s.colour[1]), green, fill(s.colour[2]) * blue));
-    m->red = fma(weight, red, m->red), m->green = fma(weight, green, m->green), m->blue = fma(weight, blue, m->blue);
-    if (kDepth) {
-        const Floats depth = load(canvas->depth + at);
-        value = fma(fill(s.depth), depth, value), m->depth = fma(weight, depth, m->depth);
+template <bool kDepth, bool kMagnitudes, int kCount>
+SPLAT_INLINE void blend_blocks_backward(const TileSplat& splat, const Splat& s, BlockMask* blocks, int32_t pair,
+                                        BackCanvas* canvas, Moments* m) {
+    int block[kCount];
+    take_blocks(blocks, block);
+    Floats alpha[kCount], rest[kCount], inv_rest[kCount], before[kCount], weight[kCount], value[kCount];
+    Mask met[kCount], free[kCount];
+    const Floats one = fill(1.0f);
+    for (int k = 0; k < kCount; ++k) alpha[k] = splat.log2_alpha(block[k]);
+    for (int k = 0; k < kCount; ++k)
+        met[k] = both(at_most(fill(kLog2AlphaMin), alpha[k]), below(pair, canvas->end + block[k] * kLanes));
+    for (int k = 0; k < kCount; ++k) free[k] = at_most(alpha[k], fill(kLog2AlphaMax));
+    exp2_each(alpha);
+    for (int k = 0; k < kCount; ++k) alpha[k] = only(met[k], min(alpha[k], fill(kAlphaMax)));  // 0 changes nothing
+    for (int k = 0; k < kCount; ++k) rest[k] = one - alpha[k];
+    for (int k = 0; k < kCount; ++k) inv_rest[k] = inverse(rest[k]);
+    for (int k = 0; k < kCount; ++k) before[k] = load(canvas->transmittance + block[k] * kLanes) * inv_rest[k];
+    for (int k = 0; k < kCount; ++k) weight[k] = alpha[k] * before[k];
+    for (int k = 0; k < kCount; ++k) {
+        const int at = block[k] * kLanes;
+        const Floats red = load(canvas->red + at), green = load(canvas->green + at), blue = load(canvas->blue + at);
+        value[k] = fma(fill(s.colour[0]), red, fma(fill(s.colour[1]), green, fill(s.colour[2]) * blue));
+        m->red = fma(weight[k], red, m->red), m->green = fma(weight[k], green, m->green);
+        m->blue = fma(weight[k], blue, m->blue);
+        if (kDepth) {
+            const Floats depth = load(canvas->depth + at);
+            value[k] = fma(fill(s.depth), depth, value[k]), m->depth = fma(weight[k], depth, m->depth);
+        }
     }
-    const Floats behind = load(canvas->behind + at);
-    const Floats dalpha = fnma(behind, inv_rest, before * value);
-    store(canvas->transmittance + at, before);
-    store(canvas->behind + at, fma(weight, value, behind));
-    const Floats g = only(at_most(log2_alpha, fill(kLog2AlphaMax)), alpha * dalpha);  // no gradient where clamped
-    const Floats gu = g * u, gv = g * v;
-    m->s = m->s + g, m->su = m->su + gu, m->sv = m->sv + gv;
-    m->suu = fma(gu, u, m->suu), m->suv = fma(gu, v, m->suv), m->svv = fma(gv, v, m->svv);
+    for (int k = 0; k < kCount; ++k) {
+        const int at = block[k] * kLanes;
+        const Floats behind = load(canvas->behind + at);
+        const Floats dalpha = fnma(behind, inv_rest[k], before[k] * value[k]);
+        store(canvas->transmittance + at, before[k]);
+        store(canvas->behind + at, fma(weight[k], value[k], behind));
+        const Floats g = only(free[k], alpha[k] * dalpha);  // no gradient where clamped
+        const Floats u = splat.u_of(block[k]), v = splat.v_of(block[k]), gu = g * u, gv = g * v;
+        m->s = m->s + g, m->su = m->su + gu, m->sv = m->sv + gv;
+        m->suu = fma(gu, u, m->suu), m->suv = fma(gu, v, m->suv), m->svv = fma(gv, v, m->svv);
+        if (kMagnitudes) {
+            m->size_x = m->size_x + magnitude(gu);
+            m->size_y = m->size_y + magnitude(fma(splat.b, gu, splat.c * gv));
+        }
+    }
 }
 
 SPLAT_INLINE void put_slot(const Moments& m, float* slot) {
-    const Floats zero = fill(0.0f);
     sum_lanes(m.s, m.su, m.sv, m.suu, slot);
     sum_lanes(m.suv, m.svv, m.red, m.green, slot + 4);
-    sum_lanes(m.blue, m.depth, zero, zero, slot + 8);
+    sum_lanes(m.blue, m.depth, m.size_x, m.size_y, slot + 8);
 }
 
-template <bool kDepth>
+template <bool kDepth, bool kMagnitudes>
 SPLAT_INLINE void walk_back(const FrameData& frame, const TilePlace& at, int32_t last, BackCanvas* canvas) {
     const int64_t first = frame.tile_begin[at.index];
     const int32_t pairs = static_cast<int32_t>(frame.tile_begin[at.index + 1] - first);
     const int32_t *list = frame.pair_splat + first, *slots = frame.pair_slot + first;
     for (int32_t pair = last; pair < pairs; ++pair)
         for (int f = 0; f < kSlotFloats; ++f) frame.slots[int64_t{slots[pair]} * kSlotFloats + f] = 0.0f;
-    BlockMask reached = 0;  // blocks with a pixel that had not ended by this pair
+    const uint8_t* masks = frame.pair_blocks + first * kMaskBytes;
     for (int32_t pair = last - 1; pair >= 0; --pair) {
         if (pair >= kAhead) {
             __builtin_prefetch(frame.splats + list[pair - kAhead]);
             __builtin_prefetch(frame.slots + int64_t{slots[pair - kAhead]} * kSlotFloats, 1);
         }
-        if (reached != kAllBlocks)
-            for (int b = 0; b < kBlocks; ++b) reached |= BlockMask{canvas->block_end[b] > pair} << b;
         const Splat& s = frame.splats[list[pair]];
-        BlockMask blocks = touched_blocks(s, at) & reached;
+        BlockMask blocks = get_mask(masks, pair);
         const TileSplat splat(s, at);
         const Floats zero = fill(0.0f);
-        Moments m = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
-        for (; blocks; blocks &= blocks - 1)
-            blend_block_backward<kDepth>(splat, s, __builtin_ctzll(blocks), pair, canvas, &m);
+        Moments m = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+        while (blocks & (blocks - 1))
+            blend_blocks_backward<kDepth, kMagnitudes, 2>(splat, s, &blocks, pair, canvas, &m);
+        if (blocks) blend_blocks_backward<kDepth, kMagnitudes, 1>(splat, s, &blocks, pair, canvas, &m);
         put_slot(m, frame.slots + int64_t{slots[pair]} * kSlotFloats);
     }
 }
 
-void blend_tile_backward(const View& view, const FrameData& frame, int tile, const PictureGradients& in) {
+void blend_tile_backward(const View& view, const FrameData& frame, int tile, const PictureGradients& in,
+                         bool magnitudes) {
     const TilePlace at = place_of(view, tile);
     BackCanvas canvas;
     const int32_t last = start_back(view, frame, at, in, &canvas);
-    if (in.depth_sum)
-        walk_back<true>(frame, at, last, &canvas);
+    if (in.depth_sum && magnitudes)
+        walk_back<true, true>(frame, at, last, &canvas);
+    else if (in.depth_sum)
+        walk_back<true, false>(frame, at, last, &canvas);
+    else if (magnitudes)
+        walk_back<false, true>(frame, at, last, &canvas);
     else
-        walk_back<false>(frame, at, last, &canvas);
+        walk_back<false, false>(frame, at, last, &canvas);
+}
+
+int64_t count_contributions(const View& view, const FrameData& frame, int tile) {
+    const TilePlace at = place_of(view, tile);
+    const int64_t first = frame.tile_begin[tile];
+    const int32_t* ends = frame.pixel_end + static_cast<int64_t>(tile) * kTilePixels;
+    int32_t last = 0;  // no pair behind it was looked at, nor has a mask
+    for (int p = 0; p < kTilePixels; ++p) last = last > ends[p] ? last : ends[p];
+    int64_t count = 0;
+    for (int32_t pair = 0; pair < last; ++pair) {
+        const TileSplat splat(frame.splats[frame.pair_splat[first + pair]], at);
+        BlockMask blocks = get_mask(frame.pair_blocks + first * kMaskBytes, pair);
+        for (; blocks; blocks &= blocks - 1) {
+            const int block = __builtin_ctzll(blocks);
+            const Mask met =
+                both(at_most(fill(kLog2AlphaMin), splat.log2_alpha(block)), below(pair, ends + block * kLanes));
+            count += __builtin_popcount(bits(met));
+        }
+    }
+    return count;
 }
 
 }  // namespace
 
-extern const BlendKernels blend_kernels = {blend_tile, blend_tile_backward};
+extern const BlendKernels blend_kernels = {blend_tile, blend_tile_backward, count_contributions, kMaskBytes};
 
 }  // namespace SPLAT_ISA_NAMESPACE
 }  // namespace splat

@@ -58,22 +58,35 @@ class RasterFrame {
 
     int64_t pairs() const { return pairs_; }
 
+    // Pairs of a pixel and a splat blended into it, of the last forward() call. For benchmarks: slow.
+    int64_t contributions() const;
+
   private:
-    void sort_by_depth(int64_t count);
-    void bin(int64_t count);
+    // Of kGaussiansATask Gaussians; where their shares begin once they have been summed.
+    struct TaskCounts {
+        int64_t visible, rows, pairs;
+    };
+
+    void project(const Parameters& in, float* radii, uint8_t* visible);
+    void find_tiles(int64_t count);
+    void sort_by_depth();
+    void bin();
     void prefix_tiles(int chunks, int tiles);
 
     View view_{};
     FrameData data_{};
-    int64_t visible_ = 0, pairs_ = 0;
+    int64_t visible_ = 0, rows_ = 0, pairs_ = 0;
+    const int32_t* order_ = nullptr;  // visible Gaussians by depth
     Buffer<Splat> splats_;
-    Buffer<uint32_t> keys_, sort_keys_;
-    Buffer<int32_t> sort_order_;  // two halves, and the visible Gaussians by depth in the first after the sort
-    Buffer<int64_t> row_begin_;   // of the k-th nearest splat in spans_
+    Buffer<TaskCounts> tasks_;
+    Buffer<Touched> touched_;
     Buffer<Span> spans_;
-    Buffer<int64_t> cursors_;  // (chunks, tiles)
-    Buffer<int64_t> tile_begin_, slot_begin_;
+    Buffer<uint32_t> keys_, sort_keys_;  // two halves, of the visible ones
+    Buffer<int32_t> sort_order_;         // two halves
+    Buffer<int32_t> cursors_;            // (chunks, tiles), and of the sort's buckets
+    Buffer<int64_t> tile_begin_;
     Buffer<int32_t> pair_splat_, pair_slot_;
+    Buffer<uint8_t> pair_blocks_;
     Buffer<float> slots_, transmittance_;
     Buffer<int32_t> pixel_end_;
 };

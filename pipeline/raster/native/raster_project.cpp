@@ -5,7 +5,8 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kMaxSh = 16;  // coefficients a channel
+constexpr int kMaxSh = 16;                                                 // coefficients a channel
+constexpr int kMaxShFloats = (kMaxSh * 3 + kLanes - 1) / kLanes * kLanes;  // a Gaussian, to whole vectors
 
 // The rows of a vector of Gaussians: pointers to the first, into the caller's arrays or, at the ragged end, to padded
 // copies.
@@ -37,8 +38,19 @@ SPLAT_INLINE void find_rows(const Parameters& in, int sh_row, int64_t first, int
 }
 
 SPLAT_INLINE Lanes load_lanes(const Rows& rows) {
-    return {gather3(rows.means, 3),    gather3(rows.log_scales, 3), gather(rows.quats, 4),    gather(rows.quats + 1, 4),
-            gather(rows.quats + 2, 4), gather(rows.quats + 3, 4),   load(rows.opacity_logits)};
+    Lanes lanes;
+    load_rgb(rows.means, &lanes.mean.x, &lanes.mean.y, &lanes.mean.z);
+    load_rgb(rows.log_scales, &lanes.log_scale.x, &lanes.log_scale.y, &lanes.log_scale.z);
+    Floats quats[kLanes];
+    load_columns(rows.quats, 4, 4, quats);
+    lanes.qw = quats[0], lanes.qx = quats[1], lanes.qy = quats[2], lanes.qz = quats[3];
+    lanes.logit = load(rows.opacity_logits);
+    return lanes;
+}
+
+// Coefficients that count, (k, rgb) vectors.
+SPLAT_INLINE void load_sh(const View& view, const Rows& rows, Floats* sh) {
+    load_columns(rows.sh, view.sh_count * 3, (view.sh_degree + 1) * (view.sh_degree + 1) * 3, sh);
 }
 
 SPLAT_INLINE Vec3 direction(const View& view, const Vec3& mean, Floats* inv_length) {
@@ -47,12 +59,14 @@ SPLAT_INLINE Vec3 direction(const View& view, const Vec3& mean, Floats* inv_leng
     return *inv_length * towards;
 }
 
-SPLAT_INLINE Vec3 colour_of(const View& view, const Rows& rows, const Vec3& dir) {
-    Floats basis[kMaxSh];
+SPLAT_INLINE Vec3 coefficient(const Floats* sh, int k) { return {sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}; }
+
+// The colour before it is clamped, and the basis it was made with.
+SPLAT_INLINE Vec3 colour_of(const View& view, const Floats* sh, const Vec3& dir, Floats* basis) {
     sh_basis(view.sh_degree, dir, basis);
-    const int count = (view.sh_degree + 1) * (view.sh_degree + 1), stride = view.sh_count * 3;
+    const int count = (view.sh_degree + 1) * (view.sh_degree + 1);
     Vec3 colour = {fill(0.5f), fill(0.5f), fill(0.5f)};
-    for (int k = 0; k < count; ++k) colour = colour + basis[k] * gather3(rows.sh + 3 * k, stride);
+    for (int k = 0; k < count; ++k) colour = colour + basis[k] * coefficient(sh, k);
     return colour;
 }
 
@@ -112,8 +126,9 @@ void project(const View& view, const Parameters& in, int64_t begin, int64_t end,
         uint32_t seen = bits(p.usable);
         alignas(64) float fields[kFields][kLanes], radius[kLanes];
         if (seen) {
-            Floats inv_length;
-            const Vec3 colour = colour_of(view, rows, direction(view, lanes.mean, &inv_length));
+            Floats inv_length, basis[kMaxSh], sh[kMaxShFloats];
+            load_sh(view, rows, sh);
+            const Vec3 colour = colour_of(view, sh, direction(view, lanes.mean, &inv_length), basis);
             seen = bits(make_splats(view, p, colour, fields, radius));
         }
         for (int lane = 0; lane < valid; ++lane) {
@@ -122,12 +137,15 @@ void project(const View& view, const Parameters& in, int64_t begin, int64_t end,
             visible[i] = is_seen;
             radii[i] = is_seen ? radius[lane] : 0.0f;
             frame.keys[i] = kCulled;
+            frame.touched[i].rows = 0;
             if (!is_seen) continue;
             Splat& splat = frame.splats[i];
             float* out = &splat.x;
             for (int f = 0; f < kFields - 2; ++f) out[f] = fields[f][lane];
-            splat.first_row = static_cast<uint16_t>(fields[kFields - 2][lane]);
-            splat.last_row = static_cast<uint16_t>(fields[kFields - 1][lane]);
+            const int first_row = static_cast<int>(fields[kFields - 2][lane]);
+            const int rows = static_cast<int>(fields[kFields - 1][lane]) - first_row + 1;
+            frame.touched[i].first_row = static_cast<uint16_t>(first_row);
+            frame.touched[i].rows = static_cast<uint16_t>(rows > 0 ? rows : 0);
             __builtin_memcpy(&frame.keys[i], &splat.depth, sizeof(float));
         }
     }
@@ -139,109 +157,145 @@ SPLAT_INLINE float most(float a, float b) { return a > b ? a : b; }
 
 // The chord of the ellipse between rows dy_first and dy_last reaches furthest right where dy is nearest to the
 // ellipse's own rightmost point, for the ellipse is convex; and to the left alike.
-int64_t find_spans(const View& view, const Splat& s, Span* spans) {
-    int64_t touched = 0;
-    const float half_y = root(s.reach) / s.c, right_px = static_cast<float>(view.width - 1);
-    for (int row = s.first_row; row <= s.last_row; ++row, ++spans) {
-        const int last_y = row * kTile + kTile < view.height ? row * kTile + kTile : view.height;
-        const float dy_first = most(row * kTile + 0.5f - s.y, -half_y), dy_last = least(last_y - 0.5f - s.y, half_y);
-        const float dy_right = least(most(s.rows_dy, dy_first), dy_last), v_right = s.c * dy_right;
-        const float dy_left = least(most(-s.rows_dy, dy_first), dy_last), v_left = s.c * dy_left;
-        const float right = s.x + s.slope * dy_right + s.inv_a * root(s.reach - v_right * v_right) - 0.5f;
-        const float left = s.x + s.slope * dy_left - s.inv_a * root(s.reach - v_left * v_left) - 0.5f;
-        const float first_px = most(__builtin_ceilf(left), 0.0f), last_px = least(__builtin_floorf(right), right_px);
-        *spans = {0, 0};
-        if (!(dy_first <= dy_last && first_px <= last_px)) continue;
-        *spans = {static_cast<uint16_t>(static_cast<int>(first_px) / kTile),
-                  static_cast<uint16_t>(static_cast<int>(last_px) / kTile + 1)};
-        touched += spans->last - spans->first;
+SPLAT_INLINE Span find_span(const View& view, const Splat& s, int row, float half_y) {
+    const int last_y = row * kTile + kTile < view.height ? row * kTile + kTile : view.height;
+    const float dy_first = most(row * kTile + 0.5f - s.y, -half_y), dy_last = least(last_y - 0.5f - s.y, half_y);
+    const float dy_right = least(most(s.rows_dy, dy_first), dy_last), v_right = s.c * dy_right;
+    const float dy_left = least(most(-s.rows_dy, dy_first), dy_last), v_left = s.c * dy_left;
+    const float right = s.x + s.slope * dy_right + s.inv_a * root(s.reach - v_right * v_right) - 0.5f;
+    const float left = s.x + s.slope * dy_left - s.inv_a * root(s.reach - v_left * v_left) - 0.5f;
+    const float first_px = most(__builtin_ceilf(left), 0.0f);
+    const float last_px = least(__builtin_floorf(right), static_cast<float>(view.width - 1));
+    if (!(dy_first <= dy_last && first_px <= last_px)) return {0, 0};
+    return {static_cast<uint16_t>(static_cast<int>(first_px) / kTile),
+            static_cast<uint16_t>(static_cast<int>(last_px) / kTile + 1)};
+}
+
+int64_t find_spans(const View& view, int64_t begin, int64_t end, const FrameData& frame, int64_t first_span) {
+    int64_t tiles = 0;
+    Span* span = frame.spans + first_span;
+    for (int64_t i = begin; i < end; ++i) {
+        Touched& touched = frame.touched[i];
+        touched.spans = static_cast<uint32_t>(span - frame.spans);
+        touched.slots = static_cast<int32_t>(tiles);
+        if (touched.rows == 0) continue;
+        const Splat& s = frame.splats[i];
+        const float half_y = root(s.reach) / s.c;
+        for (int row = touched.first_row; row < touched.first_row + touched.rows; ++row, ++span) {
+            *span = find_span(view, s, row, half_y);
+            tiles += span->last - span->first;
+        }
     }
-    return touched;
+    return tiles;
 }
 
 // The Gaussian's gradients on the screen: its slots, summed in their order.
 SPLAT_INLINE void sum_slots(const FrameData& frame, int64_t i, float (*sums)[kLanes], int lane) {
     float sum[kSlotFloats] = {};
-    for (int64_t slot = frame.slot_begin[i]; slot < frame.slot_begin[i + 1]; ++slot)
+    for (int64_t slot = frame.touched[i].slots; slot < frame.touched[i + 1].slots; ++slot)
         for (int f = 0; f < kSlotFloats; ++f) sum[f] += frame.slots[slot * kSlotFloats + f];
     for (int f = 0; f < kSlotFloats; ++f) sums[f][lane] = sum[f];
 }
 
-SPLAT_INLINE void put_row(float* out, const float (*values)[kLanes], int width, int lane) {
-    for (int f = 0; f < width; ++f) out[f] = values[f][lane];
-}
-
-// dL/d(SH) from dL/d(colour), to sh (3 k vectors); returns dL/d(mean) through the direction.
-SPLAT_INLINE Vec3 colour_backward(const View& view, const Rows& rows, const Vec3& mean, Vec3 dcolour,
-                                  float (*sh)[kLanes]) {
+// dL/d(SH) from dL/d(colour), in place of the coefficients; returns dL/d(mean) through the direction.
+SPLAT_INLINE Vec3 colour_backward(const View& view, const Vec3& mean, Vec3 dcolour, Floats* sh) {
     Floats inv_length, basis[kMaxSh], weights[kMaxSh];
     const Vec3 dir = direction(view, mean, &inv_length);
-    const Vec3 colour = colour_of(view, rows, dir);
+    const Vec3 colour = colour_of(view, sh, dir, basis);
     const Floats zero = fill(0.0f);  // no gradient where the colour was clamped
     dcolour = {only(less(zero, colour.x), dcolour.x), only(less(zero, colour.y), dcolour.y),
                only(less(zero, colour.z), dcolour.z)};
-    sh_basis(view.sh_degree, dir, basis);
-    const int count = (view.sh_degree + 1) * (view.sh_degree + 1), stride = view.sh_count * 3;
-    for (int k = 0; k < view.sh_count; ++k) {
-        const bool counts = k < count;
-        if (counts) weights[k] = dot(dcolour, gather3(rows.sh + 3 * k, stride));
-        store(sh[3 * k], counts ? basis[k] * dcolour.x : zero);
-        store(sh[3 * k + 1], counts ? basis[k] * dcolour.y : zero);
-        store(sh[3 * k + 2], counts ? basis[k] * dcolour.z : zero);
+    const int count = (view.sh_degree + 1) * (view.sh_degree + 1);
+    for (int k = 0; k < count; ++k) {
+        weights[k] = dot(dcolour, coefficient(sh, k));
+        sh[3 * k] = basis[k] * dcolour.x, sh[3 * k + 1] = basis[k] * dcolour.y, sh[3 * k + 2] = basis[k] * dcolour.z;
     }
+    for (int f = 3 * count; f < 3 * view.sh_count; ++f) sh[f] = zero;
     const Vec3 ddir = sh_direction_gradient(view.sh_degree, dir, weights);
     return inv_length * (ddir - dot(dir, ddir) * dir);
 }
 
-SPLAT_INLINE void zero_rows(const ParameterGradients& out, int sh_row, int64_t i) {
-    for (int f = 0; f < 3; ++f) out.means[3 * i + f] = out.log_scales[3 * i + f] = 0.0f;
-    for (int f = 0; f < 4; ++f) out.quats[4 * i + f] = 0.0f;
-    out.opacity_logits[i] = out.means2d[2 * i] = out.means2d[2 * i + 1] = 0.0f;
-    for (int f = 0; f < sh_row; ++f) out.sh[sh_row * i + f] = 0.0f;
+SPLAT_INLINE void zero(float* out, int64_t count) {
+    __builtin_memset(out, 0, static_cast<size_t>(count) * sizeof(float));
+}
+
+SPLAT_INLINE void zero_rows(const ParameterGradients& out, int sh_row, int64_t first, int count) {
+    zero(out.means + 3 * first, 3 * count), zero(out.log_scales + 3 * first, 3 * count);
+    zero(out.quats + 4 * first, 4 * count), zero(out.opacity_logits + first, count);
+    zero(out.means2d + 2 * first, 2 * count), zero(out.sh + sh_row * first, sh_row * count);
+}
+
+// The gradients of a vector of Gaussians, on the stack: where fewer than kLanes are left, only theirs may be written.
+struct GradientRows {
+    float means[3 * kLanes], log_scales[3 * kLanes], quats[4 * kLanes], opacity_logits[kLanes], means2d[2 * kLanes];
+    float sh[3 * kMaxSh * kLanes];
+};
+
+SPLAT_INLINE void put_rows(const LanesGradient& d, Floats* sh, int sh_row, Mask touched,
+                           const ParameterGradients& out) {
+    const auto seen = [&](Floats v) { return only(touched, v); };  // what is not seen may be NaN
+    store_rgb(out.means, seen(d.mean.x), seen(d.mean.y), seen(d.mean.z));
+    store_rgb(out.log_scales, seen(d.log_scale.x), seen(d.log_scale.y), seen(d.log_scale.z));
+    Floats quats[kLanes] = {seen(d.qw), seen(d.qx), seen(d.qy), seen(d.qz)};
+    store_columns(out.quats, 4, quats);
+    store(out.opacity_logits, seen(d.logit));
+    Floats means2d[kLanes] = {seen(d.mean2d_x), seen(d.mean2d_y)};
+    store_columns(out.means2d, 2, means2d);
+    for (int f = 0; f < sh_row; ++f) sh[f] = seen(sh[f]);
+    store_columns(out.sh, sh_row, sh);
+}
+
+SPLAT_INLINE ParameterGradients rows_from(const ParameterGradients& out, int sh_row, int64_t first) {
+    return {out.means + 3 * first,   out.log_scales + 3 * first, out.quats + 4 * first, out.opacity_logits + first,
+            out.sh + sh_row * first, out.means2d + 2 * first,    out.magnitudes};
+}
+
+void copy_rows(const GradientRows& from, int sh_row, int count, const ParameterGradients& to) {
+    const auto copy = [count](float* out, const float* in, int width) {
+        __builtin_memcpy(out, in, static_cast<size_t>(count) * width * sizeof(float));
+    };
+    copy(to.means, from.means, 3), copy(to.log_scales, from.log_scales, 3), copy(to.quats, from.quats, 4);
+    copy(to.opacity_logits, from.opacity_logits, 1), copy(to.means2d, from.means2d, 2), copy(to.sh, from.sh, sh_row);
 }
 
 void project_backward(const View& view, const Parameters& in, int64_t begin, int64_t end, const FrameData& frame,
                       const ParameterGradients& out) {
     Rows rows;
+    GradientRows ragged;
     const int sh_row = view.sh_count * 3;
-    alignas(64) float sums[kSlotFloats][kLanes], values[13][kLanes], sh[kMaxSh * 3][kLanes];
+    alignas(64) float sums[kSlotFloats][kLanes], touched[kLanes];
     for (int64_t first = begin; first < end; first += kLanes) {
         const int valid = static_cast<int>(end - first < kLanes ? end - first : kLanes);
-        const bool touched = frame.slot_begin[first] < frame.slot_begin[first + valid];
-        if (touched) {
-            for (int lane = 0; lane < kLanes; ++lane) {
-                if (lane < valid) sum_slots(frame, first + lane, sums, lane);
-                for (int f = 0; lane >= valid && f < kSlotFloats; ++f) sums[f][lane] = 0.0f;
-            }
-            find_rows(in, sh_row, first, valid, &rows);
-            const Lanes lanes = load_lanes(rows);
-            const SplatGradient g = {load(sums[0]),
-                                     load(sums[1]),
-                                     load(sums[2]),
-                                     load(sums[3]),
-                                     load(sums[4]),
-                                     load(sums[5]),
-                                     {load(sums[6]), load(sums[7]), load(sums[8])},
-                                     load(sums[9])};
-            LanesGradient d = project_lanes_backward(view, project_lanes(view, lanes), g);
-            d.mean = d.mean + colour_backward(view, rows, lanes.mean, g.colour, sh);
-            const Floats all[13] = {d.mean.x, d.mean.y, d.mean.z, d.log_scale.x, d.log_scale.y, d.log_scale.z, d.qw,
-                                    d.qx,     d.qy,     d.qz,     d.logit,       d.mean2d_x,    d.mean2d_y};
-            for (int f = 0; f < 13; ++f) store(values[f], all[f]);
+        if (frame.touched[first].slots == frame.touched[first + valid].slots) {
+            zero_rows(out, sh_row, first, valid);
+            continue;
         }
-        for (int lane = 0; lane < valid; ++lane) {
-            const int64_t i = first + lane;
-            if (frame.slot_begin[i] == frame.slot_begin[i + 1]) {
-                zero_rows(out, sh_row, i);
-                continue;
-            }
-            put_row(out.means + 3 * i, values, 3, lane);
-            put_row(out.log_scales + 3 * i, values + 3, 3, lane);
-            put_row(out.quats + 4 * i, values + 6, 4, lane);
-            put_row(out.opacity_logits + i, values + 10, 1, lane);
-            put_row(out.means2d + 2 * i, values + 11, 2, lane);
-            put_row(out.sh + sh_row * i, sh, sh_row, lane);
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const int64_t i = first + (lane < valid ? lane : 0);
+            touched[lane] = lane < valid && frame.touched[i].slots < frame.touched[i + 1].slots ? 1.0f : 0.0f;
+            sum_slots(frame, i, sums, lane);
         }
+        find_rows(in, sh_row, first, valid, &rows);
+        const Lanes lanes = load_lanes(rows);
+        Floats sh[kMaxShFloats];
+        load_sh(view, rows, sh);
+        const SplatGradient g = {load(sums[0]),
+                                 load(sums[1]),
+                                 load(sums[2]),
+                                 load(sums[3]),
+                                 load(sums[4]),
+                                 load(sums[5]),
+                                 {load(sums[6]), load(sums[7]), load(sums[8])},
+                                 load(sums[9]),
+                                 load(sums[10]),
+                                 load(sums[11])};
+        LanesGradient d = project_lanes_backward(view, project_lanes(view, lanes), g, out.magnitudes);
+        d.mean = d.mean + colour_backward(view, lanes.mean, g.colour, sh);
+        const ParameterGradients here = rows_from(out, sh_row, first);
+        const ParameterGradients stack = {ragged.means, ragged.log_scales, ragged.quats,  ragged.opacity_logits,
+                                          ragged.sh,    ragged.means2d,    out.magnitudes};
+        put_rows(d, sh, sh_row, less(fill(0.0f), load(touched)), valid == kLanes ? here : stack);
+        if (valid < kLanes) copy_rows(ragged, sh_row, valid, here);
     }
 }
 

@@ -31,6 +31,12 @@ SPLAT_INLINE Floats max(Floats a, Floats b) { return _mm512_max_ps(a, b); }     
 SPLAT_INLINE Floats sqrt(Floats a) { return _mm512_sqrt_ps(a); }
 SPLAT_INLINE Floats ceil(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
 SPLAT_INLINE Floats floor(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+SPLAT_INLINE __m512i ceil_to_ints(Floats a) {
+    return _mm512_cvt_roundps_epi32(a, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC);
+}
+SPLAT_INLINE __m512i floor_to_ints(Floats a) {
+    return _mm512_cvt_roundps_epi32(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
+}
 SPLAT_INLINE Mask less(Floats a, Floats b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
 SPLAT_INLINE Mask at_most(Floats a, Floats b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
 SPLAT_INLINE Mask both(Mask a, Mask b) { return static_cast<Mask>(a & b); }
@@ -72,13 +78,41 @@ SPLAT_INLINE void load_rgb(const float* p, Floats* red, Floats* green, Floats* b
     *blue = pick_third(v0, v1, v2, _mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0),
                        _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
 }
-// Two rows of eight that lie apart.
-SPLAT_INLINE Floats load_halves(const float* low, const float* high) {
-    return _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(low)), _mm256_loadu_ps(high), 1);
+// A 16 x 16 matrix: v[i][j] to v[j][i].
+SPLAT_INLINE void transpose(Floats* v) {
+    Floats pair[16], quad[16];
+    for (int i = 0; i < 16; i += 2) {
+        pair[i] = _mm512_unpacklo_ps(v[i], v[i + 1]);
+        pair[i + 1] = _mm512_unpackhi_ps(v[i], v[i + 1]);
+    }
+    for (int i = 0; i < 16; i += 4)
+        for (int j = 0; j < 2; ++j) {
+            quad[i + 2 * j] = _mm512_shuffle_ps(pair[i + j], pair[i + j + 2], 0x44);
+            quad[i + 2 * j + 1] = _mm512_shuffle_ps(pair[i + j], pair[i + j + 2], 0xee);
+        }
+    for (int j = 0; j < 4; ++j) {  // quad[4 i + j]: rows 4 i..4 i + 3 of columns j, j + 4, j + 8, j + 12
+        const Floats even01 = _mm512_shuffle_f32x4(quad[j], quad[4 + j], 0x88);
+        const Floats odd01 = _mm512_shuffle_f32x4(quad[j], quad[4 + j], 0xdd);
+        const Floats even23 = _mm512_shuffle_f32x4(quad[8 + j], quad[12 + j], 0x88);
+        const Floats odd23 = _mm512_shuffle_f32x4(quad[8 + j], quad[12 + j], 0xdd);
+        v[j] = _mm512_shuffle_f32x4(even01, even23, 0x88);
+        v[8 + j] = _mm512_shuffle_f32x4(even01, even23, 0xdd);
+        v[4 + j] = _mm512_shuffle_f32x4(odd01, odd23, 0x88);
+        v[12 + j] = _mm512_shuffle_f32x4(odd01, odd23, 0xdd);
+    }
 }
-SPLAT_INLINE void store_halves(float* low, float* high, Floats v) {
-    _mm256_storeu_ps(low, _mm512_castps512_ps256(v));
-    _mm256_storeu_ps(high, _mm512_extractf32x8_ps(v, 1));
+// Pieces of four floats that lie `step` apart.
+SPLAT_INLINE Floats load_pieces(const float* p, int step) {
+    Floats v = _mm512_castps128_ps512(_mm_loadu_ps(p));
+    v = _mm512_insertf32x4(v, _mm_loadu_ps(p + step), 1);
+    v = _mm512_insertf32x4(v, _mm_loadu_ps(p + 2 * step), 2);
+    return _mm512_insertf32x4(v, _mm_loadu_ps(p + 3 * step), 3);
+}
+SPLAT_INLINE void store_pieces(float* p, int step, Floats v) {
+    _mm_storeu_ps(p, _mm512_castps512_ps128(v));
+    _mm_storeu_ps(p + step, _mm512_extractf32x4_ps(v, 1));
+    _mm_storeu_ps(p + 2 * step, _mm512_extractf32x4_ps(v, 2));
+    _mm_storeu_ps(p + 3 * step, _mm512_extractf32x4_ps(v, 3));
 }
 // 1/x within 1 ulp or so. The estimate is specified to the bit, unlike the older ones.
 SPLAT_INLINE Floats inverse(Floats x) {
@@ -123,9 +157,33 @@ SPLAT_INLINE Floats gather(const float* p, int stride) {
     const __m256i lane = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
     return _mm256_i32gather_ps(p, _mm256_mullo_epi32(lane, _mm256_set1_epi32(stride)), 4);
 }
+// An 8 x 8 matrix: v[i][j] to v[j][i].
+SPLAT_INLINE void transpose(Floats* v) {
+    Floats pair[8], quad[8];
+    for (int i = 0; i < 8; i += 2) {
+        pair[i] = _mm256_unpacklo_ps(v[i], v[i + 1]);
+        pair[i + 1] = _mm256_unpackhi_ps(v[i], v[i + 1]);
+    }
+    for (int i = 0; i < 8; i += 4)
+        for (int j = 0; j < 2; ++j) {
+            quad[i + 2 * j] = _mm256_shuffle_ps(pair[i + j], pair[i + j + 2], 0x44);
+            quad[i + 2 * j + 1] = _mm256_shuffle_ps(pair[i + j], pair[i + j + 2], 0xee);
+        }
+    for (int j = 0; j < 4; ++j) {
+        v[j] = _mm256_permute2f128_ps(quad[j], quad[4 + j], 0x20);
+        v[4 + j] = _mm256_permute2f128_ps(quad[j], quad[4 + j], 0x31);
+    }
+}
 SPLAT_INLINE Mask below(int32_t value, const int32_t* p) {
     const __m256i loaded = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
     return _mm256_castsi256_ps(_mm256_cmpgt_epi32(loaded, _mm256_set1_epi32(value)));
+}
+SPLAT_INLINE Floats load_pieces(const float* p, int step) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + step), 1);
+}
+SPLAT_INLINE void store_pieces(float* p, int step, Floats v) {
+    _mm_storeu_ps(p, _mm256_castps256_ps128(v));
+    _mm_storeu_ps(p + step, _mm256_extractf128_ps(v, 1));
 }
 SPLAT_INLINE Floats inverse(Floats x) { return fill(1.0f) / x; }  // rcpps differs between makes of CPU
 SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) {
@@ -160,11 +218,19 @@ SPLAT_INLINE Floats only(Mask m, Floats v) { return reinterpret_cast<Floats>(m &
 SPLAT_INLINE Floats min(Floats a, Floats b) { return select(a < b, a, b); }
 SPLAT_INLINE Floats max(Floats a, Floats b) { return select(a > b, a, b); }
 SPLAT_INLINE Floats gather(const float* p, int stride) { return Floats{p[0], p[stride], p[2 * stride], p[3 * stride]}; }
+// A 4 x 4 matrix: v[i][j] to v[j][i].
+SPLAT_INLINE void transpose(Floats* v) {
+    const Floats a = v[0], b = v[1], c = v[2], d = v[3];
+    v[0] = Floats{a[0], b[0], c[0], d[0]}, v[1] = Floats{a[1], b[1], c[1], d[1]};
+    v[2] = Floats{a[2], b[2], c[2], d[2]}, v[3] = Floats{a[3], b[3], c[3], d[3]};
+}
 SPLAT_INLINE Mask below(int32_t value, const int32_t* p) {
     Mask loaded;
     __builtin_memcpy(&loaded, p, sizeof loaded);
     return value < loaded;
 }
+SPLAT_INLINE Floats load_pieces(const float* p, int) { return load(p); }
+SPLAT_INLINE void store_pieces(float* p, int, Floats v) { store(p, v); }
 SPLAT_INLINE Floats inverse(Floats x) { return fill(1.0f) / x; }
 SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) {
     out[0] = (a[0] + a[2]) + (a[1] + a[3]);
@@ -207,38 +273,58 @@ SPLAT_INLINE void load_rgb(const float* p, Floats* red, Floats* green, Floats* b
 }
 #endif
 
+// Of kLanes rows of `width` floats, one behind the other, the first `count` columns, a lane a row.
+SPLAT_INLINE void load_columns(const float* rows, int width, int count, Floats* columns) {
+    int column = 0;
+    for (; column < count && column + kLanes <= width; column += kLanes) {
+        for (int i = 0; i < kLanes; ++i) columns[column + i] = load(rows + i * width + column);
+        transpose(columns + column);
+    }
+    for (; column < count; ++column) columns[column] = gather(rows + column, width);
+}
+// The inverse, all columns; what is in them is lost.
+SPLAT_INLINE void store_columns(float* rows, int width, Floats* columns) {
+    int column = 0;
+    for (; column + kLanes <= width; column += kLanes) {
+        transpose(columns + column);
+        for (int i = 0; i < kLanes; ++i) store(rows + i * width + column, columns[column + i]);
+    }
+    for (; column < width; ++column) {
+        float lanes[kLanes];
+        store(lanes, columns[column]);
+        for (int i = 0; i < kLanes; ++i) rows[i * width + column] = lanes[i];
+    }
+}
+
 using Ints = int32_t __attribute__((vector_size(kLanes * 4)));
 
 SPLAT_INLINE Mask none() { return less(fill(0.0f), fill(0.0f)); }
 SPLAT_INLINE Floats as_floats(Ints v) { return reinterpret_cast<Floats>(v); }
 SPLAT_INLINE Ints as_ints(Floats v) { return reinterpret_cast<Ints>(v); }
 SPLAT_INLINE Ints fill_int(int32_t x) { return Ints{} + x; }
+SPLAT_INLINE Floats magnitude(Floats x) { return as_floats(as_ints(x) & fill_int(0x7fffffff)); }
 SPLAT_INLINE Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
 
 // 2^x for x in [-126, 127]; elsewhere anything at all comes out. A polynomial of degree 5, minimax of the relative
-// error (1e-7 with its rounding), of what x is above a whole number, which goes to the exponent.
-SPLAT_INLINE Floats exp2(Floats x) {
-#if SPLAT_ISA_AVX512
-    const Floats f = _mm512_reduce_ps(x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // in [0, 1)
-    Floats p = fill(0.00187757669f);
-    p = fma(p, f, fill(0.00898933969f));
-    p = fma(p, f, fill(0.0558263175f));
-    p = fma(p, f, fill(0.240153611f));
-    p = fma(p, f, fill(0.693153083f));
-    p = fma(p, f, fill(0.99999994f));
-    return _mm512_scalef_ps(p, x);  // p 2^floor(x)
-#else
+// error (1e-7 with its rounding), of what x is above a whole number, which goes to the exponent. AVX-512 has
+// instructions for both, but they take the multipliers' time, sums and integers do not.
+template <int kCount>
+SPLAT_INLINE void exp2_each(Floats (&x)[kCount]) {
+    constexpr float kPowers[] = {0.00967151299f, 0.0555073358f, 0.240222424f, 0.693147004f, 1.0f};
     const Floats magic = fill(12582912.0f);  // 1.5 · 2^23: the sum's low bits are the nearest whole number
-    const Floats shifted = x + magic;
-    const Floats f = x - (shifted - magic);  // in [-1/2, 1/2]
-    Floats p = fill(0.00132647273f);
-    p = fma(p, f, fill(0.00967151299f));
-    p = fma(p, f, fill(0.0555073358f));
-    p = fma(p, f, fill(0.240222424f));
-    p = fma(p, f, fill(0.693147004f));
-    p = fma(p, f, fill(1.0f));
-    return as_floats(as_ints(p) + (as_ints(shifted) << 23));
-#endif
+    Floats shifted[kCount], f[kCount];
+    for (int k = 0; k < kCount; ++k) shifted[k] = x[k] + magic;
+    for (int k = 0; k < kCount; ++k) f[k] = x[k] - (shifted[k] - magic);  // in [-1/2, 1/2]
+    for (int k = 0; k < kCount; ++k) x[k] = fill(0.00132647273f);
+    for (float power : kPowers)
+        for (int k = 0; k < kCount; ++k) x[k] = fma(x[k], f[k], fill(power));
+    for (int k = 0; k < kCount; ++k) x[k] = as_floats(as_ints(x[k]) + (as_ints(shifted[k]) << 23));
+}
+
+SPLAT_INLINE Floats exp2(Floats x) {
+    Floats one[1] = {x};
+    exp2_each(one);
+    return one[0];
 }
 
 // 2^x with overflow to a huge number and underflow to (nearly) 0.

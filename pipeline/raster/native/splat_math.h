@@ -173,6 +173,7 @@ struct SplatGradient {
     Floats s, su, sv, suu, suv, svv;  // sums over pixels of s = dL/d(ln alpha), times moments of (u, v)
     Vec3 colour;
     Floats depth;
+    Floats size_x, size_y;  // sums over pixels of |s u| and |s (b u + c v)|
 };
 
 // dL/d(raw parameters), SH apart.
@@ -208,8 +209,9 @@ SPLAT_INLINE void rows_gradient(const Projection& p, const SplatGradient& in, Fl
     *drow1 = two * (gxy * p.row0 + gyy * p.row1) + s_sharp * cross(p.normal, p.row0);
 }
 
-// The derivative of project_lanes, the mean's share through the colour apart.
-SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projection& p, const SplatGradient& in) {
+// The derivative of project_lanes, the mean's share through the colour apart. `magnitudes` is as in ParameterGradients.
+SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projection& p, const SplatGradient& in,
+                                                  bool magnitudes) {
     LanesGradient out;
     const Floats a = sqrt(fill(kHalfLog2E) * p.yy / p.det), b = -a * p.xy / p.yy, c = sqrt(fill(kHalfLog2E) / p.yy);
     Vec3 drow0, drow1;
@@ -232,6 +234,7 @@ SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projec
     dinv_z = dinv_z + dratio_x * p.point.x + dratio_y * p.point.y;
     const Floats dz = in.depth - p.inv_z * p.inv_z * dinv_z;
     out.mean = (dratio_x * p.inv_z) * w0 + (dratio_y * p.inv_z) * w1 + dz * w2;
+    if (magnitudes) out.mean2d_x = inv_k * a * in.size_x, out.mean2d_y = inv_k * in.size_y;
     return out;
 }
 
