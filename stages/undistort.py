@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.scene.camera import reduced_size
 from splatpipe.pipeline.scene.dataset import MODEL, image_path, mask_path, some
 from splatpipe.pipeline.scene.names import match_names
 from splatpipe.pipeline.scene.parallel import ordered_map
@@ -160,10 +160,9 @@ def pinhole_camera(source: pycolmap.Camera, max_megapixels: float, number: int) 
     options = pycolmap.UndistortCameraOptions()
     options.blank_pixels = 0.0
     camera = pycolmap.undistort_camera(options, source)
-    scale = min(1.0, math.sqrt(max_megapixels * 1e6 / (camera.width * camera.height)))
-    if scale < 1.0:
-        # Rounded down, so that the result is within the limit.
-        camera.rescale(max(1, int(camera.width * scale)), max(1, int(camera.height * scale)))
+    size = reduced_size(camera.width, camera.height, max_megapixels)
+    if size != (camera.width, camera.height):
+        camera.rescale(*size)
     camera.camera_id = number
     return camera
 

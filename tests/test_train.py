@@ -25,7 +25,7 @@ from splatpipe.stages.train import loop
 from splatpipe.stages.train.checkpoint import load_checkpoint
 from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
+from splatpipe.stages.train.stream import TrainingPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -241,14 +241,3 @@ def test_photos_of_the_wrong_size_or_broken_are_named(scene: Path, tmp_path: Pat
         settings = {"evaluate.every": 4, "evaluate.views": ""}
         with pytest.raises(SplatpipeError, match=r"photo_1\.png"):
             train.run(QUICK, Inputs(parts, tmp_path, settings), tmp_path, tiny_scene.Recorder())
-
-
-def test_memory_of_photos_is_bounded(scene: Path) -> None:
-    views = load_views(scene / "dataset")
-    size = 3 * tiny_scene.WIDTH * tiny_scene.HEIGHT
-    with PhotoStream(views, [0] * 50, 0, cache_bytes=3 * size) as stream:
-        seen = [photo.camera.name for photo in stream]
-        assert stream.cached_bytes() <= 3 * size
-    assert len(seen) == 50 and len(set(seen)) == len(views)
-    with PhotoStream(views, [0] * 50, 0, first=31) as later:
-        assert [photo.camera.name for photo in later] == seen[30:]

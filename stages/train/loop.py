@@ -56,7 +56,8 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     levels = coarse_levels(plan.options)
     with same_bits(inputs.machine.threads):
         state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan.options)
-        with PhotoStream(trained_on, levels, plan.options.seed, state.iteration + 1) as photos:
+        with PhotoStream(trained_on, levels, plan.options.seed, state.iteration + 1, out) as photos:
+            photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])

@@ -1,24 +1,25 @@
-"""Photos in the order of training, decoded a little ahead; memory does not grow with their number."""
+"""Photos in the order of training, read a little ahead; memory does not grow with their number."""
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View
-from splatpipe.pipeline.scene.images import Mask, Pixels, load_colour, load_mask
+from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.stages.train.draws import permutation
+from splatpipe.stages.train.photo_cache import PhotoCache, stored_bytes
 
-CACHE_BYTES = 512 << 20  # some 400 photos of 0.4 MP; more are decoded again, a few milliseconds each
 READ_AHEAD = 3  # photos in flight: hides a slow decode behind an iteration
 
 
@@ -37,28 +38,26 @@ class TrainingPhoto:
     mask: Bool[Tensor, "h w"] | None
 
 
-def reduced(view: View, level: int) -> tuple[Camera, Pixels, Mask | None]:
-    """A view halved ``level`` times: camera, photo and mask (a pixel counts where all below it do)."""
-    colour, mask, camera = load_colour(view), load_mask(view), view.camera
-    if level == 0:
-        return camera, colour, mask
-    size = (max(1, camera.width >> level), max(1, camera.height >> level))
-    colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if mask is not None:
-        share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        mask = np.asarray(share > 1.0 - 1e-6)
-    return camera.scaled(*size), colour, mask
-
-
 class PhotoStream:
     """Iterates over the photos of training, from one iteration to the last.
+
+    The photo of an iteration depends on the views, the seed and the iteration alone. A thread of its own decodes each
+    photo once a size, when it is first wanted, into a file without a name that is gone with the stream or its process;
+    memory holds the photos in flight and no more. A photo that is wanted only once is not stored. Where the disk has no
+    room for all, those that fit are stored and the others decoded each time: slower, with the same result, and
+    ``tell`` says so.
 
     Args:
         views: The photos to train on.
         levels: How often each iteration's photo is halved, ``levels[i]`` for iteration ``i`` + 1.
         seed: Of the order; each epoch has its own.
         first: The first iteration, from 1.
-        cache_bytes: Decoded photos kept.
+        cache: Folder on whose disk the decoded photos lie meanwhile.
+        max_megapixels: The photos are first reduced to this size; None: they are as the dataset has them.
+
+    Raises:
+        MachineError: if the folder cannot be written; from ``next``, if the disk is full all the same.
+        StageError: from ``next``, if a photo is missing or broken.
     """
 
     def __init__(
@@ -66,25 +65,28 @@ class PhotoStream:
         views: Sequence[View],
         levels: Sequence[int],
         seed: int,
-        first: int = 1,
-        cache_bytes: int = CACHE_BYTES,
+        first: int,
+        cache: Path,
+        max_megapixels: float | None = None,
     ) -> None:
         self._views = views
         self._levels = levels
         self._seed = seed
         self._next = first
+        self._max_megapixels = max_megapixels
         self._pending: deque[Future[TrainingPhoto]] = deque()
-        self._cache: OrderedDict[tuple[int, int], tuple[Camera, Pixels, Mask | None]]
-        self._cache = OrderedDict()
-        self._cache_room = cache_bytes
         self._epoch = (-1, np.zeros(0, np.int64))
+        wanted = Counter(self._key(iteration) for iteration in range(first, len(levels) + 1))
+        self._wanted_again = {key for key, times in wanted.items() if times > 1}
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
+        self._cache = PhotoCache(cache)
 
     def __enter__(self) -> PhotoStream:
         return self
 
     def __exit__(self, *unused: object) -> None:
         self._reader.shutdown(wait=True, cancel_futures=True)
+        self._cache.close()
 
     def __iter__(self) -> Iterator[TrainingPhoto]:
         return self
@@ -104,25 +106,41 @@ class PhotoStream:
             self._epoch = (epoch, permutation(self._seed, epoch, len(self._views)))
         return int(self._epoch[1][place])
 
-    def cached_bytes(self) -> int:
-        """Memory that decoded photos take now."""
-        return sum(pixels.nbytes for _, pixels, _ in self._cache.values())
+    def wanted_bytes(self) -> int:
+        """What all photos that are wanted more than once take on the disk."""
+        wanted = 0
+        for index, level in self._wanted_again:
+            view = self._views[index]
+            camera = reduced_camera(view.camera, self._max_megapixels, level)
+            wanted += stored_bytes(camera, view.mask_path is not None)
+        return wanted
+
+    def tell(self, report: Reporter) -> None:
+        """Warn where the disk has no room for all decoded photos."""
+        wanted, room = self.wanted_bytes(), self._cache.room_bytes
+        if wanted > room:
+            report.warning(
+                f"The decoded photos take {wanted / 1e6:,.0f} MB, and the disk has room for {room / 1e6:,.0f} MB: "
+                "those that do not fit are decoded every time they are trained on, which is slower.",
+                hint="Make room on the disk of OUT, or lower undistort.max_megapixels.",
+            )
+
+    def _key(self, iteration: int) -> tuple[int, int]:
+        return self.view_index(iteration), self._levels[iteration - 1]
 
     def _photo(self, iteration: int) -> TrainingPhoto:
-        key = (self.view_index(iteration), self._levels[iteration - 1])
-        entry = self._cache.get(key)
-        if entry is None:
-            entry = reduced(self._views[key[0]], key[1])
-            self._keep(key, entry)
-        else:
-            self._cache.move_to_end(key)
-        camera, pixels, mask = entry
-        colour = torch.from_numpy(pixels.astype(np.float32) * np.float32(1.0 / 255.0))
-        return TrainingPhoto(camera, colour, None if mask is None else torch.from_numpy(mask))
+        camera, pixels, mask = self._decoded(self._key(iteration))
+        # A fresh array each: as fast as a ring of buffers here, and none is overwritten while the trainer holds it.
+        colour = pixels.astype(np.float32)
+        colour *= np.float32(1.0 / 255.0)
+        counts = None if mask is None else torch.from_numpy(mask.copy())
+        return TrainingPhoto(camera, torch.from_numpy(colour), counts)
 
-    def _keep(self, key: tuple[int, int], entry: tuple[Camera, Pixels, Mask | None]) -> None:
-        self._cache_room -= entry[1].nbytes
-        self._cache[key] = entry
-        while self._cache_room < 0 and self._cache:
-            _, (_, dropped, _) = self._cache.popitem(last=False)
-            self._cache_room += dropped.nbytes
+    def _decoded(self, key: tuple[int, int]) -> tuple[Camera, Pixels, Mask | None]:
+        stored = self._cache.get(key)
+        if stored is not None:
+            return stored
+        decoded = reduced_view(self._views[key[0]], self._max_megapixels, key[1])
+        if key in self._wanted_again:
+            self._cache.put(key, *decoded)
+        return decoded
