@@ -49,7 +49,6 @@ Row = dict[str, Any]
 
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
 PARTS = ("forward", "loss", "backward", "adam")
-DEFAULT_POINTS = "sparse"
 
 
 class SilentReporter:
@@ -169,7 +168,7 @@ def time_case(case: Case) -> Row:
             assert trained_on == camera.name
     return {
         "gaussians": len(state.gaussians),
-        "megapixels": round(1e-6 * pixels / case.repeats, 4),
+        "megapixels": round(1e-6 * pixels / case.repeats, 6),
         "threads": case.threads,
         "sh_degree": state.gaussians.sh_degree,
         "peak_bytes": peak_memory_bytes() - before,
@@ -295,16 +294,20 @@ def parse(options: argparse.ArgumentParser) -> argparse.Namespace:
     return arguments
 
 
-def run_apart(script: str, case: Case | Mapping[str, Any]) -> Row:
+def run_apart(command: Sequence[str], case: Case) -> Row:
     """Run a script's ``--case`` in a process of its own and return the JSON that it prints last.
+
+    Args:
+        command: The script and its options.
+        case: Handed to it.
 
     Raises:
         SystemExit: if it fails; it has told why.
     """
-    text = json.dumps(asdict(case) if isinstance(case, Case) else dict(case))
-    done = subprocess.run([sys.executable, script, "--case", text], stdout=subprocess.PIPE, text=True, check=False)
+    text = json.dumps(asdict(case))
+    done = subprocess.run([sys.executable, *command, "--case", text], stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode != 0:
-        raise SystemExit(f"a case of {Path(script).name} failed: {text}")
+        raise SystemExit(f"A case of {Path(command[0]).name} failed: {text}")
     row: Row = json.loads(done.stdout.splitlines()[-1])
     return row
 
@@ -353,7 +356,8 @@ def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str
         table.add_row(*(_cell(row, spec) for spec in columns.values()))
     console.print(table)
     for fact, value in facts.items():
-        console.print(f"{fact}: {value}", highlight=False)
+        if isinstance(value, str | int | float):
+            console.print(f"{fact}: {value}", highlight=False)
     if path is not None:
         text = json.dumps({"benchmark": name, "machine": facts, "rows": list(rows)}, indent=1, allow_nan=False)
         path.write_text(text + "\n", encoding="utf-8")

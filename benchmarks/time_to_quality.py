@@ -16,12 +16,13 @@ from pathlib import Path
 
 from measure import Row, machine, parse, parser, prepare, report, restart_peak, scratch, size_factor
 
+from splatpipe.pipeline.engine.config import parse_set, resolve
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.evaluate import measure, render_options, render_pixels
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.line import LineConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
 from splatpipe.stages.train.state import TrainState
@@ -138,12 +139,11 @@ def main() -> None:
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--every", type=float, default=5.0, help="CPU seconds between measurements")
     options.add_argument("--marks", type=float, nargs="*", default=[], help="PSNR whose time is asked for, dB")
-    options.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="other options of train")
+    options.add_argument("--set", nargs="*", default=[], metavar="train.NAME=VALUE", help="other options of training")
     arguments = parse(options)
     facts = machine(arguments.threads)
-    chosen = dict(setting.split("=", 1) for setting in arguments.set)
-    chosen |= {"iterations": arguments.iterations, "seed": arguments.seed, "max_gaussians": arguments.max_gaussians}
-    config = TrainConfig.model_validate(chosen)
+    asked = {"iterations": arguments.iterations, "seed": arguments.seed, "max_gaussians": arguments.max_gaussians}
+    config = resolve(LineConfig, [{"train": asked}, *(parse_set(each, LineConfig) for each in arguments.set)]).train
     with scratch() as folder:
         wanted = arguments.megapixels
         factor = arguments.scale if wanted is None else size_factor(arguments.data, wanted)
@@ -152,6 +152,9 @@ def main() -> None:
     facts |= {"data": arguments.data.name, "held_out": arguments.held_out, "train": config.model_dump(mode="json")}
     facts["marks"] = list(passed(rows, arguments.marks))
     report("time_to_quality", facts, rows, COLUMNS, arguments.json)
+    for mark in facts["marks"]:
+        reached = "not reached" if mark["cpu_s"] is None else f"{mark['cpu_s']:.1f} CPU s, {mark['wall_s']:.1f} s"
+        print(f"{mark['mark_db']} dB: {reached}")
 
 
 if __name__ == "__main__":

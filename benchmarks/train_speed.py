@@ -69,7 +69,7 @@ def main() -> None:
                     arguments.warmup,
                     arguments.sh_degree,
                 )
-                row = {"points": points} | run_apart(__file__, case)
+                row = {"points": points} | run_apart([__file__], case)
                 # Multiplications and additions that the core could have done in the time of a pair.
                 row["flop_slots_per_pair"] = facts["fma_gflops_per_core"] / row["gpairs_per_s_per_core"]
                 rows.append(row)
