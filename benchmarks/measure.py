@@ -324,18 +324,18 @@ def scratch() -> Iterator[Path]:
 
 def machine(threads: int) -> Row:
     """What the figures were measured on, with its ceilings."""
+    facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": raster.isa_name(), "isas": _native.isas()}
+    facts |= {"system": f"{platform.system()} {platform.release()}", "versions": versions()}
+    facts["load_average"] = os.getloadavg()[0]  # of the minute before: well above 0, the machine was not idle
+    return facts | measure_ceilings(threads)
+
+
+def cpu_model() -> str:
+    """The processor's name, as far as the system tells it."""
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-        return _machine(model, threads)
-    return _machine(platform.processor() or platform.machine(), threads)
-
-
-def _machine(model: str, threads: int) -> Row:
-    facts: Row = {"cpu": model, "cores": os.cpu_count(), "isa": raster.isa_name(), "isas": _native.isas()}
-    facts |= {"system": f"{platform.system()} {platform.release()}", "versions": versions()}
-    facts["load_average"] = os.getloadavg()[0]  # of the minute before: above 0.1, the machine was not idle
-    return facts | measure_ceilings(threads)
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return platform.processor() or platform.machine()
 
 
 def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str], path: Path | None) -> None:
