@@ -348,7 +348,7 @@ def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str
         columns: Heading of each column, and the format of its value: ``key:format``; times with ``ms``, bytes ``MB``.
         path: Of the JSON; None for none.
     """
-    console = Console(width=160 if not sys.stdout.isatty() else None)
+    console = Console(width=180 if not sys.stdout.isatty() else None)
     table = Table(title=name)
     for heading in columns:
         table.add_column(heading, justify="right")

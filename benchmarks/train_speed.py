@@ -25,7 +25,7 @@ from measure import (
 
 COLUMNS = {
     "points": "points:",
-    "Gaussians": "gaussians:,",
+    "Gauss.": "gaussians:,",
     "MP": "megapixels:.2f",
     "threads": "threads:",
     "wall ms": "wall_s:ms",
@@ -37,8 +37,8 @@ COLUMNS = {
     "Adam": "adam_wall_s:ms",
     "rest": "rest_wall_s:ms",
     "pairs/px": "pairs_per_pixel:.1f",
-    "G pairs/s/core": "gpairs_per_s_per_core:.3f",
-    "FLOP slots/pair": "flop_slots_per_pair:.0f",
+    "Gpair/s/core": "gpairs_per_s_per_core:.3f",
+    "FLOP/pair": "flop_slots_per_pair:.0f",
     "peak MB": "peak_bytes:MB",
 }
 
