@@ -1,0 +1,77 @@
+// What this machine can do at best: multiply-adds in registers and copies in memory, on the threads asked for.
+//
+// Usage: ceilings THREADS. Prints GFLOP/s of a core (an FMA is two, by CPU time with all threads at work) and GB/s that
+// all threads copy (read and written both count, by the wall clock).
+// LANES is given by the compiler's flags: floats in a vector register of the instruction set it was compiled for.
+#include <algorithm>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <ctime>
+#include <functional>
+#include <thread>
+#include <vector>
+
+namespace {
+
+typedef float Vector __attribute__((vector_size(LANES * sizeof(float))));
+
+constexpr int kChains = 10;  // hides an FMA's latency of 4 to 5 cycles at two a cycle, and still fits 16 registers
+constexpr int kSteps = 2'000'000;
+constexpr size_t kBytes = size_t{512} << 20;  // all threads' sources and targets together: beyond any cache
+constexpr int kRepeats = 5;
+
+// Each thread's own; what they add up to is printed, so that no compiler leaves the work out.
+void multiply_add(float* sink) {
+    Vector chains[kChains];
+    for (int c = 0; c < kChains; ++c) chains[c] = Vector{} + static_cast<float>(c + 1);
+    const Vector factor = Vector{} + 0.9999f, term = Vector{} + *sink;
+    for (int step = 0; step < kSteps; ++step) {
+#pragma GCC unroll 16
+        for (int c = 0; c < kChains; ++c) chains[c] = chains[c] * factor + term;
+    }
+    for (int c = 0; c < kChains; ++c) *sink += chains[c][0] * 1e-9f;
+}
+
+double now(clockid_t clock) {
+    timespec time{};
+    clock_gettime(clock, &time);
+    return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
+}
+
+double seconds(clockid_t clock, int threads, const std::function<void(int)>& work) {
+    const double begin = now(clock);
+    std::vector<std::thread> others;
+    for (int t = 1; t < threads; ++t) others.emplace_back(work, t);
+    work(0);
+    for (std::thread& other : others) other.join();
+    return now(clock) - begin;
+}
+
+// The first run faults the memory in and lets the clock rate settle; it counts for nothing where others are shorter.
+double shortest(clockid_t clock, int threads, const std::function<void(int)>& work) {
+    double best = seconds(clock, threads, work);
+    for (int i = 1; i < kRepeats; ++i) best = std::min(best, seconds(clock, threads, work));
+    return best;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    const int threads = argc > 1 ? std::atoi(argv[1]) : 1;
+    if (threads < 1 || threads > 256) return 2;
+    std::vector<float> sinks(static_cast<size_t>(threads) * 64, 0.5f);  // a cache line and more apart
+    const double fma =
+        shortest(CLOCK_PROCESS_CPUTIME_ID, threads, [&](int t) { multiply_add(&sinks[static_cast<size_t>(t) * 64]); });
+    const size_t bytes = kBytes / static_cast<size_t>(threads);
+    std::vector<std::vector<char>> memory(static_cast<size_t>(threads), std::vector<char>(bytes, 1));
+    const double copy = shortest(CLOCK_MONOTONIC, threads, [&](int t) {
+        char* half = memory[static_cast<size_t>(t)].data();
+        std::memcpy(half + bytes / 2, half, bytes / 2);
+        half[0] = half[bytes - 1];
+    });
+    const double flops = 2.0 * LANES * kChains * static_cast<double>(kSteps) * threads;
+    std::printf("{\"gflops\": %.4g, \"copy_gb_s\": %.4g, \"check\": %.3g}\n", 1e-9 * flops / fma,
+                1e-9 * static_cast<double>(bytes) * threads / copy, static_cast<double>(sinks[0]));
+    return 0;
+}

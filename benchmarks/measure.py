@@ -1,0 +1,373 @@
+"""What the benchmarks share: datasets of a size, cases in processes of their own, clocks of an iteration's parts."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import json
+import os
+import platform
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from ceilings import measure_ceilings
+from rich.console import Console
+from rich.table import Table
+
+from splatpipe.pipeline import raster
+from splatpipe.pipeline.engine.runner import versions
+from splatpipe.pipeline.engine.stage import Inputs
+from splatpipe.pipeline.engine.worker import peak_memory_bytes
+from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import IMAGES, MODEL, View, load_model, load_views, mask_path
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.scene.images import load_colour, load_mask
+from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages import initialize
+from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.train import loop
+from splatpipe.stages.train.draws import permutation
+from splatpipe.stages.train.plan import Plan, make_plan, sh_degree_at
+from splatpipe.stages.train.state import TrainState
+from splatpipe.stages.train.stream import PhotoStream
+
+Row = dict[str, Any]
+
+PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
+PARTS = ("forward", "loss", "backward", "adam")
+
+
+class SilentReporter:
+    """A stage's Reporter that tells nothing."""
+
+    def progress(self, done: float, total: float, what: str, unit: str = "") -> None: ...
+    def metric(self, name: str, value: float, step: int | None = None) -> None: ...
+    def warning(self, message: str, hint: str = "") -> None: ...
+
+
+@dataclass(frozen=True)
+class Case:
+    """Training iterations to be timed, in a process of their own.
+
+    Attributes:
+        dataset: Folder with photos of the right size and their cameras.
+        splat: The Gaussians to start with.
+        threads: That compute.
+        repeats: Iterations that count.
+        warmup: Iterations before them; at least an epoch, so that every photo is decoded.
+        sh_degree: Of the Gaussians' colours, all of it from the first iteration that counts.
+        seed: Of the order of photos.
+    """
+
+    dataset: str
+    splat: str
+    threads: int
+    repeats: int = 30
+    warmup: int = 5
+    sh_degree: int = 3
+    seed: int = 0
+
+
+@dataclass
+class Parts:
+    """Seconds that each part of an iteration took, one value an iteration.
+
+    Attributes:
+        wall_s: By the wall clock.
+        cpu_s: Of all threads.
+    """
+
+    wall_s: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in (*PARTS, "iteration")})
+    cpu_s: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in (*PARTS, "iteration")})
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, its time kept under a name."""
+
+        @functools.wraps(function)
+        def run(*arguments: Any, **options: Any) -> Any:
+            wall, cpu = time.perf_counter(), time.process_time()
+            result = function(*arguments, **options)
+            self.wall_s[name].append(time.perf_counter() - wall)
+            self.cpu_s[name].append(time.process_time() - cpu)
+            return result
+
+        return run
+
+    def row(self) -> Row:
+        """Medians and shortest times; ``rest`` is what the parts leave of an iteration."""
+        row: Row = {}
+        for kind, times in (("wall", self.wall_s), ("cpu", self.cpu_s)):
+            row[f"{kind}_s"] = statistics.median(times["iteration"])
+            row[f"{kind}_min_s"] = min(times["iteration"])
+            row |= {f"{name}_{kind}_s": statistics.median(times[name]) for name in PARTS}
+            in_parts = zip(*(times[name] for name in PARTS), strict=True)
+            rest = [whole - sum(parts) for whole, parts in zip(times["iteration"], in_parts, strict=True)]
+            row[f"rest_{kind}_s"] = statistics.median(rest)
+        return row
+
+
+@contextlib.contextmanager
+def timed_parts(parts: Parts) -> Iterator[None]:
+    """Put a clock around the functions that training's ``descend`` calls; they stay what they are."""
+    places = ((loop.raster, "render"), (loop, "photo_loss"), (torch.Tensor, "backward"), (TrainState, "step"))
+    with contextlib.ExitStack() as undo:
+        for part, (owner, name) in zip(PARTS, places, strict=True):
+            function = getattr(owner, name)
+            setattr(owner, name, parts.timed(part, function))
+            undo.callback(setattr, owner, name, function)
+        yield
+
+
+def time_case(case: Case) -> Row:
+    """Train a few iterations by training's own code, the number of Gaussians fixed, and take their times.
+
+    Memory is what the process takes at most above what it took with its libraries imported, which this call finds.
+    """
+    before = restart_peak()
+    config = TrainConfig(
+        iterations=PUBLISHED_ITERATIONS, sh_degree=case.sh_degree, sh_every=1, seed=case.seed, max_gaussians=10**9
+    )
+    views = load_views(Path(case.dataset))
+    start = read_splat(Path(case.splat))
+    plan = make_plan(config, views, 0, "", len(start))
+    warmup = max(case.warmup, len(views))
+    steps = warmup + case.repeats
+    if steps >= int(plan.options.densify_from):
+        raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
+    parts, pairs, pixels = Parts(), [], 0
+    with loop.same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed) as photos:
+        state = TrainState.begin(start, plan.options)
+        for photo in islice(photos, warmup):
+            loop.train_step(state, plan, photo)
+
+        def iteration() -> str:
+            photo = next(photos)
+            loop.train_step(state, plan, photo)
+            return photo.camera.name
+
+        for _ in range(case.repeats):
+            camera = camera_of(views, case.seed, state.iteration + 1)
+            pairs.append(contributing_pairs(state.gaussians, camera, plan, state.iteration + 1))
+            pixels += camera.width * camera.height
+            with timed_parts(parts):
+                trained_on = parts.timed("iteration", iteration)()
+            assert trained_on == camera.name
+    return {
+        "gaussians": len(state.gaussians),
+        "megapixels": round(1e-6 * pixels / case.repeats, 6),
+        "threads": case.threads,
+        "sh_degree": state.gaussians.sh_degree,
+        "peak_bytes": peak_memory_bytes() - before,
+        "pairs": round(statistics.fmean(pairs)),
+        "pairs_per_pixel": sum(pairs) / pixels,
+        "gpairs_per_s_per_core": 1e-9 * sum(pairs) / sum(parts.cpu_s["forward"] + parts.cpu_s["backward"]),
+    } | parts.row()
+
+
+def camera_of(views: Sequence[View], seed: int, iteration: int) -> Camera:
+    """Which view's turn it is in an iteration (from 1)."""
+    epoch, place = divmod(iteration - 1, len(views))
+    return views[int(permutation(seed, epoch, len(views))[place])].camera
+
+
+def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iteration: int) -> int:
+    """Pixel-Gaussian pairs that training's render in an iteration blends: alpha ≥ 1/255, before the pixel's end.
+
+    Args:
+        gaussians: As they are before the iteration.
+        camera: The iteration's.
+        plan: The training's.
+        iteration: From 1.
+    """
+    options = plan.options
+    n, h, w = len(gaussians), camera.height, camera.width
+    frame = _native.Frame()
+    frame.forward(
+        tuple(tensor.detach().contiguous() for tensor in gaussians.tensors().values()),
+        (np.ascontiguousarray(camera.cam_from_world, np.float64), (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
+        (sh_degree_at(options, iteration), options.antialias, plan.near, loop.background(options, iteration)),
+        (torch.empty(h, w, 3), torch.empty(h, w), None, None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
+    )
+    return int(frame.contributing_pairs())
+
+
+def restart_peak() -> int:
+    """Let the kernel's record of this process's peak memory start anew, and return what it takes now, bytes."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    return peak_memory_bytes()
+
+
+def point_sets(data: Path) -> list[Path]:
+    """The sparse models of a dataset folder, each a folder with `0` in it: `sparse`, and others named after it."""
+    found = sorted(path.parent for path in data.glob("sparse*/0") if path.is_dir())
+    if not found:
+        raise SystemExit(f"{data} has no sparse/0.")
+    return found
+
+
+def prepare(data: Path, points: str, factor: float, folder: Path, photos: int | None = None) -> Path:
+    """Write a dataset's photos and cameras in another size, lossless, as training reads them.
+
+    Args:
+        data: The dataset, undistorted.
+        points: Which of its sparse models, by the folder's name.
+        factor: On both sides of every photo.
+        folder: Where.
+        photos: Only so many, the first in name order; None for all.
+    """
+    whole = folder / "whole"  # the same under the names that the line has
+    whole.mkdir(parents=True)
+    for link, target in ((IMAGES, IMAGES), ("masks", "masks"), ("sparse", points)):
+        if (data / target).is_dir():
+            (whole / link).symlink_to((data / target).resolve())
+    model = load_model(whole)
+    views = load_views(whole)
+    kept = views[:photos]
+    for view in views[len(kept) :]:
+        model.deregister_frame(model.find_image_with_name(view.camera.name).frame_id)
+    for camera in model.cameras.values():
+        camera.rescale(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    (folder / MODEL).mkdir(parents=True)
+    model.write(folder / MODEL)
+    for view in kept:
+        size = (max(1, round(view.camera.width * factor)), max(1, round(view.camera.height * factor)))
+        how = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_LINEAR
+        _write_png(
+            folder / IMAGES / view.camera.name, cv2.resize(load_colour(view), size, interpolation=how)[:, :, ::-1]
+        )
+        if (mask := load_mask(view)) is not None:
+            share = cv2.resize(mask.astype(np.float32), size, interpolation=how)
+            _write_png(mask_path(folder, view.camera.name), np.where(share > 1.0 - 1e-6, 255, 0))
+    initialize.run(InitializeConfig(), Inputs({"undistort.dataset": whole}, folder), folder, SilentReporter())
+    return folder
+
+
+def _write_png(path: Path, pixels: Any) -> None:
+    """Under whatever name: readers look at the content."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _, data = cv2.imencode(".png", np.ascontiguousarray(pixels, np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    path.write_bytes(data.tobytes())
+
+
+def size_factor(data: Path, megapixels: float) -> float:
+    """What to multiply the sides of a dataset's first photo by for a size."""
+    camera = load_views(data)[0].camera
+    return float((1e6 * megapixels / (camera.width * camera.height)) ** 0.5)
+
+
+def parser(text: str | None) -> argparse.ArgumentParser:
+    """The options that all benchmarks have."""
+    options = argparse.ArgumentParser(description=text)
+    options.add_argument("--data", type=Path, help="a folder with images/ and sparse/0, undistorted (PINHOLE)")
+    options.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    options.add_argument("--json", type=Path, help="where the figures go")
+    options.add_argument("--case", help=argparse.SUPPRESS)
+    return options
+
+
+def parse(options: argparse.ArgumentParser) -> argparse.Namespace:
+    """Read the command line.
+
+    Raises:
+        SystemExit: if it makes no sense.
+    """
+    arguments = options.parse_args()
+    if arguments.case is None and (arguments.data is None or not arguments.data.is_dir()):
+        options.error("--data must be a folder with images/ and sparse/0")
+    if arguments.threads < 1:
+        options.error("--threads must be at least 1")
+    return arguments
+
+
+def run_apart(command: Sequence[str], case: Case) -> Row:
+    """Run a script's ``--case`` in a process of its own and return the JSON that it prints last.
+
+    Args:
+        command: The script and its options.
+        case: Handed to it.
+
+    Raises:
+        SystemExit: if it fails; it has told why.
+    """
+    text = json.dumps(asdict(case))
+    done = subprocess.run([sys.executable, *command, "--case", text], stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode != 0:
+        raise SystemExit(f"A case of {Path(command[0]).name} failed: {text}")
+    row: Row = json.loads(done.stdout.splitlines()[-1])
+    return row
+
+
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder for the run's datasets."""
+    folder = Path(tempfile.mkdtemp(prefix="splatpipe-bench-"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+def machine(threads: int) -> Row:
+    """What the figures were measured on, with its ceilings."""
+    facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": raster.isa_name(), "isas": _native.isas()}
+    facts |= {"system": f"{platform.system()} {platform.release()}", "versions": versions()}
+    facts["load_average"] = os.getloadavg()[0]  # of the minute before: well above 0, the machine was not idle
+    return facts | measure_ceilings(threads)
+
+
+def cpu_model() -> str:
+    """The processor's name, as far as the system tells it."""
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return platform.processor() or platform.machine()
+
+
+def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str], path: Path | None) -> None:
+    """Print a table of the rows and write them all.
+
+    Args:
+        name: Of the benchmark.
+        facts: Of the machine and the run.
+        rows: The figures.
+        columns: Heading of each column, and the format of its value: ``key:format``; times with ``ms``, bytes ``MB``.
+        path: Of the JSON; None for none.
+    """
+    console = Console(width=180 if not sys.stdout.isatty() else None)
+    table = Table(title=name)
+    for heading in columns:
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(*(_cell(row, spec) for spec in columns.values()))
+    console.print(table)
+    for fact, value in facts.items():
+        if isinstance(value, str | int | float):
+            console.print(f"{fact}: {value}", highlight=False)
+    if path is not None:
+        text = json.dumps({"benchmark": name, "machine": facts, "rows": list(rows)}, indent=1, allow_nan=False)
+        path.write_text(text + "\n", encoding="utf-8")
+
+
+def _cell(row: Row, spec: str) -> str:
+    key, _, how = spec.partition(":")
+    value = row.get(key)
+    if value is None:
+        return "-"
+    if how == "ms":
+        return f"{1e3 * value:.2f}"
+    return f"{1e-6 * value:.0f}" if how == "MB" else format(value, how)

@@ -1,0 +1,161 @@
+"""How good a held-out view is after how long: ``time_to_quality.py --data DATASET --held-out NAME --json FILE``.
+
+The line's own training with its defaults for that number of iterations. Every few CPU seconds the clocks stop, and the
+held-out view is rendered and measured as `evaluate` does, in 8 bits. The clocks run from the first iteration: photos
+are reduced and the start is made before, as the stages before training do it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from measure import Row, machine, parse, parser, prepare, report, restart_peak, scratch, size_factor
+
+from splatpipe.pipeline.engine.config import parse_set, resolve
+from splatpipe.pipeline.engine.worker import peak_memory_bytes
+from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.images import load_colour, load_mask
+from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages.evaluate import measure, render_options, render_pixels
+from splatpipe.stages.line import LineConfig, TrainConfig
+from splatpipe.stages.train import loop
+from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
+from splatpipe.stages.train.state import TrainState
+from splatpipe.stages.train.stream import PhotoStream
+
+COLUMNS = {
+    "iteration": "iteration:,",
+    "Gaussians": "gaussians:,",
+    "MP": "megapixels:.2f",
+    "threads": "threads:",
+    "wall s": "wall_s:.1f",
+    "CPU s": "cpu_s:.1f",
+    "PSNR dB": "psnr:.2f",
+    "SSIM": "ssim:.3f",
+    "peak MB": "peak_bytes:MB",
+}
+
+
+@dataclass
+class Clocks:
+    """Time that training took, without what was measured in between.
+
+    Attributes:
+        wall_s: By the wall clock.
+        cpu_s: Of all threads.
+    """
+
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    _since: tuple[float, float] = field(default=(0.0, 0.0))
+
+    def start(self) -> None:
+        """Go on."""
+        self._since = time.perf_counter(), time.process_time()
+
+    def stop(self) -> None:
+        """Hold, and add what passed."""
+        self.wall_s += time.perf_counter() - self._since[0]
+        self.cpu_s += time.process_time() - self._since[1]
+
+    def cpu_now(self) -> float:
+        """CPU seconds while they run."""
+        return self.cpu_s + time.process_time() - self._since[1]
+
+
+def follow(dataset: Path, config: TrainConfig, arguments: argparse.Namespace) -> Iterator[Row]:
+    """Train, and measure the held-out views now and then and at the end.
+
+    Args:
+        dataset: As ``measure.prepare`` leaves it.
+        config: Of the training.
+        arguments: The command line.
+    """
+    before = restart_peak()
+    clocks, due, peak = Clocks(), arguments.every, 0
+    views = load_views(dataset)
+    start = read_splat(dataset / "init.ply")
+    plan = make_plan(config, views, 0, arguments.held_out, len(start))
+    names = set(plan.train_views)
+    levels = coarse_levels(plan.options)
+    with loop.same_bits(arguments.threads):
+        clocks.start()
+        state = TrainState.begin(start, plan.options)
+        trained_on = [view for view in views if view.camera.name in names]
+        with PhotoStream(trained_on, levels, plan.options.seed) as photos:
+            for photo in photos:
+                loop.train_step(state, plan, photo)
+                last = state.iteration == plan.options.iterations
+                if clocks.cpu_now() < due and not last:
+                    continue
+                clocks.stop()
+                due = clocks.cpu_s + arguments.every
+                peak = max(peak, peak_memory_bytes() - before)
+                row = {"iteration": state.iteration, "gaussians": len(state.gaussians), "threads": arguments.threads}
+                row |= {"megapixels": plan.train_megapixels, "wall_s": clocks.wall_s, "cpu_s": clocks.cpu_s}
+                yield row | held_out(state, plan, dataset) | {"peak_bytes": peak}
+                restart_peak()
+                clocks.start()
+
+
+def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
+    """Mean PSNR and SSIM of the views that were held out, as `evaluate` measures them."""
+    gaussians = state.finished()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan.json"
+        path.write_text(plan.to_json(), encoding="utf-8")
+        options = render_options(path, gaussians)
+    measured = [
+        measure(render_pixels(gaussians, view, options), load_colour(view), load_mask(view))
+        for view in load_views(dataset)
+        if view.camera.name in set(plan.test_views)
+    ]
+    values = {name: [float(found[name] or 0.0) for found in measured] for name in ("psnr", "ssim")}
+    return {name: sum(each) / len(each) for name, each in values.items()}
+
+
+def passed(rows: list[Row], marks: list[float]) -> Iterator[Row]:
+    """When each mark was first reached, dB; nothing but the mark where it never was."""
+    for mark in marks:
+        found = next((row for row in rows if row["psnr"] >= mark), None)
+        keys = ("cpu_s", "wall_s", "iteration", "gaussians")
+        yield {"mark_db": mark} | {key: None if found is None else found[key] for key in keys}
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--held-out", required=True, help="names of the photos to hold out, separated by commas")
+    size = options.add_mutually_exclusive_group()
+    size.add_argument("--megapixels", type=float, help="size that photos are reduced to")
+    size.add_argument("--scale", type=float, default=1.0, help="factor on their sides instead")
+    options.add_argument("--points", default="sparse", help="name of the point set")
+    options.add_argument("--iterations", type=int, default=7000)
+    options.add_argument("--max-gaussians", type=int, default=TrainConfig().max_gaussians)
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--every", type=float, default=5.0, help="CPU seconds between measurements")
+    options.add_argument("--marks", type=float, nargs="*", default=[], help="PSNR whose time is asked for, dB")
+    options.add_argument("--set", nargs="*", default=[], metavar="train.NAME=VALUE", help="other options of training")
+    arguments = parse(options)
+    facts = machine(arguments.threads)
+    asked = {"iterations": arguments.iterations, "seed": arguments.seed, "max_gaussians": arguments.max_gaussians}
+    config = resolve(LineConfig, [{"train": asked}, *(parse_set(each, LineConfig) for each in arguments.set)]).train
+    with scratch() as folder:
+        wanted = arguments.megapixels
+        factor = arguments.scale if wanted is None else size_factor(arguments.data, wanted)
+        dataset = prepare(arguments.data, arguments.points, factor, folder / "dataset")
+        rows = list(follow(dataset, config, arguments))
+    facts |= {"data": arguments.data.name, "held_out": arguments.held_out, "train": config.model_dump(mode="json")}
+    facts["marks"] = list(passed(rows, arguments.marks))
+    report("time_to_quality", facts, rows, COLUMNS, arguments.json)
+    for mark in facts["marks"]:
+        reached = "not reached" if mark["cpu_s"] is None else f"{mark['cpu_s']:.1f} CPU s, {mark['wall_s']:.1f} s"
+        print(f"{mark['mark_db']} dB: {reached}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""benchmarks: they run on any dataset, count what they say they count, and train what the line trains."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.raster import RenderOptions
+from splatpipe.pipeline.raster.definitions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from splatpipe.pipeline.raster.reference import project, visible_splats
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.stages import evaluate, initialize, train
+from splatpipe.stages.line import EvaluateConfig, InitializeConfig, TrainConfig
+from splatpipe.stages.train.plan import make_plan
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import measure
+import tiny_scene
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+MEGAPIXELS = 1e-6 * tiny_scene.WIDTH * tiny_scene.HEIGHT
+KEYS = {"gaussians", "megapixels", "threads", "wall_s", "cpu_s", "peak_bytes"}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_scene.write_dataset(tmp_path_factory.mktemp("scene") / "tiny")
+
+
+def run(name: str, dataset: Path, out: Path, *options: str) -> dict[str, Any]:
+    command = [sys.executable, str(BENCHMARKS / f"{name}.py"), "--data", str(dataset), "--json", str(out), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert name in done.stdout
+    found: dict[str, Any] = json.loads(out.read_text())
+    assert found["machine"]["fma_gflops_per_core"] > 0.0 and found["machine"]["copy_gb_s"] > 0.0
+    assert found["machine"]["isa"] in found["machine"]["isas"] and found["machine"]["cpu"]
+    for row in found["rows"]:
+        assert row.keys() >= KEYS
+        assert all(row[key] > 0 for key in KEYS)
+    return found
+
+
+def pairs_by_definition(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> int:
+    """One Gaussian after the other, from near to far, over whole pictures."""
+    splats = project(gaussians.to(dtype=torch.float64), camera, options)
+    order = torch.argsort(splats.depths, stable=True)
+    splats = splats.select(order[visible_splats(splats, camera)[order]])
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    left, open_ = np.ones_like(x), np.ones(x.shape, bool)
+    pairs = 0
+    for mean, (xx, xy, yy), opacity in zip(
+        splats.means.tolist(), splats.covariances.tolist(), splats.opacities.tolist(), strict=True
+    ):
+        dx, dy = x - mean[0], y - mean[1]
+        distance2 = (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
+        alpha = np.minimum(ALPHA_MAX, opacity * np.exp(-0.5 * distance2))
+        seen = open_ & (alpha >= ALPHA_MIN)
+        open_ &= ~(seen & (left * (1.0 - alpha) < TRANSMITTANCE_MIN))
+        seen &= open_
+        left[seen] *= 1.0 - alpha[seen]
+        pairs += int(seen.sum())
+    return pairs
+
+
+@pytest.mark.parametrize("opacity_logit", [-1.0, 2.0, 6.0])
+def test_contributing_pairs_are_those_of_the_definition(dataset: Path, opacity_logit: float) -> None:
+    gaussians = tiny_scene.true_model(600)
+    gaussians.opacity_logits[:] = opacity_logit  # the last: pixels end early
+    plan = make_plan(TrainConfig(), load_views(dataset), 0, "", len(gaussians))
+    for camera in tiny_scene.cameras()[::4]:
+        counted = measure.contributing_pairs(gaussians, camera, plan, 1)
+        expected = pairs_by_definition(gaussians, camera, RenderOptions(0, near=plan.near))
+        # float32 puts a few alphas on the other side of 1/255, and a few pixels end a Gaussian earlier or later.
+        assert expected > 5000 and abs(counted - expected) <= 2e-3 * expected
+
+
+def test_train_speed_times_every_point_set_in_every_size(dataset: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    for link, target in (("images", "images"), ("sparse", "sparse"), ("sparse_again", "sparse")):
+        (data / link).symlink_to(dataset / target)
+    sizes = ("--megapixels", "0.001", str(MEGAPIXELS))
+    rows = run("train_speed", data, tmp_path / "f.json", "--threads", "2", *sizes, "--repeats", "3")["rows"]
+    assert [row["points"] for row in rows] == ["sparse", "sparse", "sparse_again", "sparse_again"]
+    small, whole = rows[:2]
+    assert small["megapixels"] == pytest.approx(0.001, rel=0.05) and whole["megapixels"] == pytest.approx(MEGAPIXELS)
+    for row in rows:
+        assert row["gaussians"] == tiny_scene.GAUSSIANS and row["threads"] == 2 and row["sh_degree"] == 3
+        assert row["pairs"] == pytest.approx(1e6 * row["megapixels"] * row["pairs_per_pixel"], rel=0.05)
+        assert row["gpairs_per_s_per_core"] > 0.0 and row["wall_min_s"] <= row["wall_s"]
+        assert all(row[f"{part}_{clock}_s"] > 0.0 for part in (*measure.PARTS, "rest") for clock in ("wall", "cpu"))
+
+
+def test_scaling_keeps_the_pairs_of_a_pixel_while_gaussians_grow(dataset: Path, tmp_path: Path) -> None:
+    options = ("--threads", "1", "--gaussians", "400", "1600", "--at-gaussians", "1600", "--photos", "5", "--memory")
+    size, pairs = str(MEGAPIXELS), 12.0
+    sizes = ("--megapixels", size, "--at-megapixels", size, "--pairs", str(pairs), "--repeats", "2")
+    rows = run("scaling", dataset, tmp_path / "f.json", *options, *sizes)["rows"]
+    assert [row["series"] for row in rows] == ["gaussians", "gaussians", "megapixels", "threads", "memory", "memory"]
+    assert [row["gaussians"] for row in rows[:4]] == [400, 1600, 1600, 1600]
+    for row in rows[:4]:  # the iterations in between change opacities and sizes a little
+        assert row["pairs_per_pixel"] == pytest.approx(pairs, rel=0.35)
+    for row, asked in zip(rows[4:], (400, 1600), strict=True):
+        assert 0.9 * asked < row["gaussians"] <= asked
+    assert rows[0]["ratio_to_linear"] == 1.0
+    growth = rows[1]["wall_s"] / rows[0]["wall_s"]
+    assert math.isclose(rows[1]["ratio_to_linear"], growth / 4.0)
+
+
+def test_time_to_quality_trains_and_measures_what_the_line_does(dataset: Path, tmp_path: Path) -> None:
+    iterations, held_out = 60, "flight 1/photo_4.png"
+    options = ("--threads", "1", "--held-out", held_out, "--iterations", str(iterations), "--every", "1e9")
+    found = run("time_to_quality", dataset, tmp_path / "f.json", *options, "--marks", "1", "99")
+    (row,) = found["rows"]
+
+    parts = {"undistort.dataset": dataset, "initialize.splat": tmp_path / "init.ply"}
+    parts |= {"train.model": tmp_path / "model.ply", "train.plan": tmp_path / "plan.json"}
+    settings = {"evaluate.every": 0, "evaluate.views": held_out}
+    inputs = Inputs(parts, tmp_path, settings, Machine("cpu", 1))
+    recorder = tiny_scene.Recorder()
+    initialize.run(InitializeConfig(), inputs, tmp_path, recorder)
+    summary = train.run(TrainConfig(iterations=iterations), inputs, tmp_path, recorder)
+    quality = evaluate.run(EvaluateConfig(every=0, views=held_out), inputs, tmp_path, recorder)
+    assert (row["iteration"], row["gaussians"]) == (iterations, summary["gaussians"])
+    assert row["psnr"] == pytest.approx(quality["psnr"], abs=1e-6)
+    assert row["ssim"] == pytest.approx(quality["ssim"], abs=1e-6)
+
+    low, high = found["machine"]["marks"]
+    assert low["cpu_s"] == row["cpu_s"] and low["iteration"] == iterations
+    assert high["mark_db"] == 99.0 and high["cpu_s"] is None
