@@ -93,6 +93,8 @@ class TrainConfig(StageConfig):
     """Iterations until one degree more is trained. Auto: 1000, at most a fifth of the run."""
     ssim_weight: Fraction = 0.2
     """Share of 1 - SSIM in the loss; the rest is L1."""
+    loss: Literal["native", "kornia"] = "native"
+    """Who computes the loss and its gradient: our kernels, or kornia's SSIM under torch, some 50 times slower."""
     antialias: bool = False
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
     background: Literal["black", "white", "random"] = "black"
@@ -109,8 +111,8 @@ class TrainConfig(StageConfig):
     """Last iteration of density control. Auto: half of the run."""
     densify_every: Length = "auto"
     """Iterations between its steps. Auto: 100, at most a tenth of the run."""
-    densify_gradient: PositiveFloat = 2e-4
-    """Gaussians whose mean image-plane gradient (NDC) is above this are densified."""
+    densify_gradient: PositiveFloat = 4e-4
+    """Gaussians are densified whose pixels' image-plane gradients (NDC), as magnitudes, sum to more than this."""
     split_extent: PositiveFloat = 0.01
     """Those larger than this share of the scene's extent are split, smaller ones cloned."""
     split_shrink: Annotated[float, Field(ge=1.0, le=10.0)] = 1.6

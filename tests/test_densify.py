@@ -11,10 +11,12 @@ from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.densify import (
     DensityStatistics,
     grow,
+    half_opacity,
     is_density_step,
     is_opacity_reset,
     prune_mask,
     reset_opacity,
+    room_at,
 )
 from splatpipe.stages.train.draws import normal, permutation, uniform
 from splatpipe.stages.train.plan import resolve_schedule
@@ -32,7 +34,7 @@ def model(sizes: list[float]) -> Gaussians:
 
 def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
     gaussians = model([0.05, 0.5, 0.05, 0.5])
-    growth, counts = grow(gaussians, torch.tensor([1.0, 1.0, 0.0, 0.0]), OPTIONS, EXTENT, 7)
+    growth, counts = grow(gaussians, torch.tensor([1.0, 1.0, 0.0, 0.0]), 10, OPTIONS, EXTENT, 7)
     assert counts == {"cloned": 1, "split": 1, "held_back": 0}
     assert growth.source.tolist() == [0, 2, 3, 0, 1, 1]
     assert growth.fresh.tolist() == [False, False, False, True, True, True]
@@ -48,7 +50,7 @@ def test_children_of_a_split_are_drawn_from_their_parent() -> None:
     gaussians.log_scales[:] = torch.tensor([4.0, 1.0, 0.25]).log()
     half = math.radians(30.0) / 2.0
     gaussians.quats[:] = 3.0 * torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)])
-    growth, _ = grow(gaussians, torch.ones(4000), OPTIONS, EXTENT, 1)
+    growth, _ = grow(gaussians, torch.ones(4000), 4000, OPTIONS, EXTENT, 1)
     c, s = math.cos(2 * half), math.sin(2 * half)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     expected = turn @ np.diag([16.0, 1.0, 0.0625]) @ turn.T
@@ -57,14 +59,40 @@ def test_children_of_a_split_are_drawn_from_their_parent() -> None:
     assert growth.means.mean(dim=0).abs().max() < 0.25
 
 
-def test_cap_takes_the_largest_gradients_and_counts_the_rest() -> None:
-    options = OPTIONS.model_copy(update={"max_gaussians": 7})
-    gradient = torch.tensor([0.1, 0.5, 0.3, 0.5, 0.0])
-    growth, counts = grow(model([0.05] * 5), gradient, options, EXTENT, 1)
+def test_the_largest_scores_come_first_and_the_rest_is_counted() -> None:
+    score = torch.tensor([0.1, 0.5, 0.3, 0.5, 0.0])
+    growth, counts = grow(model([0.05] * 5), score, 2, OPTIONS, EXTENT, 1)
     assert growth.source.tolist() == [0, 1, 2, 3, 4, 1, 3]
     assert counts == {"cloned": 2, "split": 0, "held_back": 2}
-    _, counts = grow(model([0.05] * 9), torch.ones(9), options, EXTENT, 1)
+    _, counts = grow(model([0.05] * 9), torch.ones(9), -3, OPTIONS, EXTENT, 1)
     assert counts == {"cloned": 0, "split": 0, "held_back": 9}
+
+
+def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
+    gaussians = model([0.05, 0.5, 0.5])
+    gaussians.opacity_logits[:] = torch.tensor([2.0, -5.0, 1.0])
+    growth, _ = grow(gaussians, torch.tensor([1.0, 1.0, 0.0]), 9, OPTIONS, EXTENT, 1)
+    assert growth.source.tolist() == [0, 2, 0, 1, 1]
+    before, after = 1.0 - torch.sigmoid(gaussians.opacity_logits), 1.0 - torch.sigmoid(growth.opacity_logits)
+    torch.testing.assert_close(after[0] * after[2], before[0])
+    torch.testing.assert_close(after[3] * after[4], before[1])
+    assert growth.opacity_logits[1] == gaussians.opacity_logits[2]
+
+
+@pytest.mark.parametrize("logit", [-80.0, -20.0, 0.0, 9.0, 80.0])
+def test_halved_opacity_is_exact_for_any_logit(logit: float) -> None:
+    halved = float(half_opacity(torch.tensor([logit], dtype=torch.float64)))
+    alpha, through = 1.0 / (1.0 + math.exp(-logit)), math.exp(-0.5 * math.log1p(math.exp(logit)))
+    assert halved == pytest.approx(math.log(alpha) - math.log1p(through) - math.log(through), rel=1e-9)
+
+
+def test_gaussians_rise_evenly_to_the_cap() -> None:
+    options = resolve_schedule(TrainConfig(iterations=4000, max_gaussians=1000))  # steps at 500, 600, ..., 2000
+    steps = [room_at(options, 100, iteration) for iteration in range(500, 2001, 100)]
+    assert steps[0] == 160 and steps[-1] == 1000
+    assert {after - before for before, after in zip(steps, steps[1:-1], strict=False)} == {60}
+    assert room_at(options, 100, 400) == 100 and room_at(options, 5000, 1000) == 1000
+    assert room_at(options.model_copy(update={"densify": False}), 100, 1000) == 100
 
 
 def test_transparent_huge_and_broken_gaussians_are_pruned() -> None:
@@ -84,12 +112,12 @@ def test_the_last_gaussian_is_never_pruned() -> None:
     assert prune_mask(gaussians, OPTIONS, EXTENT, 50, torch.zeros(2)).tolist() == [True, False]
 
 
-def test_statistic_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
+def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
     statistics = DensityStatistics(3)
     gradient = torch.tensor([[3e-3, 4e-3], [1.0, 1.0], [math.nan, 0.0]])
     statistics.observe(gradient, torch.tensor([True, False, True]), 200, 200)
     statistics.observe(torch.zeros(3, 2), torch.tensor([True, False, True]), 200, 200)
-    torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([0.25, 0.0, 0.0]))
+    torch.testing.assert_close(statistics.score(), torch.tensor([0.25, 0.0, 0.0]))
     statistics.observe_radii(torch.tensor([1.0, 2.0, 0.0]))
     statistics.observe_radii(torch.tensor([2.0, 1.0, 0.0]))
     assert statistics.max_radius_px.tolist() == [2.0, 2.0, 0.0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -137,6 +137,53 @@ def compare(scene: Gaussians, camera: Camera, options: RenderOptions, gradient: 
 def test_agrees_with_the_reference(seed: int, antialias: bool) -> None:
     options = RenderOptions(3, background=(0.1, 0.5, 0.9), antialias=antialias, near=0.2)
     compare(random_scene(seed), random_camera(seed), options)
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_magnitudes_of_the_screen_gradient_agree_with_the_reference(antialias: bool) -> None:
+    options = RenderOptions(1, antialias=antialias, near=0.2, magnitudes=True)
+    compare(random_scene(9, 60), random_camera(9), options)
+    compare(random_scene(9, 60), random_camera(9), replace(options, depth=False))
+
+
+def test_magnitudes_do_not_cancel_and_change_no_other_gradient() -> None:
+    scene, camera, options = random_scene(10, 40), random_camera(10), RenderOptions(1, near=0.2)
+    signed, sizes = evaluate(scene, camera, options), evaluate(scene, camera, replace(options, magnitudes=True))
+    for name in scene.tensors():
+        assert torch.equal(signed.gradients[name], sizes.gradients[name])
+    ours, theirs = sizes.gradients["means2d"], signed.gradients["means2d"].abs()
+    assert (ours >= theirs * (1.0 - 1e-4)).all() and ours.sum() > 1.5 * theirs.sum()
+
+
+def test_contributing_pairs_are_those_of_the_reference() -> None:
+    scene = random_scene(11, 60, 0)
+    scene.opacity_logits += 3.0  # so that pixels end
+    camera, options = random_camera(11), RenderOptions(0, near=0.2)
+    frame = _native.Frame()
+    tensors = [torch.empty(camera.height, camera.width, 3), torch.empty(camera.height, camera.width), None, None]
+    tensors += [torch.empty(len(scene)), torch.empty(len(scene), dtype=torch.uint8)]
+    size, intrinsics = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
+    view = (np.ascontiguousarray(camera.cam_from_world, np.float64), size, intrinsics)
+    frame.forward(tuple(scene.tensors().values()), view, (0, False, options.near, options.background), tuple(tensors))
+    # Every blended pair moves its pixel's alpha; the reference's alphas are found again one Gaussian at a time.
+    assert frame.contributing_pairs() == pytest.approx(
+        blended_pairs(scene.to(dtype=torch.float64), camera, options), rel=2e-3
+    )
+
+
+def blended_pairs(scene: Gaussians, camera: Camera, options: RenderOptions) -> int:
+    """Count by the definition: each Gaussian's own alpha picture, front to back."""
+    with torch.no_grad():
+        depths = scene.means @ torch.from_numpy(camera.cam_from_world[2, :3].copy()) + camera.cam_from_world[2, 3]
+        left, alive, count = torch.ones(camera.height, camera.width, dtype=torch.float64), None, 0
+        for row in torch.argsort(depths, stable=True).tolist():
+            alpha = render(scene.select(torch.tensor([row])), camera, options, backend="reference").alpha
+            after = left * (1.0 - alpha)
+            alive = torch.ones_like(left, dtype=torch.bool) if alive is None else alive
+            alive &= after >= 1e-4
+            count += int((alive & (alpha > 0.0)).sum())
+            left = torch.where(alive, after, left)
+    return count
 
 
 @pytest.mark.parametrize("sh_degree", range(4))

@@ -220,7 +220,7 @@ def test_gradients_that_are_not_finite_skip_that_gaussian_and_are_counted(
     def poisoned(render: torch.Tensor, *rest: object) -> torch.Tensor:
         return loss(render, *rest) + 0.0 * torch.sqrt(render[0, 0, 0] - render[0, 0, 0].detach())
 
-    monkeypatch.setattr(loop, "photo_loss", poisoned)
+    monkeypatch.setitem(loop.LOSSES, "native", poisoned)
     gaussians = read_splat(trained(scene, tmp_path) / "model.ply")
     assert bool(gaussians.finite().all())
     assert json.loads((tmp_path / "history.json").read_text())["skipped_gradients"] > 0

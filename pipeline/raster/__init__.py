@@ -37,7 +37,8 @@ def render(
         camera: The view, pinhole.
         options: SH degree, background, near plane, variant.
         backend: ``native`` wants float32 on the CPU; ``auto`` takes it where it can.
-        means2d_probe: Zeros (n, 2) whose gradient becomes dL/d(centre on screen), pixels, for density control.
+        means2d_probe: Zeros (n, 2) whose gradient becomes dL/d(centre on screen), pixels, for density control; with
+            `options.magnitudes` the sum of its absolute values over the pixels.
 
     Returns:
         Colour, alpha and depth of every pixel, and which Gaussians are visible.

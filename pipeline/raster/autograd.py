@@ -63,6 +63,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.mark_non_differentiable(median_depth, visible, radii, *(() if options.depth else (depth_sum,)))
         if any(ctx.needs_input_grad):
             ctx.frame = frame
+            ctx.magnitudes = options.magnitudes
             ctx.save_for_backward(*parameters)
         return colour, alpha, depth_sum, median_depth, visible, radii
 
@@ -76,7 +77,7 @@ class _Rasterize(torch.autograd.Function):
         gradients = tuple(torch.empty_like(tensor) for tensor in parameters)
         means2d = torch.empty(len(parameters[0]), 2)
         try:
-            ctx.frame.backward(parameters, pictures, gradients, means2d)
+            ctx.frame.backward(parameters, pictures, gradients, means2d, ctx.magnitudes)
         except MemoryError as error:
             _refuse(error, len(parameters[0]))
         wanted = ctx.needs_input_grad[2:]

@@ -50,6 +50,7 @@ class RenderOptions:
             widens it ("Mip-Splatting", Yu et al. 2024, the 2D Mip filter).
         near: Gaussians nearer than this are skipped, world units along the view axis, > 0.
         depth: Render depths, too; without, both are zeros and a render takes a fifth less.
+        magnitudes: The probe's gradient sums the pixels' absolute values, x and y apart, which do not cancel.
     """
 
     sh_degree: int
@@ -57,6 +58,7 @@ class RenderOptions:
     antialias: bool = False
     near: float = 0.01
     depth: bool = True
+    magnitudes: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ Formulas: "EWA Splatting" (Zwicker et al. 2002) for the projection of a Gaussian
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -173,14 +174,22 @@ def render_reference(
         index = torch.nonzero(visible)[:, 0]
         index = index[torch.argsort(everything.depths[index], stable=True)]
     splats = project(gaussians.select(index), camera, options)  # NaNs of the others must not reach the gradient
-    means = splats.means if means2d_probe is None else splats.means + means2d_probe[index]
+    probe = torch.zeros_like(splats.means) if means2d_probe is None else means2d_probe[index]
 
     rows = max(1, _PAIRS_AT_ONCE // (max(1, len(index)) * camera.width))
-    background = torch.tensor(options.background, dtype=means.dtype, device=means.device)
+    background = torch.tensor(options.background, dtype=probe.dtype, device=probe.device)
     bands = []
     for top in range(0, camera.height, rows):
-        size = (top, min(top + rows, camera.height), camera.width)
-        values = (means, splats.depths, splats.covariances, splats.determinants, splats.opacities, splats.colours)
+        size = (top, min(top + rows, camera.height), camera.width, options.magnitudes)
+        values = (
+            splats.means,
+            probe,
+            splats.depths,
+            splats.covariances,
+            splats.determinants,
+            splats.opacities,
+            splats.colours,
+        )
         bands.append(checkpoint(_blend_rows, size, background, *values, use_reentrant=False, preserve_rng_state=False))
     colour, alpha, depth_sum, median_depth = (torch.cat(parts) for parts in zip(*bands, strict=True))
     if not options.depth:
@@ -188,10 +197,23 @@ def render_reference(
     return Render(colour, alpha, depth_sum, median_depth.detach(), visible, radii)
 
 
+class _SumOfMagnitudes(torch.autograd.Function):
+    """Spreads (n, 2) over r x w pixels; the gradient that comes back is the sum of the pixels' absolute values."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, rows: int, columns: int) -> Tensor:
+        return values[:, None, None].expand(-1, rows, columns, -1)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
+        return upstream[0].abs().sum((1, 2)), None, None
+
+
 def _blend_rows(
-    size: tuple[int, int, int],
+    size: tuple[int, int, int, bool],
     background: Float[Tensor, " 3"],
     means: Float[Tensor, "n 2"],
+    probe: Float[Tensor, "n 2"],
     depths: Float[Tensor, " n"],
     covariances: Float[Tensor, "n 3"],
     determinants: Float[Tensor, " n"],
@@ -199,11 +221,12 @@ def _blend_rows(
     colours: Float[Tensor, "n 3"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rows top..bottom of the picture: colour (r, w, 3), alpha, depth sum, median depth (r, w)."""
-    top, bottom, width = size
+    top, bottom, width, magnitudes = size
     ys = torch.arange(top, bottom, dtype=means.dtype, device=means.device) + 0.5
     xs = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
-    dx = (xs[None, :] - means[:, None, 0])[:, None, :]  # (n, 1, w)
-    dy = (ys[None, :] - means[:, None, 1])[:, :, None]  # (n, r, 1)
+    shift = _SumOfMagnitudes.apply(probe, bottom - top, width) if magnitudes else probe[:, None, None]  # (n, r, w, 2)
+    dx = (xs[None, :] - means[:, None, 0])[:, None, :] - shift[..., 0]  # (n, r, w), each 1 where it does not matter
+    dy = (ys[None, :] - means[:, None, 1])[:, :, None] - shift[..., 1]
     xy, yy = covariances[:, 1, None, None], covariances[:, 2, None, None]
     # dᵀ Σ'⁻¹ d as a sum of squares, which does not cancel in long thin Gaussians.
     distance2 = (dx - xy / yy * dy) ** 2 * (yy / determinants[:, None, None]) + dy**2 / yy  # (n, r, w)

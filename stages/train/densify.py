@@ -1,7 +1,11 @@
 """Adaptive density control: where Gaussians are cloned, split, pruned and their opacity reset.
 
 Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023,
-section 5 and its published settings; with a hard cap, where the largest gradients come first.
+section 5 and its published settings, changed in three ways. The score of a Gaussian sums the magnitudes of its pixels'
+gradients, which do not cancel in one that is too large for what it covers (Ye et al., "AbsGS", ACM MM 2024). The number
+of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
+"Taming 3DGS", SIGGRAPH Asia 2024). And two that take the place of one have the opacity that lets as much light through
+as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024, section 3.3).
 """
 
 from __future__ import annotations
@@ -30,12 +34,14 @@ class Growth:
         fresh: (m,) True where it is new, so that its optimiser state starts at zero.
         means: (m, 3) world units.
         log_scales: (m, 3).
+        opacity_logits: (m,).
     """
 
     source: Int64[Tensor, " m"]
     fresh: Bool[Tensor, " m"]
     means: Float[Tensor, "m 3"]
     log_scales: Float[Tensor, "m 3"]
+    opacity_logits: Float[Tensor, " m"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class DensityEvent:
         cloned: Gaussians copied.
         split: Gaussians replaced by two.
         pruned: Gaussians removed.
-        held_back: Gaussians that the cap kept from being densified.
+        held_back: Gaussians that the schedule kept from being densified.
         gaussians: How many there are now.
     """
 
@@ -67,7 +73,7 @@ class DensityStatistics:
     """Running sums over the photos since the last step.
 
     Attributes:
-        gradient_sum: (n,) sum of the norm of dL/d(mean2D), NDC.
+        gradient_sum: (n,) sum of the norms of the pixels' summed |dL/d(mean2D)|, NDC.
         seen: (n,) photos that saw the Gaussian.
         max_radius_px: (n,) largest radius on screen.
     """
@@ -81,7 +87,7 @@ class DensityStatistics:
         """Add an iteration's image-plane gradients.
 
         Args:
-            gradient_px: dL/d(mean2D), per pixel.
+            gradient_px: Sums of |dL/d(mean2D)| over the pixels, x and y apart.
             visible: Which Gaussians the photo saw.
             width: Of the render, pixels.
             height: Of the render, pixels.
@@ -94,7 +100,7 @@ class DensityStatistics:
         """Add an iteration's sizes on screen, pixels (0 where unseen)."""
         torch.maximum(self.max_radius_px, radii_px, out=self.max_radius_px)
 
-    def mean_gradient(self) -> Float[Tensor, " n"]:
+    def score(self) -> Float[Tensor, " n"]:
         """The statistic: averaged over the photos that saw the Gaussian."""
         return self.gradient_sum / self.seen.clamp(min=1.0)
 
@@ -103,14 +109,31 @@ class DensityStatistics:
         return {"gradient_sum": self.gradient_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
 
 
+def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
+    """The most Gaussians that density control leaves: from the first to its last step, evenly up to the cap.
+
+    Args:
+        options: Resolved.
+        initial: Gaussians at the start.
+        iteration: Now.
+    """
+    first, last, every = int(options.densify_from), int(options.densify_until), int(options.densify_every)
+    initial = min(initial, options.max_gaussians)
+    if not options.densify or iteration < first:
+        return initial
+    share = min(1.0, (iteration - first + every) / max(every, last - first))
+    return initial + int(share * (options.max_gaussians - initial))
+
+
 def grow(
-    gaussians: Gaussians, gradient: Float[Tensor, " n"], options: TrainConfig, extent: float, iteration: int
+    gaussians: Gaussians, score: Float[Tensor, " n"], room: int, options: TrainConfig, extent: float, iteration: int
 ) -> tuple[Growth, dict[str, int]]:
-    """Clone the small and split the large Gaussians whose gradient asks for it.
+    """Clone the small and split the large Gaussians whose score asks for it.
 
     Args:
         gaussians: The model.
-        gradient: Mean image-plane gradient of each, NDC.
+        score: ``DensityStatistics.score`` of each.
+        room: How many Gaussians may be added.
         options: Resolved.
         extent: Of the scene, world units.
         iteration: Names the random numbers.
@@ -119,8 +142,8 @@ def grow(
         The new rows (kept ones in their order, then clones, then two children for each split), and the counts
         ``cloned``, ``split`` and ``held_back``.
     """
-    wanted = torch.nonzero(gradient > options.densify_gradient).flatten()
-    chosen = _largest(wanted, gradient, max(0, options.max_gaussians - len(gaussians)))
+    wanted = torch.nonzero(score > options.densify_gradient).flatten()
+    chosen = _largest(wanted, score, max(0, room))
     size = gaussians.log_scales.amax(dim=1)
     large = size[chosen] > math.log(options.split_extent * extent)
     cloned, split = chosen[~large], chosen[large]
@@ -134,8 +157,20 @@ def grow(
     children = len(old) + len(cloned)
     means[children:] += _split_offsets(gaussians, split, options.seed, iteration)
     log_scales[children:] -= math.log(options.split_shrink)
+    logits = gaussians.opacity_logits.clone()
+    logits[chosen] = half_opacity(logits[chosen])
     counts = {"cloned": len(cloned), "split": len(split), "held_back": len(wanted) - len(chosen)}
-    return Growth(source, fresh, means, log_scales), counts
+    return Growth(source, fresh, means, log_scales, logits[source]), counts
+
+
+def half_opacity(logits: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+    """The logit of the opacity of which two let as much light through as one of the given: 1 - √(1 - α).
+
+    Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024, eq. 9.
+    """
+    through = torch.exp(0.5 * torch.nn.functional.logsigmoid(-logits))  # √(1 - α), exact for any logit
+    # 1 - √(1 - α) = α / (1 + √(1 - α)), which does not cancel for small α.
+    return torch.nn.functional.logsigmoid(logits) - torch.log1p(through) - torch.log(through)
 
 
 def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit: int) -> Int64[Tensor, " k"]:

@@ -13,7 +13,7 @@ from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.raster.loss import photo_loss
+from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
@@ -35,6 +35,7 @@ CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
 REPORT_EVERY = 10  # iterations
+LOSSES = {"native": photo_loss, "kornia": photo_loss_reference}
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -159,7 +160,7 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     options, iteration = plan.options, state.iteration + 1
     if photo.mask is None or bool(photo.mask.any()):
         descend(state, plan, photo, iteration)
-    state.control_density(options, plan.extent, iteration)
+    state.control_density(options, plan.extent, plan.initial_gaussians, iteration)
     state.iteration = iteration
     facts = {
         "gaussians": len(state.gaussians),
@@ -172,21 +173,24 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
 def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
+    observed = options.densify and iteration <= int(options.densify_until)
     settings = raster.RenderOptions(
         sh_degree=sh_degree_at(options, iteration),
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
         depth=False,
+        magnitudes=observed,
     )
-    probe = state.probe()
+    probe = state.probe() if observed else None
     rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
-    loss = photo_loss(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
+    measure = LOSSES[options.loss]
+    loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
     loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))
     with torch.no_grad():
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
-        if options.densify and iteration <= int(options.densify_until) and probe.grad is not None:
+        if probe is not None and probe.grad is not None:
             state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
             if options.prune_screen_px > 0.0:
                 state.statistics.observe_radii(rendered.radii)

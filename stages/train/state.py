@@ -22,6 +22,7 @@ from splatpipe.stages.train.densify import (
     is_opacity_reset,
     prune_mask,
     reset_opacity,
+    room_at,
 )
 from splatpipe.stages.train.history import History
 
@@ -100,36 +101,40 @@ class TrainState:
         """Zeros whose gradient a render makes the one by the means on the image plane."""
         return torch.zeros(len(self.gaussians), 2, requires_grad=True)
 
-    def control_density(self, options: TrainConfig, extent: float, iteration: int) -> None:
+    def control_density(self, options: TrainConfig, extent: float, initial: int, iteration: int) -> None:
         """Grow, prune and reset where this iteration is one for it.
 
         Args:
             options: Resolved.
             extent: Of the scene, world units.
+            initial: Gaussians that the training began with.
             iteration: The one that ends.
         """
         with torch.no_grad():
             if is_density_step(options, iteration):
-                self._densify(options, extent, iteration)
+                self._densify(options, extent, room_at(options, initial, iteration), iteration)
             if is_opacity_reset(options, iteration):
                 reset_opacity(self.gaussians.opacity_logits.detach(), options.reset_opacity)
                 self.adam.zero_state(names=("opacity_logits",))
                 self.history.resets.append(iteration)
 
-    def _densify(self, options: TrainConfig, extent: float, iteration: int) -> None:
-        old = self.gaussians.detach()
-        growth, counts = grow(old, self.statistics.mean_gradient(), options, extent, iteration)
-        grown = old.select(growth.source)
-        grown.means, grown.log_scales = growth.means, growth.log_scales
-        radii = torch.where(growth.fresh, 0.0, self.statistics.max_radius_px[growth.source])
-        kept = ~prune_mask(grown, options, extent, iteration, radii)
-        self.gaussians = grown.select(kept).requires_grad_()
-        self.adam.select(growth.source[kept])
-        self.adam.zero_state(rows=growth.fresh[kept])
+    def _densify(self, options: TrainConfig, extent: float, limit: int, iteration: int) -> None:
+        """Prune, then grow to at most ``limit`` Gaussians."""
+        gaussians, statistics = self.gaussians.detach(), self.statistics
+        gone = prune_mask(gaussians, options, extent, iteration, statistics.max_radius_px)
+        pruned = int(gone.sum())
+        score = torch.where(gone, 0.0, statistics.score())
+        growth, counts = grow(gaussians, score, limit - len(gaussians) + pruned, options, extent, iteration)
+        kept = ~gone[growth.source]
+        source, fresh = growth.source[kept], growth.fresh[kept]
+        grown = gaussians.select(source)
+        grown.means, grown.log_scales = growth.means[kept], growth.log_scales[kept]
+        grown.opacity_logits = growth.opacity_logits[kept]
+        self.gaussians = grown.requires_grad_()
+        self.adam.select(source)
+        self.adam.zero_state(rows=fresh)
         self.statistics = DensityStatistics(len(self.gaussians))
-        pruned = len(grown) - len(self.gaussians)
-        event = DensityEvent(iteration, pruned=pruned, gaussians=len(self.gaussians), **counts)
-        self.history.add_density(event)
+        self.history.add_density(DensityEvent(iteration, pruned=pruned, gaussians=len(self.gaussians), **counts))
 
     def finished(self) -> Gaussians:
         """The trained model: finite, with unit quaternions."""
