@@ -22,7 +22,7 @@ CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.p
 FETCHED = $(firstword $(wildcard $(CURDIR)/.venv/headers/usr/include/python3.*))
 WITH_HEADERS = $(if $(FETCHED),CXXFLAGS="-I$(FETCHED) -I$(dir $(FETCHED))" SKBUILD_CMAKE_DEFINE="Python_INCLUDE_DIR=$(FETCHED)")
 
-.PHONY: run test test-captures sanitize symbols setup develop lint types layers wheel format clean
+.PHONY: run test test-captures test-isa sanitize symbols setup develop lint types layers wheel format clean
 .DEFAULT_GOAL := run
 
 run: .venv/.installed
@@ -37,6 +37,14 @@ endif
 test: .venv/.tested
 	@echo "== tests"
 	@$(BIN)/python -m pytest -q -m "not captures and not cuda"
+
+# The tests of the kernels take each instruction set that this CPU has; all the others take the best. Here a training and
+# the whole line take the others, too.
+test-isa: .venv/.tested
+	@for isa in $$($(BIN)/python -c 'from splatpipe.pipeline.raster import isa_names; print(*isa_names()[1:])'); do \
+	  echo "== training on $$isa" && SPLATPIPE_ISA=$$isa $(BIN)/python -m pytest -q tests/test_train.py || exit 1; done
+	@echo "== the line on baseline"
+	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/test_line.py -k test_a_run_leaves_what_is_promised
 
 test-captures: .venv/.tested
 	@echo "== the line on real photos"
