@@ -1,6 +1,7 @@
 # make run                     sets up, then runs the demo capture into out/demo
 # make run PHOTOS=dir OUT=dir  the same on your photos (PRESET=preview|standard|high)
 # make test                    sets up, then passes every test
+# make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
 # A second call does not set up again.
 
@@ -12,7 +13,7 @@ TORCH ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' 2>/dev/null)
-NATIVE := $(filter %.cpp %.h %.cu,$(SOURCES))
+NATIVE := $(filter %.cpp %.h %.cu,$(SOURCES)) $(wildcard tests/native/*)
 
 # The index has torch's own wheels; what torch needs comes from PyPI with the rest.
 CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.pytorch.org/whl/cpu)
@@ -21,7 +22,7 @@ CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.p
 FETCHED = $(firstword $(wildcard $(CURDIR)/.venv/headers/usr/include/python3.*))
 WITH_HEADERS = $(if $(FETCHED),CXXFLAGS="-I$(FETCHED) -I$(dir $(FETCHED))" SKBUILD_CMAKE_DEFINE="Python_INCLUDE_DIR=$(FETCHED)")
 
-.PHONY: run test test-captures setup develop lint types layers wheel format clean
+.PHONY: run test test-captures test-isa sanitize symbols setup develop lint types layers wheel format clean
 .DEFAULT_GOAL := run
 
 run: .venv/.installed
@@ -37,9 +38,35 @@ test: .venv/.tested
 	@echo "== tests"
 	@$(BIN)/python -m pytest -q -m "not captures and not cuda"
 
+# The tests of the kernels take each instruction set that this CPU has; all the others take the best. Here a training and
+# the whole line take the others, too.
+test-isa: .venv/.tested
+	@for isa in $$($(BIN)/python -c 'from splatpipe.pipeline.raster import isa_names; print(*isa_names()[1:])'); do \
+	  echo "== training on $$isa" && SPLATPIPE_ISA=$$isa $(BIN)/python -m pytest -q tests/test_train.py || exit 1; done
+	@echo "== the line on baseline"
+	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/test_line.py -k test_a_run_leaves_what_is_promised
+
 test-captures: .venv/.tested
 	@echo "== the line on real photos"
 	@$(BIN)/python -m pytest -q -m captures --captures=../shared/data
+
+# The tests in C++ (tests/native), once per group of sanitizers that go together; any finding ends them.
+sanitize: sanitize-address sanitize-thread
+
+sanitize-address: SANITIZERS = address,undefined,float-cast-overflow
+sanitize-thread: SANITIZERS = thread
+
+# ThreadSanitizer knows few layouts of memory; setarch -R, where it is allowed, gives it one of those.
+sanitize-%: .venv/.tested
+	@echo "== native tests under $(SANITIZERS)"
+	@$(BIN)/cmake -S pipeline/raster/native -B build/sanitize/$* -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
+	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPLATPIPE_SANITIZE=$(SANITIZERS) > /dev/null
+	@$(BIN)/ninja -j2 --quiet -C build/sanitize/$*
+	@if setarch -R true 2>/dev/null; then setarch -R build/sanitize/$*/native_tests; else build/sanitize/$*/native_tests; fi
+
+# No weak symbols in what is compiled per instruction set.
+symbols: .venv/.tested
+	@$(BIN)/python -m pytest -q tests/test_native_symbols.py
 
 setup: .venv/.installed
 

@@ -95,6 +95,8 @@ def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", 
         raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
     if device == "cuda":
         raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
+    if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
+        import splatpipe.pipeline.raster  # noqa: F401
     return Request(LINE, config, photos, out, Machine(device, threads or available_cores()))
 
 

@@ -16,7 +16,7 @@ def examine() -> dict[str, JSON]:
     """Versions, cores, memory, disk, the rasterizer's instruction set and the graphics card."""
     import torch
 
-    from splatpipe.pipeline.raster import isa_name
+    from splatpipe.pipeline.raster import isa_name, isa_names
 
     return {
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -24,7 +24,7 @@ def examine() -> dict[str, JSON]:
         "memory": _memory(),
         "free disk here": f"{shutil.disk_usage(Path.cwd()).free / 1e9:.0f} GB",
         **versions(),
-        "rasterizer": f"native, {isa_name()}",
+        "rasterizer": f"native, {isa_name()} (of {', '.join(isa_names())})",
         "graphics card": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none that CUDA sees",
         "open3d": _version("open3d-cpu") or _version("open3d") or "not installed (an extra; the line does not need it)",
     }

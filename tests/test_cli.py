@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.raster.isa import choose_isa, isa_names
+
 
 def splatpipe(*arguments: object, **how: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments)]
@@ -79,10 +82,33 @@ def test_json_is_one_object_on_stdout_also_when_it_fails(tmp_path: Path, photos:
     assert told["error"]["hint"]
 
 
-def test_doctor_names_the_instruction_set() -> None:
-    done = splatpipe("doctor", "--json")
+def test_doctor_names_the_instruction_set_in_use_and_those_there_are() -> None:
+    done = splatpipe("doctor", "--json", env={**os.environ, "SPLATPIPE_ISA": ""})
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["rasterizer"].startswith("native, ")
+    assert json.loads(done.stdout)["rasterizer"] == f"native, {isa_names()[0]} (of {', '.join(isa_names())})"
+    done = splatpipe("doctor", "--json", env={**os.environ, "SPLATPIPE_ISA": "baseline"})
+    assert json.loads(done.stdout)["rasterizer"].startswith("native, baseline ")
+
+
+@pytest.mark.parametrize("arguments", [("doctor",), ("run", "{photos}", "{out}")])
+def test_an_unknown_instruction_set_is_told_before_anything_runs(
+    tmp_path: Path, photos: Path, arguments: tuple[str, ...]
+) -> None:
+    arguments = tuple(text.format(photos=photos, out=tmp_path / "out") for text in arguments)
+    done = splatpipe(*arguments, env={**os.environ, "SPLATPIPE_ISA": "sse9"})
+    assert done.returncode == 2, done.stderr
+    assert 'SPLATPIPE_ISA asks for "sse9"' in " ".join(done.stderr.replace("│", " ").split())
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_instruction_set_that_the_machine_lacks_is_the_machines_fault() -> None:
+    assert choose_isa("", ["avx2", "baseline"]) == choose_isa("auto", ["avx2", "baseline"]) == "avx2"
+    assert choose_isa("baseline", ["avx2", "baseline"]) == "baseline"
+    with pytest.raises(MachineError, match="avx512, which this CPU does not have") as caught:
+        choose_isa("avx512", ["avx2", "baseline"])
+    assert caught.value.exit_code == 4
+    assert "avx2, baseline" in caught.value.hint
 
 
 def test_options_lists_every_option() -> None:

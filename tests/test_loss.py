@@ -72,9 +72,10 @@ def assert_as_reference(kind: str, size: tuple[int, int], weight: float = 0.2, m
 
 @pytest.fixture(params=_native.isas())
 def isa(request):
+    before = _native.isa()
     _native.set_isa(request.param)
     yield request.param
-    _native.set_isa("auto")
+    _native.set_isa(before)
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -17,9 +17,10 @@ RATES = {"means": 1.6e-4, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5
 
 @pytest.fixture(params=_native.isas())
 def isa(request):
+    before = _native.isa()
     _native.set_isa(request.param)
     yield request.param
-    _native.set_isa("auto")
+    _native.set_isa(before)
 
 
 def parameters(n: int, coefficients: int = 16) -> dict[str, torch.Tensor]:

@@ -28,9 +28,10 @@ FLIP = 1e-3  # how much larger than a rounding such a pixel's difference is
 
 @pytest.fixture(params=_native.isas(), autouse=True)
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = _native.isa()
     _native.set_isa(request.param)
     yield request.param
-    _native.set_isa("auto")
+    _native.set_isa(before)
     set_threads(2)
 
 

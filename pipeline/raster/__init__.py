@@ -10,11 +10,12 @@ from torch import Tensor
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.autograd import render_native
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions, check
+from splatpipe.pipeline.raster.isa import isa_name, isa_names, use_isa_of_environment
 from splatpipe.pipeline.raster.reference import render_reference
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians
 
-__all__ = ["Render", "RenderOptions", "isa_name", "render", "set_threads"]
+__all__ = ["Render", "RenderOptions", "isa_name", "isa_names", "render", "set_threads"]
 
 Backend = Literal["auto", "reference", "native"]
 
@@ -64,6 +65,4 @@ def set_threads(threads: int) -> None:
     _native.set_threads(threads)
 
 
-def isa_name() -> str:
-    """The instruction set that the native kernels run on: the best of this CPU, or what SPLATPIPE_ISA asked for."""
-    return _native.isa()
+use_isa_of_environment()

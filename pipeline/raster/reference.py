@@ -201,11 +201,11 @@ class _SumOfMagnitudes(torch.autograd.Function):
     """Spreads (n, 2) over r x w pixels; the gradient that comes back is the sum of the pixels' absolute values."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, rows: int, columns: int) -> Tensor:
+    def forward(_ctx: Any, values: Tensor, rows: int, columns: int) -> Tensor:
         return values[:, None, None].expand(-1, rows, columns, -1)
 
     @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
+    def backward(_ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
         return upstream[0].abs().sum((1, 2)), None, None
 
 

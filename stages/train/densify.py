@@ -121,7 +121,7 @@ def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
     initial = min(initial, options.max_gaussians)
     if not options.densify or iteration < first:
         return initial
-    share = min(1.0, (iteration - first + every) / max(every, last - first))
+    share = min(1.0, (iteration - first + every) / (last - first + every))
     return initial + int(share * (options.max_gaussians - initial))
 
 

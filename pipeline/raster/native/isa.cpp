@@ -1,7 +1,6 @@
 #include "isa.h"
 
 #include <atomic>
-#include <cstdlib>
 #include <cstring>
 
 namespace splat {
@@ -46,11 +45,6 @@ bool set_isa(const char* name) {
             return true;
         }
     return false;
-}
-
-bool set_isa_from_environment() {
-    const char* wanted = std::getenv("SPLATPIPE_ISA");
-    return set_isa(wanted && *wanted ? wanted : "auto");
 }
 
 }  // namespace splat

@@ -18,16 +18,13 @@ namespace splat {
 
 enum class Isa { baseline = 0, avx2 = 1, avx512 = 2 };
 
-// The ISA in use: the best this CPU has, or the one that SPLATPIPE_ISA or set_isa asked for.
+// The ISA in use, of set_isa; baseline before that.
 Isa active_isa();
 
 // Choose by name: "baseline", "avx2", "avx512", or "auto". False if this CPU or this build lacks it.
 bool set_isa(const char* name);
 const char* isa_name(Isa isa);
 bool isa_available(Isa isa);
-
-// Reads SPLATPIPE_ISA; false if what it asks for cannot be had.
-bool set_isa_from_environment();
 
 }  // namespace splat
 

@@ -10,6 +10,10 @@
 
 #include "raster.h"
 
+#if defined(__SANITIZE_ADDRESS__)
+#include <sanitizer/asan_interface.h>
+#endif
+
 namespace splat {
 
 // More pixel-tile pairs than 32-bit indices hold.
@@ -28,20 +32,27 @@ class Buffer {
 
     // At least `count` elements; what was in it is lost where it grows. Throws std::bad_alloc.
     T* reserve(int64_t count) {
-        if (count <= capacity_) return data_;
-        std::free(data_);
-        data_ = nullptr, capacity_ = 0;
-        const int64_t wanted = count + count / 4;  // densification grows a scene step by step
-        const std::size_t lines = (static_cast<std::size_t>(wanted) * sizeof(T) + kLine - 1) / kLine;
-        data_ = static_cast<T*>(std::aligned_alloc(kLine, lines * kLine));
-        if (!data_) throw std::bad_alloc();
-        capacity_ = wanted;
+        if (count > capacity_) grow(count);
+#if defined(__SANITIZE_ADDRESS__)  // sees a step beyond what was asked for, too
+        ASAN_UNPOISON_MEMORY_REGION(data_, static_cast<std::size_t>(count) * sizeof(T));
+        ASAN_POISON_MEMORY_REGION(data_ + count, static_cast<std::size_t>(capacity_ - count) * sizeof(T));
+#endif
         return data_;
     }
     T* data() const { return data_; }
 
   private:
     static constexpr std::size_t kLine = 64;  // of the cache
+
+    void grow(int64_t count) {
+        std::free(data_);
+        data_ = nullptr, capacity_ = 0;
+        const int64_t wanted = count + count / 4;  // densification grows a scene step by step
+        const std::size_t lines = (static_cast<std::size_t>(wanted) * sizeof(T) + kLine - 1) / kLine;
+        data_ = static_cast<T*>(std::aligned_alloc(kLine, lines * kLine));
+        if (!data_) throw std::bad_alloc();
+        capacity_ = static_cast<int64_t>(lines * kLine / sizeof(T));
+    }
 
     T* data_ = nullptr;
     int64_t capacity_ = 0;

@@ -1,0 +1,54 @@
+"""Which instruction set the native kernels run on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.raster import _native
+
+VARIABLE = "SPLATPIPE_ISA"
+INSTRUCTION_SETS = ("avx512", "avx2", "baseline")
+"""All that kernels are compiled for on some machine, best first."""
+
+
+def choose_isa(wanted: str, available: Sequence[str]) -> str:
+    """What SPLATPIPE_ISA asks for.
+
+    Args:
+        wanted: An instruction set; ``auto`` or nothing for the best.
+        available: Those that this machine has, best first.
+
+    Raises:
+        UsageError: if there is no such instruction set.
+        MachineError: if this machine lacks it.
+    """
+    if wanted in ("", "auto"):
+        return available[0]
+    if wanted not in INSTRUCTION_SETS:
+        raise UsageError(
+            f'{VARIABLE} asks for "{wanted}", which is no instruction set of ours.',
+            hint=f"Choose auto, {', '.join(INSTRUCTION_SETS[:-1])} or {INSTRUCTION_SETS[-1]}.",
+        )
+    if wanted not in available:
+        raise MachineError(
+            f"{VARIABLE} asks for {wanted}, which this CPU does not have.",
+            hint=f"Leave it unset for the best, or choose of {', '.join(available)}.",
+        )
+    return wanted
+
+
+def use_isa_of_environment() -> None:
+    """Run the native kernels on what SPLATPIPE_ISA asks for; as of ``choose_isa``."""
+    _native.set_isa(choose_isa(os.environ.get(VARIABLE, ""), _native.isas()))
+
+
+def isa_name() -> str:
+    """The instruction set in use: the best of this CPU, or what SPLATPIPE_ISA asked for."""
+    return _native.isa()
+
+
+def isa_names() -> list[str]:
+    """Instruction sets that this CPU has, best first."""
+    return _native.isas()
