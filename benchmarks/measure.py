@@ -71,6 +71,7 @@ class Case:
         warmup: Iterations before them; at least an epoch, so that every photo is decoded.
         sh_degree: Of the Gaussians' colours, all of it from the first iteration that counts.
         seed: Of the order of photos.
+        statistics: Collect what density control ranks by, as the first half of a training does.
     """
 
     dataset: str
@@ -80,6 +81,7 @@ class Case:
     warmup: int = 5
     sh_degree: int = 3
     seed: int = 0
+    statistics: bool = True
 
 
 @dataclass
@@ -139,7 +141,12 @@ def time_case(case: Case) -> Row:
     """
     before = restart_peak()
     config = TrainConfig(
-        iterations=PUBLISHED_ITERATIONS, sh_degree=case.sh_degree, sh_every=1, seed=case.seed, max_gaussians=10**9
+        iterations=PUBLISHED_ITERATIONS,
+        sh_degree=case.sh_degree,
+        sh_every=1,
+        seed=case.seed,
+        max_gaussians=10**9,
+        densify=case.statistics,
     )
     views = load_views(Path(case.dataset))
     start = read_splat(Path(case.splat))
@@ -149,7 +156,7 @@ def time_case(case: Case) -> Row:
     if steps >= int(plan.options.densify_from):
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
-    with loop.same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed) as photos:
+    with loop.same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
         state = TrainState.begin(start, plan.options)
         for photo in islice(photos, warmup):
             loop.train_step(state, plan, photo)

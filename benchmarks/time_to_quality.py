@@ -87,7 +87,7 @@ def follow(dataset: Path, config: TrainConfig, arguments: argparse.Namespace) ->
         clocks.start()
         state = TrainState.begin(start, plan.options)
         trained_on = [view for view in views if view.camera.name in names]
-        with PhotoStream(trained_on, levels, plan.options.seed) as photos:
+        with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
                 loop.train_step(state, plan, photo)
                 last = state.iteration == plan.options.iterations

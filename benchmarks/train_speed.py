@@ -48,6 +48,7 @@ def main() -> None:
     options.add_argument("--megapixels", type=float, nargs="+", default=[0.1, 0.4, 1.6])
     options.add_argument("--points", nargs="+", help="names of the point sets; all without any")
     options.add_argument("--sh-degree", type=int, default=3, choices=range(4))
+    options.add_argument("--no-statistics", action="store_true", help="as in the half without density control")
     options.add_argument("--repeats", type=int, default=30, help="iterations that count")
     options.add_argument("--warmup", type=int, default=5, help="iterations before them, at least an epoch")
     arguments = parse(options)
@@ -68,6 +69,7 @@ def main() -> None:
                     arguments.repeats,
                     arguments.warmup,
                     arguments.sh_degree,
+                    statistics=not arguments.no_statistics,
                 )
                 row = {"points": points} | run_apart([__file__], case)
                 # Multiplications and additions that the core could have done in the time of a pair.

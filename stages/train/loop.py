@@ -35,7 +35,6 @@ CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
 REPORT_EVERY = 10  # iterations
-LOSSES = {"native": photo_loss, "kornia": photo_loss_reference}
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -184,7 +183,7 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     )
     probe = state.probe() if observed else None
     rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
-    measure = LOSSES[options.loss]
+    measure = photo_loss if options.loss == "native" else photo_loss_reference
     loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
     loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))

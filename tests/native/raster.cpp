@@ -63,7 +63,7 @@ void opaque_layers_and_huge_splats() {
 
 // Several tasks of the projection and chunks of the binning; many at the same depth.
 void many_gaussians() {
-    Scene scene = random_scene(9, 14'000, 1, -4.5f);
+    Scene scene = random_scene(9, 20'000, 1, -4.5f);
     for (std::size_t i = 2; i < scene.means.size(); i += 3) scene.means[i] = std::round(scene.means[i] * 4.0f) / 4.0f;
     check_threads(scene, view_of(120, 90, 1, {0}), true, "many");
 }

@@ -403,11 +403,11 @@ SPLAT_INLINE void blend_blocks_backward(const TileSplat& splat, const Splat& s, 
     }
     for (int k = 0; k < kCount; ++k) {
         const int at = block[k] * kLanes;
-        const Floats behind = load(canvas->behind + at);
-        const Floats dalpha = fnma(behind, inv_rest[k], before[k] * value[k]);
+        const Floats behind = load(canvas->behind + at), light = weight[k] * value[k];
         store(canvas->transmittance + at, before[k]);
-        store(canvas->behind + at, fma(weight[k], value[k], behind));
-        const Floats g = only(free[k], alpha[k] * dalpha);  // no gradient where clamped
+        store(canvas->behind + at, behind + light);
+        const Floats share = alpha[k] * inv_rest[k];  // dL/d(ln alpha) = light - behind alpha / (1 - alpha)
+        const Floats g = only(free[k], fnma(share, behind, light));  // no gradient where clamped
         const Floats u = splat.u_of(block[k]), v = splat.v_of(block[k]), gu = g * u, gv = g * v;
         m->s = m->s + g, m->su = m->su + gu, m->sv = m->sv + gv;
         m->suu = fma(gu, u, m->suu), m->suv = fma(gu, v, m->suv), m->svv = fma(gv, v, m->svv);
@@ -418,10 +418,14 @@ SPLAT_INLINE void blend_blocks_backward(const TileSplat& splat, const Splat& s, 
     }
 }
 
+template <bool kDepth, bool kMagnitudes>
 SPLAT_INLINE void put_slot(const Moments& m, float* slot) {
     sum_lanes(m.s, m.su, m.sv, m.suu, slot);
     sum_lanes(m.suv, m.svv, m.red, m.green, slot + 4);
-    sum_lanes(m.blue, m.depth, m.size_x, m.size_y, slot + 8);
+    if (kDepth || kMagnitudes)
+        sum_lanes(m.blue, m.depth, m.size_x, m.size_y, slot + 8);
+    else
+        slot[8] = sum_lanes(m.blue), slot[9] = slot[10] = slot[11] = 0.0f;
 }
 
 template <bool kDepth, bool kMagnitudes>
@@ -445,7 +449,7 @@ SPLAT_INLINE void walk_back(const FrameData& frame, const TilePlace& at, int32_t
         while (blocks & (blocks - 1))
             blend_blocks_backward<kDepth, kMagnitudes, 2>(splat, s, &blocks, pair, canvas, &m);
         if (blocks) blend_blocks_backward<kDepth, kMagnitudes, 1>(splat, s, &blocks, pair, canvas, &m);
-        put_slot(m, frame.slots + int64_t{slots[pair]} * kSlotFloats);
+        put_slot<kDepth, kMagnitudes>(m, frame.slots + int64_t{slots[pair]} * kSlotFloats);
     }
 }
 

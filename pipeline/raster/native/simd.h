@@ -127,6 +127,11 @@ SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) 
     const __m256 half = _mm512_castps512_ps256(abcd) + _mm512_extractf32x8_ps(abcd, 1);
     _mm_storeu_ps(out, _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1));
 }
+SPLAT_INLINE float sum_lanes(Floats a) {
+    const __m256 half = _mm512_castps512_ps256(a) + _mm512_extractf32x8_ps(a, 1);
+    const __m128 quarter = _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1);
+    return (quarter[0] + quarter[2]) + (quarter[1] + quarter[3]);
+}
 
 #elif SPLAT_ISA_AVX2
 
@@ -190,6 +195,10 @@ SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) 
     const Floats abcd = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
     _mm_storeu_ps(out, _mm256_castps256_ps128(abcd) + _mm256_extractf128_ps(abcd, 1));
 }
+SPLAT_INLINE float sum_lanes(Floats a) {
+    const __m128 half = _mm256_castps256_ps128(a) + _mm256_extractf128_ps(a, 1);
+    return (half[0] + half[2]) + (half[1] + half[3]);
+}
 
 #else
 
@@ -238,6 +247,7 @@ SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) 
     out[2] = (c[0] + c[2]) + (c[1] + c[3]);
     out[3] = (d[0] + d[2]) + (d[1] + d[3]);
 }
+SPLAT_INLINE float sum_lanes(Floats a) { return (a[0] + a[2]) + (a[1] + a[3]); }
 // Whole numbers in ±2^22, where these are wanted; larger ones come back as they are.
 SPLAT_INLINE Floats nearest(Floats a) {
     const Floats magic = fill(12582912.0f);  // 1.5 · 2^23
