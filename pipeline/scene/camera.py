@@ -12,6 +12,7 @@ Frames, stated once:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,3 +78,20 @@ class Camera:
         in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
         in_image = in_camera[:, :2] / in_camera[:, 2:]
         return np.asarray(in_image * [self.fx, self.fy] + [self.cx, self.cy])
+
+
+def reduced_size(width: int, height: int, max_megapixels: float) -> tuple[int, int]:
+    """The largest size of a picture's shape within a limit; its own where that is within already.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        max_megapixels: Of the result, in 10⁶ pixels.
+
+    Returns:
+        Width and height, each rounded down so that the result is within the limit, and at least 1.
+    """
+    scale = min(1.0, math.sqrt(max_megapixels * 1e6 / (width * height)))
+    if scale == 1.0:
+        return width, height
+    return max(1, int(width * scale)), max(1, int(height * scale))

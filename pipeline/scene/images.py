@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.scene.camera import Camera, reduced_size
 from splatpipe.pipeline.scene.dataset import View
 
 Pixels = npt.NDArray[np.uint8]
@@ -28,7 +29,10 @@ def read_image(path: Path, flags: int) -> Pixels:
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
-        raise StageError(f"{path.name} of the dataset cannot be read: {error.strerror}.") from error
+        raise StageError(
+            f"{path.name} of the dataset cannot be read: {error.strerror}.",
+            hint="Run again with --rerun-from undistort.",
+        ) from error
     pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if pixels is None:
         raise StageError(
@@ -56,6 +60,48 @@ def load_mask(view: View) -> Mask | None:
     pixels = read_image(view.mask_path, cv2.IMREAD_GRAYSCALE)
     _check_size(view, pixels, view.mask_path)
     return np.asarray(pixels > 0)
+
+
+def reduced_camera(camera: Camera, max_megapixels: float | None, level: int = 0) -> Camera:
+    """The camera of ``reduced_view``, without reading the photo.
+
+    Args:
+        camera: In the dataset's grid.
+        max_megapixels: Limit of the size, rounded as `undistort` does; None for the dataset's own size.
+        level: How often that size is halved, rounded down, at least 1 pixel a side.
+    """
+    width, height = camera.width, camera.height
+    if max_megapixels is not None:
+        width, height = reduced_size(width, height, max_megapixels)
+    size = (max(1, width >> level), max(1, height >> level))
+    return camera if size == (camera.width, camera.height) else camera.scaled(*size)
+
+
+def reduced_view(view: View, max_megapixels: float | None, level: int = 0) -> tuple[Camera, Pixels, Mask | None]:
+    """A view at the size that training and evaluation ask for, by one area filter from the dataset's photo.
+
+    Args:
+        view: Of the dataset.
+        max_megapixels: As for ``reduced_camera``.
+        level: As for ``reduced_camera``.
+
+    Returns:
+        Its camera, its photo (h, w, 3), and its mask (h, w) or None; a pixel counts where all below it do.
+
+    Raises:
+        StageError: if the photo or its mask cannot be read or is not of its camera's size.
+    """
+    colour, mask = load_colour(view), load_mask(view)
+    camera = reduced_camera(view.camera, max_megapixels, level)
+    if camera is view.camera:
+        return camera, colour, mask
+    size = (camera.width, camera.height)
+    colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if mask is not None:
+        # Not "all of it counts": OpenCV's weights add up to as little as 0.999, but those of nothing are exactly zero.
+        ignored = cv2.resize((~mask).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        mask = np.asarray(ignored == 0.0)
+    return camera, colour, mask
 
 
 def _check_size(view: View, pixels: Pixels, path: Path) -> None:

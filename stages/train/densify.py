@@ -189,6 +189,22 @@ def prune_mask(
     return gone
 
 
+def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
+    """Most Gaussians after an iteration: linear from ``initial`` at ``densify_from`` to the cap at ``densify_until``.
+
+    Args:
+        options: Resolved.
+        initial: Gaussians at the start.
+        iteration: From 1.
+    """
+    first, last = int(options.densify_from), int(options.densify_until)
+    initial = min(initial, options.max_gaussians)
+    if not options.densify or iteration < first:
+        return initial
+    share = min(1.0, (iteration - first) / max(1, last - first))
+    return initial + int(share * (options.max_gaussians - initial))
+
+
 def is_density_step(options: TrainConfig, iteration: int) -> bool:
     """Whether density control acts after this iteration."""
     within = int(options.densify_from) <= iteration <= int(options.densify_until)

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View
-from splatpipe.pipeline.scene.images import Mask, Pixels, load_colour, load_mask
+from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_view
 from splatpipe.stages.train.draws import permutation
 
 CACHE_BYTES = 512 << 20  # some 400 photos of 0.4 MP; more are decoded again, a few milliseconds each
@@ -37,19 +36,6 @@ class TrainingPhoto:
     mask: Bool[Tensor, "h w"] | None
 
 
-def reduced(view: View, level: int) -> tuple[Camera, Pixels, Mask | None]:
-    """A view halved ``level`` times: camera, photo and mask (a pixel counts where all below it do)."""
-    colour, mask, camera = load_colour(view), load_mask(view), view.camera
-    if level == 0:
-        return camera, colour, mask
-    size = (max(1, camera.width >> level), max(1, camera.height >> level))
-    colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if mask is not None:
-        share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        mask = np.asarray(share > 1.0 - 1e-6)
-    return camera.scaled(*size), colour, mask
-
-
 class PhotoStream:
     """Iterates over the photos of training, from one iteration to the last.
 
@@ -59,6 +45,7 @@ class PhotoStream:
         seed: Of the order; each epoch has its own.
         first: The first iteration, from 1.
         cache_bytes: Decoded photos kept.
+        max_megapixels: Photos are reduced to at most so many; None for the dataset's size.
     """
 
     def __init__(
@@ -68,7 +55,9 @@ class PhotoStream:
         seed: int,
         first: int = 1,
         cache_bytes: int = CACHE_BYTES,
+        max_megapixels: float | None = None,
     ) -> None:
+        self._max_megapixels = max_megapixels
         self._views = views
         self._levels = levels
         self._seed = seed
@@ -112,7 +101,7 @@ class PhotoStream:
         key = (self.view_index(iteration), self._levels[iteration - 1])
         entry = self._cache.get(key)
         if entry is None:
-            entry = reduced(self._views[key[0]], key[1])
+            entry = reduced_view(self._views[key[0]], self._max_megapixels, key[1])
             self._keep(key, entry)
         else:
             self._cache.move_to_end(key)
