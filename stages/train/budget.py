@@ -48,7 +48,7 @@ class Timing:
     """
 
     gaussians: int
-    pixels: float
+    pixels: int
     seconds: float
 
 
@@ -68,7 +68,7 @@ class Speed:
     pixel_s: float
     pair_s: float
 
-    def seconds(self, gaussians: float, pixels: float) -> float:
+    def seconds(self, gaussians: int, pixels: int | float) -> float:
         """Of an iteration."""
         return self.base_s + self.gaussian_s * gaussians + self.pixel_s * pixels + self.pair_s * gaussians * pixels
 
@@ -96,7 +96,7 @@ def fit_speed(timings: Sequence[Timing]) -> Speed:
     return Speed(*costs.tolist())
 
 
-def _terms(gaussians: float, pixels: float) -> npt.NDArray[np.float64]:
+def _terms(gaussians: int, pixels: int) -> npt.NDArray[np.float64]:
     return np.array([1.0, gaussians, pixels, gaussians * pixels])
 
 

@@ -25,7 +25,10 @@ from splatpipe.stages.train.stream import TrainingPhoto
 MOST_VIEWS = 8  # a size is timed on: their mean is within a few percent of all photos'
 PICTURES = 3  # that evaluate keeps of a view: photo, render, error
 NEVER = 1_000_000_000  # iterations until a step of density control
+WARM_UP_ITERATIONS = 100  # until opacities, which step by a twentieth of a logit, are spread as in training
+WARM_UP_SHARE = 0.5  # of the time for measuring at most
 PILOT_ITERATION = 10  # the state claims to be so far, so that all SH degrees take part
+SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a surface shared out (0.5)
 STREAM = 7  # of the jitter's random numbers; the pilot is thrown away, so nothing depends on them
 
 Step = Callable[[TrainState, Plan, TrainingPhoto], None]
@@ -63,9 +66,9 @@ def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, mos
     small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
     states = [_pilot_state(stretched(start, count, plan.options.seed), trial) for count in counts]
+    _warm_up(states, trial, small, step, began + WARM_UP_SHARE * most_seconds)
+    _evaluation_seconds(states[0].finished(), small[0], plan)  # pays for what is loaded once
     evaluate_s = _evaluation_seconds(states[0].finished(), full[0], plan)
-    for state in states:
-        step(state, trial, small[0])  # the first one pays for memory that the others find
     timings = []
     for photos in zip(small, full, strict=True):
         for state in states:
@@ -95,7 +98,7 @@ def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
         generator = torch.Generator().manual_seed(seed + STREAM)
         sizes = torch.exp(model.log_scales)
         model.means = model.means + sizes * torch.randn(count, 3, generator=generator)
-        model.log_scales = model.log_scales - 0.5 * math.log(count / len(start))
+        model.log_scales = model.log_scales - SPLIT_SHRINK * math.log(count / len(start))
     return model
 
 
@@ -103,6 +106,17 @@ def _pilot_state(start: Gaussians, trial: Plan) -> TrainState:
     state = TrainState.begin(start, trial.options)
     state.iteration = PILOT_ITERATION
     return state
+
+
+def _warm_up(
+    states: Sequence[TrainState], trial: Plan, photos: Sequence[TrainingPhoto], step: Step, until: float
+) -> None:
+    """Train each state a little: opacities and sizes that have left their start cost more than those there."""
+    for number in range(WARM_UP_ITERATIONS):
+        for state in states:
+            step(state, trial, photos[number % len(photos)])
+        if time.monotonic() > until:
+            break
 
 
 def _photos(views: Sequence[View], megapixels: float | None) -> tuple[list[TrainingPhoto], float]:

@@ -10,10 +10,10 @@ from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.line import TrainConfig
-from splatpipe.stages.train.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, Task, choose
+from splatpipe.stages.train.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, FIRST_ITERATIONS, Task, choose
 from splatpipe.stages.train.measure import Measured, Step, measure
 from splatpipe.stages.train.memory import within_memory
-from splatpipe.stages.train.plan import Plan, mean_megapixels
+from splatpipe.stages.train.plan import Plan, mean_megapixels, resolve_schedule
 
 MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
 MEASURE_SECONDS = 6.0  # and no more than this: by then the noise of a shared machine is averaged out
@@ -67,7 +67,9 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
     if 0.0 < scene.machine.began_s < began:
         began = scene.machine.began_s
     before = time.monotonic() - began
-    measured = measure(pilot(plan), scene.start, scene.trained_on, step, min(MEASURE_SECONDS, MEASURE_SHARE * budget))
+    measured = measure(
+        pilot(plan, scene.config), scene.start, scene.trained_on, step, min(MEASURE_SECONDS, MEASURE_SHARE * budget)
+    )
     left = budget - (time.monotonic() - began)
     choice = choose(_task(plan, scene, measured, left))
     if choice.seconds <= LEAST_SHARE * budget:
@@ -86,11 +88,16 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
     )
 
 
-def pilot(plan: Plan) -> Plan:
-    """The plan with the cap near which the budget's may lie, to be measured at."""
-    options = plan.options
-    wanted = max(FIRST_GROWTH * plan.initial_gaussians, PILOT_GROWTH_A_SECOND * options.time_budget_s, FEWEST_GAUSSIANS)
-    return replace(plan, options=options.model_copy(update={"max_gaussians": min(options.max_gaussians, int(wanted))}))
+def pilot(plan: Plan, config: TrainConfig) -> Plan:
+    """The plan of a short training with a cap near which the budget's may lie, to be measured at.
+
+    Args:
+        plan: Without a budget.
+        config: The options, not resolved.
+    """
+    wanted = max(FIRST_GROWTH * plan.initial_gaussians, PILOT_GROWTH_A_SECOND * config.time_budget_s, FEWEST_GAUSSIANS)
+    short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
+    return replace(plan, options=resolve_schedule(config.model_copy(update=short)))
 
 
 def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
