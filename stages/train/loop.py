@@ -150,6 +150,11 @@ def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Pat
         for photo in photos:
             train_step(state, plan, photo)
             state.seconds = clock.seconds()
+            if state.history.growth_ended == state.iteration:
+                report.warning(
+                    f"The memory limit is close, so no Gaussian is added after iteration {state.iteration:,}.",
+                    hint="Give more with --max-memory, or smaller photos with undistort.max_megapixels.",
+                )
             if interrupt.requested:
                 break
             if clock.is_up(plan) and state.iteration < plan.options.iterations:
