@@ -27,12 +27,13 @@ LONGEST = 30_000  # iterations, as published: beyond them little is learnt
 FEWEST = 300  # iterations, however short the time: fewer do not leave the initial blur
 VISITS = 10  # iterations a photo at least: one seen less often leaves floaters before its camera
 
-FIRST_GROWTH = 2.0  # times the initial Gaussians that every plan has room for, before it takes larger photos
+FIRST_GROWTH = 1.5  # times the initial Gaussians that every plan has room for, before it takes larger photos
 FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer; the plan thins the initial ones down to it at most
 COARSEST_MEGAPIXELS = 0.05  # photos are halved at the start of a training no further than to this
 LOW_GRADIENT = 2e-5  # NDC; low enough that Gaussians follow ``room_at`` and so the forecast
 
 EXPORT_GAUSSIAN_S = 8e-6  # a Gaussian of the model moved, written twice and hashed
+AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
 SAMPLES = 60  # points that a forecast takes of a training: its schedules are linear or steps
 OPTIMISM = 1.03  # the forecast is met 3 % late on purpose: the deadline cuts a tail, but nothing fills a gap
 
@@ -147,7 +148,7 @@ class Task:
     def takes(self, options: TrainConfig, megapixels: float) -> float:
         """Forecast of a training, its photos' decoding (once a size) included, seconds."""
         decoding = self.prepare_s * (1 + options.coarse_levels)
-        return decoding + forecast(self.speed, options, self.initial, megapixels)
+        return decoding + AGEING * forecast(self.speed, options, self.initial, megapixels)
 
 
 @dataclass(frozen=True)
@@ -204,12 +205,18 @@ def sizes(megapixels: float) -> list[float]:
 
 
 def wanted_iterations(task: Task, megapixels: float) -> int:
-    """Iterations that are worth more than larger photos or more Gaussians.
+    """Iterations that are worth more than larger photos or more Gaussians."""
+    return max(VISITS * task.photos, worthwhile_iterations(task.seconds(megapixels)))
 
-    They grow with the root of the time, so that both grow; with it 10 minutes give the 7,000 of the standard preset.
+
+def worthwhile_iterations(seconds: float) -> int:
+    """Iterations that a training of so many seconds shall have at least, from ``FEWEST`` to ``LONGEST``.
+
+    They grow with the root of the time, so that what they work on grows as much; with it 10 minutes give about the
+    7,000 of the standard preset.
     """
-    wanted = FIRST_ITERATIONS * math.sqrt(max(task.seconds(megapixels), 1.0) / FIRST_SECONDS)
-    return int(min(LONGEST, max(FEWEST, VISITS * task.photos, wanted)))
+    wanted = FIRST_ITERATIONS * math.sqrt(max(seconds, 1.0) / FIRST_SECONDS)
+    return int(min(LONGEST, max(FEWEST, wanted)))
 
 
 def planned_options(config: TrainConfig, megapixels: float, cap: int, iterations: int) -> TrainConfig:

@@ -40,7 +40,7 @@ class Measured:
 
     Attributes:
         speed: Of an iteration.
-        decode_s: Reading a photo at the dataset's size.
+        decode_s: Reading a photo of the dataset and reducing it.
         evaluate_s: Rendering, measuring and keeping a held-out view, a megapixel.
     """
 
@@ -49,7 +49,20 @@ class Measured:
     evaluate_s: float
 
 
-def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, most_seconds: float) -> Measured:
+@dataclass(frozen=True)
+class Effort:
+    """What may be spent on measuring, and what for.
+
+    Attributes:
+        most_s: No round is begun after so many seconds; one is done always.
+        iteration_s: What an iteration of the plan may take, about: photos that take it are the ones to be timed.
+    """
+
+    most_s: float
+    iteration_s: float
+
+
+def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, effort: Effort) -> Measured:
     """Time real iterations at two sizes and two numbers of Gaussians.
 
     Args:
@@ -57,23 +70,26 @@ def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, mos
         start: The initial Gaussians.
         views: To train on.
         step: An iteration of training.
-        most_seconds: No round is begun after so many; one is done always.
+        effort: Its limit.
     """
     began = time.monotonic()
     chosen = [views[index * len(views) // min(len(views), MOST_VIEWS)] for index in range(min(len(views), MOST_VIEWS))]
     trial = replace(plan, options=pilot_options(plan))
-    full, decode_s = _photos(chosen, None)
     small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
     states = [_pilot_state(stretched(start, count, plan.options.seed), trial) for count in counts]
-    _warm_up(states, trial, small, step, began + WARM_UP_SHARE * most_seconds)
+    _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
+    first = _timed(states[0], trial, small[0], step)
+    # Cost grows a little slower than size, so the line through two sizes is right near them only.
+    megapixels = SMALLEST_MEGAPIXELS * max(2.0, effort.iteration_s / first.seconds)
+    large, decode_s = _photos(chosen, megapixels)
     _evaluation_seconds(states[0].finished(), small[0], plan)  # pays for what is loaded once
-    evaluate_s = _evaluation_seconds(states[0].finished(), full[0], plan)
-    timings = []
-    for photos in zip(small, full, strict=True):
+    evaluate_s = _evaluation_seconds(states[0].finished(), large[0], plan)
+    timings = [first]
+    for photos in zip(small, large, strict=True):
         for state in states:
             timings += [_timed(state, trial, photo, step) for photo in photos]
-        if time.monotonic() - began > most_seconds:
+        if time.monotonic() - began > effort.most_s:
             break
     return Measured(fit_speed(timings), decode_s, evaluate_s)
 
@@ -119,7 +135,7 @@ def _warm_up(
             break
 
 
-def _photos(views: Sequence[View], megapixels: float | None) -> tuple[list[TrainingPhoto], float]:
+def _photos(views: Sequence[View], megapixels: float) -> tuple[list[TrainingPhoto], float]:
     """The views as training sees them, and the seconds that one took."""
     began = time.monotonic()
     photos = []

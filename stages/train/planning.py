@@ -10,13 +10,20 @@ from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.line import TrainConfig
-from splatpipe.stages.train.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, FIRST_ITERATIONS, Task, choose
-from splatpipe.stages.train.measure import Measured, Step, measure
+from splatpipe.stages.train.budget import (
+    FEWEST_GAUSSIANS,
+    FIRST_GROWTH,
+    FIRST_ITERATIONS,
+    Task,
+    choose,
+    worthwhile_iterations,
+)
+from splatpipe.stages.train.measure import Effort, Measured, Step, measure
 from splatpipe.stages.train.memory import within_memory
 from splatpipe.stages.train.plan import Plan, mean_megapixels, resolve_schedule
 
 MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
-MEASURE_SECONDS = 6.0  # and no more than this: by then the noise of a shared machine is averaged out
+MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
 PILOT_GROWTH_A_SECOND = 150.0  # Gaussians that a second of budget pays for, about: where the forecast has to be right
 LEAST_SHARE = 0.1  # of the budget for the training, even where nothing is left: the tolerance of the whole
 EXPORT_SECONDS = 1.5  # the last stages whatever the size: digests, the report, the end of the process
@@ -67,9 +74,11 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
     if 0.0 < scene.machine.began_s < began:
         began = scene.machine.began_s
     before = time.monotonic() - began
-    measured = measure(
-        pilot(plan, scene.config), scene.start, scene.trained_on, step, min(MEASURE_SECONDS, MEASURE_SHARE * budget)
+    effort = Effort(
+        min(MEASURE_SECONDS, MEASURE_SHARE * budget),
+        max(LEAST_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
     )
+    measured = measure(pilot(plan, scene.config), scene.start, scene.trained_on, step, effort)
     left = budget - (time.monotonic() - began)
     choice = choose(_task(plan, scene, measured, left))
     if choice.seconds <= LEAST_SHARE * budget:
