@@ -35,7 +35,8 @@ LOW_GRADIENT = 2e-5  # NDC; low enough that Gaussians follow ``room_at`` and so 
 EXPORT_GAUSSIAN_S = 8e-6  # a Gaussian of the model moved, written twice and hashed
 AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
 SAMPLES = 60  # points that a forecast takes of a training: its schedules are linear or steps
-OPTIMISM = 1.03  # the forecast is met 3 % late on purpose: the deadline cuts a tail, but nothing fills a gap
+SCHEDULE_SHARE = 0.95  # of the time for the planned schedule; what is over polishes at its last learning rates
+POLISH = 1.5  # times the planned iterations at most, where the forecast was too high
 
 
 @dataclass(frozen=True)
@@ -159,13 +160,19 @@ class Choice:
         options: Resolved: iterations, cap, halvings at the start and a low threshold of density control.
         megapixels: Most of a photo; None for the dataset's size.
         seconds: When the training ends, done or not.
-        forecast_s: When it should be done.
+        forecast_s: When the schedule should be done.
     """
 
     options: TrainConfig
     megapixels: float | None
     seconds: float
     forecast_s: float
+
+    @property
+    def last_iteration(self) -> int:
+        """The most iterations: beyond the schedule until the time is up, unless that is as long as is of use."""
+        scheduled = self.options.iterations
+        return scheduled if scheduled >= LONGEST else int(POLISH * scheduled)
 
 
 def choose(task: Task) -> Choice:
@@ -233,7 +240,7 @@ def planned_options(config: TrainConfig, megapixels: float, cap: int, iterations
 
 def _fits(task: Task, megapixels: float, cap: int, iterations: int) -> bool:
     options = planned_options(task.config, megapixels, cap, iterations)
-    return task.takes(options, megapixels) <= OPTIMISM * task.left(megapixels, cap)
+    return task.takes(options, megapixels) <= SCHEDULE_SHARE * task.left(megapixels, cap)
 
 
 def _largest(least: int, most: int, fits: Callable[[int], bool]) -> int:

@@ -63,7 +63,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         plan = load_or_write_plan(out / "plan.json", make)
         if budgeted(plan):
             report.note(plan.described())
-        levels = coarse_levels(plan.options)
+        levels = coarse_levels(plan.options, plan.last_iteration)
         state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan.options)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, max_megapixels=size) as photos:
@@ -137,7 +137,7 @@ def resume(path: Path, plan: Plan, report: Reporter) -> TrainState | None:
 
 
 def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Path, report: Reporter) -> None:
-    """Train to the plan's last iteration or its last second, leaving checkpoints on the way.
+    """Train to the plan's last iteration or last second, leaving checkpoints on the way.
 
     The clock decides when a checkpoint is written and, under a time budget, after which iteration the training ends.
     What an iteration computes does not depend on it.
@@ -157,32 +157,33 @@ def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Pat
                 )
             if interrupt.requested:
                 break
-            if clock.is_up(plan) and state.iteration < plan.options.iterations:
-                end_early(state, plan, photo, report)
+            if clock.is_up(plan):
+                end_now(state, plan, photo, report)
                 break
-            if clock.checkpoint_due() and state.iteration < plan.options.iterations:
+            if clock.checkpoint_due() and state.iteration < plan.last_iteration:
                 with clock.checkpointing():
                     save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
-            if state.iteration % REPORT_EVERY == 0 or state.iteration == plan.options.iterations:
+            if state.iteration % REPORT_EVERY == 0 or state.iteration == plan.last_iteration:
                 tell(state, plan, report)
     if interrupt.requested:  # asked of once more: it may have come after the last iteration's look
         save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
         raise KeyboardInterrupt
 
 
-def end_early(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporter) -> None:
-    """Close the history of a training whose time is up, and say so."""
+def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporter) -> None:
+    """Close the history of a training whose time is up, and say where that cut the schedule."""
     state.history.end_iteration(state.iteration, True, curve_facts(state, plan, photo))
     tell(state, plan, report)
-    report.note(
-        f"its time is up after {state.iteration:,} of {plan.options.iterations:,} planned iterations; "
-        "the model is taken as it stands"
-    )
+    if state.iteration < plan.options.iterations:
+        report.note(
+            f"its time is up after {state.iteration:,} of {plan.options.iterations:,} planned iterations; "
+            "the model is taken as it stands"
+        )
 
 
 def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
     """Report how far the training is."""
-    report.progress(state.iteration, plan.options.iterations, "training", "iterations")
+    report.progress(state.iteration, max(state.iteration, plan.options.iterations), "training", "iterations")
     if (loss := state.history.recent_loss()) is not None:
         report.metric("loss", loss, state.iteration)
     report.metric("gaussians", len(state.gaussians), state.iteration)
@@ -204,7 +205,7 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     if growing and is_density_step(options, iteration) and over_memory(options):
         state.history.growth_ended = iteration
     state.iteration = iteration
-    state.history.end_iteration(iteration, iteration == options.iterations, curve_facts(state, plan, photo))
+    state.history.end_iteration(iteration, iteration == plan.last_iteration, curve_facts(state, plan, photo))
 
 
 def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str, int]:

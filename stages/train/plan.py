@@ -38,6 +38,8 @@ class Plan:
         train_megapixels: Mean size of the training photos, as they are trained on.
         initial_gaussians: Gaussians at the start.
         megapixels: Photos are reduced to at most so many; None where they keep the dataset's size.
+        last_iteration: The training ends here at the latest. Iterations after ``options.iterations``, if any, fill a
+            time budget: they are computed with the schedule's last rates.
         train_seconds: The training ends after so many, done or not; 0 for when it is done.
         forecast_seconds: When it should be done; 0 where nothing was measured.
     """
@@ -49,6 +51,7 @@ class Plan:
     test_views: tuple[str, ...]
     train_megapixels: float
     initial_gaussians: int
+    last_iteration: int
     megapixels: float | None = None
     train_seconds: float = 0.0
     forecast_seconds: float = 0.0
@@ -166,6 +169,7 @@ def make_plan(config: TrainConfig, views: Sequence[View], every: int, names: str
         test_views=tuple(sorted(test)),
         train_megapixels=mean_megapixels(cameras),
         initial_gaussians=gaussians,
+        last_iteration=config.iterations,
     )
 
 
@@ -197,9 +201,14 @@ def coarse_level_at(options: TrainConfig, iteration: int) -> int:
     return options.coarse_levels - (iteration - 1) * options.coarse_levels // until if iteration <= until else 0
 
 
-def coarse_levels(options: TrainConfig) -> list[int]:
-    """``coarse_level_at`` for every iteration."""
-    return [coarse_level_at(options, iteration) for iteration in range(1, options.iterations + 1)]
+def coarse_levels(options: TrainConfig, last: int | None = None) -> list[int]:
+    """``coarse_level_at`` for every iteration.
+
+    Args:
+        options: Resolved.
+        last: The last iteration; that of the schedule without it.
+    """
+    return [coarse_level_at(options, iteration) for iteration in range(1, (last or options.iterations) + 1)]
 
 
 def means_rate(plan: Plan, iteration: int) -> float:

@@ -90,6 +90,7 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
     return replace(
         plan,
         options=choice.options,
+        last_iteration=choice.last_iteration,
         megapixels=choice.megapixels,
         train_megapixels=mean_megapixels(cameras, choice.megapixels),
         train_seconds=round(choice.seconds, 2),
