@@ -20,6 +20,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.budget import FEWEST_GAUSSIANS
 from splatpipe.stages.train.plan import Plan
 
 FLOAT_BYTES = 4
@@ -29,7 +30,6 @@ STATISTICS_BYTES = 12
 PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
 PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
 FIXED_BYTES = 100_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
-FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer
 GROWTH_STOPS_AT = 0.97  # of the limit: what is measured over it after a step of density control was no surprise then
 
 
