@@ -21,7 +21,7 @@ from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages.evaluate import measure, render_options, render_pixels
+from splatpipe.stages.evaluate import as_trained, measure, render_pixels
 from splatpipe.stages.line import LineConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
@@ -109,9 +109,9 @@ def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.json"
         path.write_text(plan.to_json(), encoding="utf-8")
-        options = render_options(path, gaussians)
+        options, _ = as_trained(path, gaussians)
     measured = [
-        measure(render_pixels(gaussians, view, options), load_colour(view), load_mask(view))
+        measure(render_pixels(gaussians, view.camera, options), load_colour(view), load_mask(view))
         for view in load_views(dataset)
         if view.camera.name in set(plan.test_views)
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,6 +57,13 @@ ThreadsOption = Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 fo
 SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout at the end.")]
 PresetOption = Annotated[str, typer.Option(help="preview (minutes), standard or high.")]
+TimeBudgetOption = Annotated[
+    str | None,
+    typer.Option(metavar="10m|90s|1h30m", help="For the whole command; the training is planned to fill what is left."),
+]
+MaxMemoryOption = Annotated[
+    str | None, typer.Option(metavar="8G|512M", help="Most memory that training may take, 10⁹ bytes a G.")
+]
 UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
 RerunOption = Annotated[list[str] | None, typer.Option(metavar="STAGE", help="Run this stage again. Repeatable.")]
 RerunFromOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage and all after it again.")]
@@ -86,18 +94,31 @@ def _overrides(config: Path | None, assignments: Sequence[str] | None, seed: int
     return _Overrides([*tables, *(parse_set(text, LineConfig) for text in assignments or ())])
 
 
+def _with_budgets(assignments: Sequence[str] | None, time_budget: str | None, max_memory: str | None) -> list[str]:
+    """``--time-budget`` and ``--max-memory`` as the assignments that they are short for."""
+    from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
+
+    budgets = []
+    if time_budget is not None:
+        budgets.append(f"train.time_budget_s={parse_duration(time_budget, '--time-budget')!r}")
+    if max_memory is not None:
+        budgets.append(f"train.max_memory_bytes={parse_bytes(max_memory, '--max-memory')}")
+    return [*budgets, *(assignments or ())]
+
+
 def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
     from splatpipe.pipeline.engine.session import Request
     from splatpipe.pipeline.engine.stage import Machine
     from splatpipe.stages.line import LINE
 
+    began_s = round(time.monotonic(), 3)
     if device not in ("auto", "cpu", "cuda"):
         raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
     if device == "cuda":
         raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
         import splatpipe.pipeline.raster  # noqa: F401
-    return Request(LINE, config, photos, out, Machine(device, threads or available_cores()))
+    return Request(LINE, config, photos, out, Machine(device, threads or available_cores(), began_s))
 
 
 def available_cores() -> int:
@@ -131,6 +152,8 @@ def run(
     preset: PresetOption = "standard",
     config: ConfigOption = None,
     assignments: SetOption = None,
+    time_budget: TimeBudgetOption = None,
+    max_memory: MaxMemoryOption = None,
     until: UntilOption = None,
     rerun: RerunOption = None,
     rerun_from: RerunFromOption = None,
@@ -143,6 +166,7 @@ def run(
     from splatpipe.pipeline.engine.config import load_preset
 
     with Ending(out, as_json) as done:
+        assignments = _with_budgets(assignments, time_budget, max_memory)
         resolved = _overrides(config, assignments, seed).resolve(load_preset(preset))
         again = _stages_to_rerun(rerun or [], rerun_from, until)
         with _Session(_request(photos, out, resolved, device, threads)) as runner:
@@ -155,6 +179,8 @@ def demo(
     out: OutArgument,
     preset: PresetOption = "demo",
     assignments: SetOption = None,
+    time_budget: TimeBudgetOption = None,
+    max_memory: MaxMemoryOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
     seed: SeedOption = None,
@@ -163,7 +189,8 @@ def demo(
     """Run the line on the capture that ships with splatpipe, to see it work."""
     from splatpipe.demo import capture_path
 
-    run(capture_path(), out, preset, None, assignments, None, None, None, device, threads, seed, as_json)
+    assignments = _with_budgets(assignments, time_budget, max_memory)
+    run(capture_path(), out, preset, None, assignments, device=device, threads=threads, seed=seed, as_json=as_json)
 
 
 @app.command()

@@ -128,6 +128,9 @@ class RunConsole:
         self.close()
         self._line("✗", "red", stage, str(data["message"]))
 
+    def _note(self, stage: str, data: Mapping[str, JSON]) -> None:
+        self._line("·", "cyan", stage, str(data["message"]))
+
     def _warning(self, stage: str, data: Mapping[str, JSON]) -> None:
         hint = f" {data['hint']}" if data["hint"] else ""
         self._line("!", "yellow", stage, f"{data['message']}{hint}")

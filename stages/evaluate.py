@@ -17,9 +17,10 @@ from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.scene import metrics
-from splatpipe.pipeline.scene.dataset import View, load_views, split_views
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import load_views, split_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.images import Mask, Pixels, load_colour, load_mask
+from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_view
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.line import EvaluateConfig
 
@@ -38,7 +39,7 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     _, held_out = split_views([view.camera.name for view in views], config.every, config.views)
     chosen = [view for view in views if view.camera.name in set(held_out)]
     gaussians = read_splat(inputs["train.model"])
-    options = render_options(inputs["train.plan"], gaussians)
+    options, megapixels = as_trained(inputs["train.plan"], gaussians)
     folder = out / "views"
     folder.mkdir(parents=True, exist_ok=True)
     if not chosen:
@@ -50,7 +51,8 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     stems = flat_stems([view.camera.name for view in chosen])
     per_view = []
     for done, (view, stem) in enumerate(zip(chosen, stems, strict=True), start=1):
-        per_view.append(evaluate_view(view, gaussians, options, folder / stem))
+        reduced = reduced_view(view, megapixels)
+        per_view.append(evaluate_view(reduced, gaussians, options, folder / stem))
         report.progress(done, len(chosen), "measuring held-out photos", "photos")
     means = mean_measures(per_view)
     result = {"test_views": len(per_view), "mean": means, "per_view": per_view}
@@ -60,8 +62,8 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     return summary | {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
 
 
-def render_options(plan: Path, gaussians: Gaussians) -> raster.RenderOptions:
-    """How the model was trained to be rendered, from training's `plan.json`.
+def as_trained(plan: Path, gaussians: Gaussians) -> tuple[raster.RenderOptions, float | None]:
+    """How the model was trained to be rendered, and the megapixels that photos were reduced to, from `plan.json`.
 
     Raises:
         StageError: if the plan is not one.
@@ -69,28 +71,31 @@ def render_options(plan: Path, gaussians: Gaussians) -> raster.RenderOptions:
     try:
         fields = json.loads(plan.read_text(encoding="utf-8"))
         white = fields["options"]["background"] == "white"
-        return raster.RenderOptions(
+        options = raster.RenderOptions(
             sh_degree=gaussians.sh_degree,
             background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
             antialias=bool(fields["options"]["antialias"]),
             near=float(fields["near"]),
         )
+        return options, None if fields["megapixels"] is None else float(fields["megapixels"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError("Training's plan.json cannot be read.", hint="Run again with --rerun-from train.") from error
 
 
-def render_pixels(gaussians: Gaussians, view: View, options: raster.RenderOptions) -> Pixels:
-    """Render a view to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
+def render_pixels(gaussians: Gaussians, camera: Camera, options: raster.RenderOptions) -> Pixels:
+    """Render a camera's view to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
     with torch.no_grad():
-        colour = raster.render(gaussians, view.camera, options).colour
+        colour = raster.render(gaussians, camera, options).colour
         return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 
-def evaluate_view(view: View, gaussians: Gaussians, options: raster.RenderOptions, stem: Path) -> dict[str, Any]:
+def evaluate_view(
+    view: tuple[Camera, Pixels, Mask | None], gaussians: Gaussians, options: raster.RenderOptions, stem: Path
+) -> dict[str, Any]:
     """Render and measure one view, and keep its pictures.
 
     Args:
-        view: The held-out photo.
+        view: The held-out photo at the size of training: camera, photo and mask.
         gaussians: The model.
         options: How it is rendered.
         stem: Path of the pictures without their endings.
@@ -98,15 +103,15 @@ def evaluate_view(view: View, gaussians: Gaussians, options: raster.RenderOption
     Returns:
         Its name, the pictures' common stem, its size, and a figure a measure.
     """
-    photo, mask = load_colour(view), load_mask(view)
-    render = render_pixels(gaussians, view, options)
+    camera, photo, mask = view
+    render = render_pixels(gaussians, camera, options)
     _write_png(stem, "photo", photo)
     _write_png(stem, "render", render)
     _write_png(stem, "error", error_picture(render, photo, mask))
     if mask is not None:
         _write_png(stem, "mask", np.where(mask, 255, 0).astype(np.uint8))
     counted = 1.0 if mask is None else round(float(mask.mean()), 6)
-    facts = {"name": view.camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
+    facts = {"name": camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
     return facts | {"counted": counted} | measure(render, photo, mask)
 
 

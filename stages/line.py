@@ -14,6 +14,8 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 PositiveFloat = Annotated[float, Field(gt=0.0)]
 NonNegativeFloat = Annotated[float, Field(ge=0.0)]
 Length = Literal["auto"] | PositiveInt
+LONGEST_BUDGET_S = 30 * 86_400.0
+LARGEST_MEMORY = 1 << 50
 LengthOrZero = Literal["auto"] | NonNegativeInt
 
 
@@ -82,7 +84,11 @@ class TrainConfig(StageConfig):
     """
 
     iterations: PositiveInt = 30_000
-    """Optimisation steps, one photo each."""
+    """Optimisation steps, one photo each; a time budget plans its own."""
+    time_budget_s: Annotated[float, Field(ge=0.0, le=LONGEST_BUDGET_S)] = 0.0
+    """Seconds for the whole command: resolution, cap and iterations are planned to fill what is left. 0: none."""
+    max_memory_bytes: Annotated[int, Field(ge=0, le=LARGEST_MEMORY)] = 0
+    """Most resident memory that training may take, its libraries included: caps the Gaussians. 0: no limit."""
     seed: NonNegativeInt = 0
     """Seed of the order of photos and of density control."""
     max_gaussians: PositiveInt = 1_000_000

@@ -39,6 +39,8 @@ class Notes:
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None: ...
 
+    def note(self, message: str) -> None: ...
+
     def warning(self, message: str, hint: str = "") -> None:
         self.warnings.append(message)
 

@@ -116,9 +116,13 @@ def test_cameras_in_one_place_are_refused_with_a_hint() -> None:
 def test_plan_is_written_once_and_taken_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     first = make_plan(TrainConfig(iterations=50), views(), 2, "", 9)
-    assert load_or_write_plan(path, first) == first
+    assert load_or_write_plan(path, lambda: first) == first
     text = path.read_bytes()
-    assert load_or_write_plan(path, make_plan(TrainConfig(iterations=99), views(), 0, "", 8)) == first
+
+    def not_called() -> Plan:
+        raise AssertionError("a plan that is there is taken as it is")
+
+    assert load_or_write_plan(path, not_called) == first
     assert path.read_bytes() == text
     assert Plan.from_json(text.decode()).digest() == first.digest()
 
@@ -130,8 +134,8 @@ def test_broken_plan_is_written_anew(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.json"
     path.write_text(text)
     fresh = make_plan(TrainConfig(), views(), 2, "", 9)
-    assert load_or_write_plan(path, fresh) == fresh
-    assert json.loads(path.read_text())["format"] == 1
+    assert load_or_write_plan(path, lambda: fresh) == fresh
+    assert json.loads(path.read_text())["format"] == 2
 
 
 def test_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:

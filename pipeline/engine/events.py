@@ -19,6 +19,7 @@ Kind = Literal[
     "stage_failed",
     "progress",
     "metric",
+    "note",
     "warning",
     "run_finished",
 ]
@@ -35,7 +36,8 @@ class Event:
         kind: What happened.
         stage: The stage it happened in, or empty.
         data: The details, JSON values. ``progress``: done, total, what, unit. ``metric``: name, value, step.
-            ``warning``: message, hint. ``stage_started``: reason. ``stage_finished``: seconds, summary.
+            ``note``: message. ``warning``: message, hint. ``stage_started``: reason.
+            ``stage_finished``: seconds, summary.
         time_s: Seconds since the epoch.
     """
 
@@ -65,6 +67,9 @@ class EventReporter:
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None:
         self._send("metric", {"name": name, "value": value, "step": step})
+
+    def note(self, message: str) -> None:
+        self._send("note", {"message": message})
 
     def warning(self, message: str, hint: str = "") -> None:
         self._send("warning", {"message": message, "hint": hint})

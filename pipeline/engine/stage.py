@@ -32,10 +32,12 @@ class Machine:
     Attributes:
         device: ``auto``, ``cpu`` or ``cuda``.
         threads: Worker threads, at least 1.
+        began_s: ``time.monotonic()`` when the command began, which all processes of a machine share; 0 where not known.
     """
 
     device: str = "auto"
     threads: int = 1
+    began_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,9 @@ class Reporter(Protocol):
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None:
         """A figure worth a curve, e.g. ``loss`` at an iteration."""
+
+    def note(self, message: str) -> None:
+        """One line that everybody who watches wants to read, e.g. the plan of a training."""
 
     def warning(self, message: str, hint: str = "") -> None:
         """Something the user should know about a result that is right all the same."""

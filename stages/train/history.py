@@ -21,6 +21,7 @@ class History:
         curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and halvings of the photos.
         density: Steps of density control.
         resets: Iterations after which opacities were reset.
+        growth_ended: Iteration from which memory allowed no more Gaussians; 0 where it did.
         skipped_gradients: Gaussians' gradients left out because they were not finite, over all iterations.
         loss_sum: Of the losses since the last point.
         loss_count: How many those are.
@@ -29,6 +30,7 @@ class History:
     curve: list[dict[str, float | int | None]] = field(default_factory=list)
     density: list[dict[str, int]] = field(default_factory=list)
     resets: list[int] = field(default_factory=list)
+    growth_ended: int = 0
     skipped_gradients: int = 0
     loss_sum: float = 0.0
     loss_count: int = 0
@@ -51,7 +53,8 @@ class History:
             last: Whether the training ends here.
             facts: What else the point says.
         """
-        if iteration % CURVE_EVERY != 0 and not last:
+        closed = bool(self.curve) and self.curve[-1]["iteration"] == iteration
+        if closed or (iteration % CURVE_EVERY != 0 and not last):
             return
         loss = self.loss_sum / self.loss_count if self.loss_count else None
         self.curve.append({"iteration": iteration, "loss": loss, **facts})
@@ -71,6 +74,7 @@ class History:
             "curve": self.curve,
             "density": self.density,
             "resets": self.resets,
+            "growth_ended": self.growth_ended,
             "skipped_gradients": self.skipped_gradients,
             "loss_sum": self.loss_sum,
             "loss_count": self.loss_count,

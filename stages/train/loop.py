@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,12 +14,14 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
-from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.dataset import View, load_views
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
+from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.draws import BACKGROUND, uniform
 from splatpipe.stages.train.interrupts import deferred_interrupts
+from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
     Plan,
     coarse_levels,
@@ -28,6 +30,7 @@ from splatpipe.stages.train.plan import (
     means_rate,
     sh_degree_at,
 )
+from splatpipe.stages.train.planning import Scene, under_budgets
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
 
@@ -50,13 +53,20 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     views = load_views(inputs["undistort.dataset"])
     start = read_splat(inputs["initialize.splat"])
     every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
-    plan = load_or_write_plan(out / "plan.json", make_plan(config, views, every, names, len(start)))
-    kept = set(plan.train_views)
-    trained_on = [view for view in views if view.camera.name in kept]
-    levels = coarse_levels(plan.options)
+
+    def make() -> Plan:
+        free = make_plan(config, views, every, names, len(start))
+        scene = Scene(config, start, views_of(free, views), len(free.test_views), inputs.machine)
+        return under_budgets(free, scene, train_step, report)
+
     with same_bits(inputs.machine.threads):
+        plan = load_or_write_plan(out / "plan.json", make)
+        if budgeted(plan):
+            report.note(plan.described())
+        levels = coarse_levels(plan.options, plan.last_iteration)
         state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan.options)
-        with PhotoStream(trained_on, levels, plan.options.seed, state.iteration + 1, out) as photos:
+        first, size = state.iteration + 1, plan.megapixels
+        with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
         gaussians = state.finished()
@@ -64,7 +74,8 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
     return {
         "gaussians": len(gaussians),
-        "iterations": plan.options.iterations,
+        "iterations": state.iteration,
+        "planned_iterations": plan.options.iterations,
         "loss": state.history.last_loss(),
         "train_seconds": round(state.seconds, 1),
         "train_megapixels": plan.train_megapixels,
@@ -72,6 +83,17 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         "device": "cpu",
         "instruction_set": raster.isa_name(),
     }
+
+
+def views_of(plan: Plan, views: Sequence[View]) -> list[View]:
+    """The views that the plan trains on."""
+    kept = set(plan.train_views)
+    return [view for view in views if view.camera.name in kept]
+
+
+def budgeted(plan: Plan) -> bool:
+    """Whether a budget had a say in the plan, so that people want to see it."""
+    return bool(plan.options.time_budget_s or plan.options.max_memory_bytes)
 
 
 def check_device(machine: Machine) -> None:
@@ -116,9 +138,10 @@ def resume(path: Path, plan: Plan, report: Reporter) -> TrainState | None:
 
 
 def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Path, report: Reporter) -> None:
-    """Train to the plan's last iteration, leaving checkpoints on the way.
+    """Train to the plan's last iteration or last second, leaving checkpoints on the way.
 
-    When a checkpoint is written depends on the clock; what is computed does not.
+    The clock decides when a checkpoint is written and, under a time budget, after which iteration the training ends.
+    What an iteration computes does not depend on it.
 
     Raises:
         KeyboardInterrupt: when asked to end, after a checkpoint.
@@ -128,21 +151,40 @@ def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Pat
         for photo in photos:
             train_step(state, plan, photo)
             state.seconds = clock.seconds()
+            if state.history.growth_ended == state.iteration:
+                report.warning(
+                    f"The memory limit is close, so no Gaussian is added after iteration {state.iteration:,}.",
+                    hint="Give more with --max-memory, or smaller photos with undistort.max_megapixels.",
+                )
             if interrupt.requested:
                 break
-            if clock.checkpoint_due() and state.iteration < plan.options.iterations:
+            if clock.is_up(plan):
+                end_now(state, plan, photo, report)
+                break
+            if clock.checkpoint_due() and state.iteration < plan.last_iteration:
                 with clock.checkpointing():
                     save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
-            if state.iteration % REPORT_EVERY == 0 or state.iteration == plan.options.iterations:
+            if state.iteration % REPORT_EVERY == 0 or state.iteration == plan.last_iteration:
                 tell(state, plan, report)
     if interrupt.requested:  # asked of once more: it may have come after the last iteration's look
         save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
         raise KeyboardInterrupt
 
 
+def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporter) -> None:
+    """Close the history of a training whose time is up, and say where that cut the schedule."""
+    state.history.end_iteration(state.iteration, True, curve_facts(state, plan, photo))
+    tell(state, plan, report)
+    if state.iteration < plan.options.iterations:
+        report.note(
+            f"its time is up after {state.iteration:,} of {plan.options.iterations:,} planned iterations; "
+            "the model is taken as it stands"
+        )
+
+
 def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
     """Report how far the training is."""
-    report.progress(state.iteration, plan.options.iterations, "training", "iterations")
+    report.progress(state.iteration, max(state.iteration, plan.options.iterations), "training", "iterations")
     if (loss := state.history.recent_loss()) is not None:
         report.metric("loss", loss, state.iteration)
     report.metric("gaussians", len(state.gaussians), state.iteration)
@@ -159,14 +201,22 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     options, iteration = plan.options, state.iteration + 1
     if photo.mask is None or bool(photo.mask.any()):
         descend(state, plan, photo, iteration)
-    state.control_density(options, plan.extent, plan.initial_gaussians, iteration)
+    growing = not state.history.growth_ended
+    control = options if growing else without_growth(options)
+    state.control_density(control, plan.extent, plan.initial_gaussians, iteration)
+    if growing and is_density_step(options, iteration) and over_memory(options):
+        state.history.growth_ended = iteration
     state.iteration = iteration
-    facts = {
+    state.history.end_iteration(iteration, iteration == plan.last_iteration, curve_facts(state, plan, photo))
+
+
+def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str, int]:
+    """What a point of the history's curve says besides the loss."""
+    return {
         "gaussians": len(state.gaussians),
-        "sh_degree": sh_degree_at(options, iteration),
+        "sh_degree": sh_degree_at(plan.options, state.iteration),
         "width": photo.camera.width,
     }
-    state.history.end_iteration(iteration, iteration == options.iterations, facts)
 
 
 def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
@@ -213,6 +263,9 @@ class _Clock:
 
     def seconds(self) -> float:
         return time.monotonic() - self._began
+
+    def is_up(self, plan: Plan) -> bool:
+        return 0.0 < plan.train_seconds <= self.seconds()
 
     def checkpoint_due(self) -> bool:
         return time.monotonic() - self._last >= max(CHECKPOINT_SECONDS, self._cost / CHECKPOINT_SHARE)

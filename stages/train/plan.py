@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from splatpipe.pipeline.scene.dataset import View, split_views
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.durable import write_durably
 
-PLAN_FORMAT = 1
+PLAN_FORMAT = 2
 EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
 NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones see nothing that near
 PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
@@ -35,8 +35,13 @@ class Plan:
         near: Near plane, world units.
         train_views: Names of the photos trained on, sorted.
         test_views: Names of those held out, sorted.
-        train_megapixels: Mean size of the training photos.
+        train_megapixels: Mean size of the training photos, as they are trained on.
         initial_gaussians: Gaussians at the start.
+        megapixels: Photos are reduced to at most so many; None where they keep the dataset's size.
+        last_iteration: The training ends here at the latest. Iterations after ``options.iterations``, if any, fill a
+            time budget: they are computed with the schedule's last rates.
+        train_seconds: The training ends after so many, done or not; 0 for when it is done.
+        forecast_seconds: When it should be done; 0 where nothing was measured.
     """
 
     options: TrainConfig
@@ -46,6 +51,10 @@ class Plan:
     test_views: tuple[str, ...]
     train_megapixels: float
     initial_gaussians: int
+    last_iteration: int
+    megapixels: float | None = None
+    train_seconds: float = 0.0
+    forecast_seconds: float = 0.0
 
     def to_json(self) -> str:
         """The plan as canonical JSON."""
@@ -55,6 +64,21 @@ class Plan:
     def digest(self) -> str:
         """sha256 of ``to_json``: names the plan in its checkpoints."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
+
+    def described(self) -> str:
+        """The plan in a line for people."""
+        options = self.options
+        parts = [
+            f"{self.train_megapixels:.2f} MP",
+            f"up to {options.max_gaussians:,} Gaussians",
+            f"{options.iterations:,} iterations",
+        ]
+        if options.time_budget_s:
+            takes = min(self.forecast_seconds, self.train_seconds)
+            parts.append(f"about {duration(takes)} of the {duration(options.time_budget_s)} budget")
+        if options.max_memory_bytes:
+            parts.append(f"within {options.max_memory_bytes / 1e9:.1f} GB")
+        return "plan: " + ", ".join(parts)
 
     @staticmethod
     def from_json(text: str) -> Plan:
@@ -73,6 +97,16 @@ class Plan:
             return Plan(**fields)
         except (KeyError, TypeError) as error:
             raise ValueError(f"not a plan: {error}") from error
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people: `45 s`, `6 min 40 s`, `2 h 05 min`."""
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes == 0:
+        return f"{rest} s"
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s" if rest else f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes % 60 else f"{minutes // 60} h"
 
 
 def resolve_schedule(config: TrainConfig) -> TrainConfig:
@@ -99,6 +133,12 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     return EXTENT_MARGIN * radius
 
 
+def mean_megapixels(cameras: Sequence[Camera], most: float | None = None) -> float:
+    """Mean size of photos when each is reduced to at most ``most`` megapixels."""
+    pixels = [camera.width * camera.height / 1e6 for camera in cameras]
+    return round(sum(min(size, most or size) for size in pixels) / len(pixels), 4)
+
+
 def make_plan(config: TrainConfig, views: Sequence[View], every: int, names: str, gaussians: int) -> Plan:
     """Resolve a training's plan.
 
@@ -121,42 +161,54 @@ def make_plan(config: TrainConfig, views: Sequence[View], every: int, names: str
             f"All {len(cameras)} cameras stand in one place, so the scene has no size.",
             hint="Take the photos from different places, and hold out fewer of them.",
         )
-    pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
     return Plan(
         options=resolve_schedule(config),
         extent=extent,
         near=NEAR_PER_EXTENT * extent,
         train_views=tuple(sorted(train)),
         test_views=tuple(sorted(test)),
-        train_megapixels=round(pixels / 1e6, 4),
+        train_megapixels=mean_megapixels(cameras),
         initial_gaussians=gaussians,
+        last_iteration=config.iterations,
     )
 
 
-def load_or_write_plan(path: Path, fresh: Plan) -> Plan:
-    """The plan already at ``path``, or ``fresh``, written there.
+def load_or_write_plan(path: Path, make: Callable[[], Plan]) -> Plan:
+    """The plan already at ``path``, or a new one, written there before anything is trained.
 
     The folder belongs to one key of configuration and inputs, so a plan in it is of this training.
+
+    Args:
+        path: Where the plan is.
+        make: Makes one; called only where there is none, for it may measure for a while.
     """
     try:
         return Plan.from_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
+        fresh = make()
         write_durably(path, lambda file: file.write(fresh.to_json().encode()))
         return fresh
 
 
-def coarse_levels(options: TrainConfig) -> list[int]:
-    """How often each iteration's photo is halved: equal shares of ``coarse_until``, coarsest first.
+def coarse_level_at(options: TrainConfig, iteration: int) -> int:
+    """How often an iteration's photo (from 1) is halved: equal shares of ``coarse_until``, coarsest first.
 
     Args:
         options: Resolved.
+        iteration: From 1.
     """
     until = int(options.coarse_until)
-    levels = []
-    for iteration in range(options.iterations):
-        step = iteration * options.coarse_levels // until if iteration < until else options.coarse_levels
-        levels.append(options.coarse_levels - step)
-    return levels
+    return options.coarse_levels - (iteration - 1) * options.coarse_levels // until if iteration <= until else 0
+
+
+def coarse_levels(options: TrainConfig, last: int | None = None) -> list[int]:
+    """``coarse_level_at`` for every iteration.
+
+    Args:
+        options: Resolved.
+        last: The last iteration; that of the schedule without it.
+    """
+    return [coarse_level_at(options, iteration) for iteration in range(1, (last or options.iterations) + 1)]
 
 
 def means_rate(plan: Plan, iteration: int) -> float:

@@ -30,6 +30,8 @@ class Recorder:
 
     def metric(self, name: str, value: float, step: int | None = None) -> None: ...
 
+    def note(self, message: str) -> None: ...
+
     def warning(self, message: str, hint: str = "") -> None:
         self.warnings.append(message)
 

@@ -26,6 +26,7 @@ class Recorder:
     """A Reporter that remembers."""
 
     warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     steps: list[tuple[float, float]] = field(default_factory=list)
     metrics: list[tuple[str, float, int | None]] = field(default_factory=list)
 
@@ -34,6 +35,9 @@ class Recorder:
 
     def metric(self, name: str, value: float, step: int | None = None) -> None:
         self.metrics.append((name, value, step))
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
 
     def warning(self, message: str, hint: str = "") -> None:
         self.warnings.append(message)

@@ -1,0 +1,57 @@
+"""Quantities as people write them on a command line: `1h30m`, `8G`."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from splatpipe.pipeline.engine.errors import UsageError
+
+LONGEST_TEXT = 24  # characters: longer than any quantity that makes sense
+
+_NUMBER = r"[0-9]+(?:\.[0-9]+)?"
+_DURATION = re.compile(rf"(?:({_NUMBER})h)?(?:({_NUMBER})m)?(?:({_NUMBER})s)?")
+_SECONDS = (3600.0, 60.0, 1.0)
+_BYTES = re.compile(rf"({_NUMBER})([MGT])B?")
+_UNITS = {"M": 10**6, "G": 10**9, "T": 10**12}
+
+
+def parse_duration(text: str, option: str) -> float:
+    """Seconds of `90s`, `10m`, `1h30m` or `1.5h`.
+
+    Args:
+        text: What the user wrote.
+        option: Where, for the message.
+
+    Raises:
+        UsageError: if it is anything else, or no time at all.
+    """
+    match = _DURATION.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
+    parts = match.groups(default="0") if match else ()
+    seconds = sum(float(part) * unit for part, unit in zip(parts, _SECONDS, strict=False))
+    if not 0.0 < seconds < math.inf:
+        raise UsageError(
+            f'Cannot understand {option} "{text[:LONGEST_TEXT]}".',
+            hint=f"Write it with its units, largest first: {option} 90s, 10m or 1h30m.",
+        )
+    return seconds
+
+
+def parse_bytes(text: str, option: str) -> int:
+    """Bytes of `512M`, `8G` or `1.5T`: decimal units, the smaller of the two readings.
+
+    Args:
+        text: What the user wrote.
+        option: Where, for the message.
+
+    Raises:
+        UsageError: if it is anything else, or nothing at all.
+    """
+    match = _BYTES.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
+    number = int(float(match[1]) * _UNITS[match[2]]) if match else 0
+    if number <= 0:
+        raise UsageError(
+            f'Cannot understand {option} "{text[:LONGEST_TEXT]}".',
+            hint=f"Write it with its unit: {option} 512M or 8G.",
+        )
+    return number

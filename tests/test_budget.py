@@ -1,0 +1,378 @@
+"""Budgets of time and memory: what is planned, that it is kept, and that its limits hold."""
+
+import hashlib
+import json
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages import evaluate, initialize, train
+from splatpipe.stages.line import EvaluateConfig, InitializeConfig, TrainConfig
+from splatpipe.stages.train import loop, planning
+from splatpipe.stages.train.budget import (
+    FEWEST,
+    FEWEST_GAUSSIANS,
+    LONGEST,
+    SCHEDULE_SHARE,
+    SMALLEST_MEGAPIXELS,
+    VISITS,
+    Choice,
+    Speed,
+    Task,
+    Timing,
+    choose,
+    fit_speed,
+    forecast,
+)
+from splatpipe.stages.train.densify import room_at
+from splatpipe.stages.train.memory import FIXED_BYTES, bytes_per_gaussian, resident_bytes
+from splatpipe.stages.train.plan import Plan, coarse_levels, duration, means_rate, resolve_schedule
+from splatpipe.stages.train.state import TrainState
+from splatpipe.stages.train.stream import TrainingPhoto
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+SPEED = Speed(base_s=2e-3, gaussian_s=3e-7, pixel_s=3e-8, pair_s=2e-13)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("90s", 90.0), ("10m", 600.0), ("1h30m", 5400.0), ("1.5h", 5400.0), ("2h5s", 7205.0), (" 1m ", 60.0)],
+)
+def test_durations_are_read(text: str, seconds: float) -> None:
+    assert parse_duration(text, "--time-budget") == seconds
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        " ",
+        "10",
+        "m",
+        "-5m",
+        "+5m",
+        "0s",
+        "0h0m",
+        "1m1h",
+        "1m 30s",
+        "5M",
+        "1e3s",
+        "nan",
+        "infs",
+        "１０m",
+        "1..5m",
+        ".5m",
+        "1d",
+        "5ms",
+        "9" * 400 + "h",
+        "5m\x00",
+        "10m;rm -rf",
+        "0x10s",
+        "1_0s",
+    ],
+)
+def test_what_is_no_duration_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(UsageError, match="--time-budget") as raised:
+        parse_duration(text, "--time-budget")
+    assert "10m" in raised.value.hint and len(str(raised.value)) < 80
+
+
+@pytest.mark.parametrize(
+    ("text", "number"), [("512M", 512 * 10**6), ("8G", 8 * 10**9), ("1.5GB", 1_500_000_000), ("1T", 10**12)]
+)
+def test_sizes_are_read(text: str, number: int) -> None:
+    assert parse_bytes(text, "--max-memory") == number
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "8", "G", "-8G", "0G", "0.0000000000001M", "8g", "8 G", "8Gi", "8K", "nanG", "1e3G", "８G", "9" * 99 + "G"],
+)
+def test_what_is_no_size_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(UsageError, match="--max-memory") as raised:
+        parse_bytes(text, "--max-memory")
+    assert "8G" in raised.value.hint
+
+
+def test_durations_are_told_as_people_say_them() -> None:
+    said = {4.4: "4 s", 60.0: "1 min", 400.0: "6 min 40 s", 7500.0: "2 h 05 min", 7200.0: "2 h"}
+    assert {seconds: duration(seconds) for seconds in said} == said
+
+
+def test_room_grows_linearly_from_the_start_to_the_cap() -> None:
+    options = resolve_schedule(TrainConfig(iterations=100, densify_from=10, densify_until=50, max_gaussians=900))
+    assert [room_at(options, 100, i) for i in (1, 10, 20, 30, 50, 100)] == [100, 100, 300, 500, 900, 900]
+    assert room_at(options, 2000, 1) == 900
+    still = options.model_copy(update={"densify": False})
+    assert room_at(still, 100, 100) == 100
+
+
+def test_a_speed_is_found_again_from_its_timings() -> None:
+    sizes = [(n, p) for n in (5_000, 60_000) for p in (100_000, 400_000, 1_600_000)]
+    fitted = fit_speed([Timing(n, p, SPEED.seconds(n, p)) for n, p in sizes])
+    for n, p in ((7_000, 2e5), (200_000, 1e6)):
+        assert fitted.seconds(n, p) == pytest.approx(SPEED.seconds(n, p), rel=1e-6)
+
+
+def test_no_cost_is_below_zero_whatever_was_measured() -> None:
+    noisy = [Timing(10, 100, 0.02), Timing(10, 400, 0.01), Timing(900, 100, 0.005), Timing(900, 400, 0.03)]
+    fitted = fit_speed(noisy)
+    assert min(fitted.base_s, fitted.gaussian_s, fitted.pixel_s, fitted.pair_s) >= 0.0
+    assert fit_speed([Timing(10, 100, 0.02)]).seconds(10, 100) == pytest.approx(0.02)
+    with pytest.raises(ValueError, match="timings"):
+        fit_speed([])
+
+
+def test_forecast_is_the_sum_over_the_iterations() -> None:
+    options = resolve_schedule(TrainConfig(iterations=2400, max_gaussians=50_000, coarse_levels=2))
+    levels = coarse_levels(options)
+    each = [SPEED.seconds(room_at(options, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
+    assert forecast(SPEED, options, 8_000, 0.4) == pytest.approx(math.fsum(each), rel=0.01)
+
+
+def plan_for(seconds: float, photos: int = 30, initial: int = 8_000, size: float = 0.5, cap: int = 1_000_000) -> Choice:
+    config = TrainConfig(time_budget_s=seconds, max_gaussians=cap)
+    return choose(Task(config, initial, photos, size, SPEED, 0.0, lambda _size: seconds))
+
+
+@pytest.mark.parametrize("seconds", [10.0, 30.0, 60.0, 300.0, 600.0, 3600.0])
+def test_plans_fill_their_time(seconds: float) -> None:
+    choice = plan_for(seconds)
+    assert 0.9 * seconds <= choice.forecast_s <= SCHEDULE_SHARE * seconds
+
+
+def test_more_time_never_plans_less() -> None:
+    plans = [plan_for(seconds) for seconds in (5.0, 15.0, 60.0, 240.0, 900.0, 3600.0, 14_400.0)]
+    sizes = [plan.megapixels or 0.5 for plan in plans]
+    caps = [plan.options.max_gaussians for plan in plans]
+    assert sizes == sorted(sizes) and sizes[0] < 0.5 == sizes[-1]
+    assert caps == sorted(caps) and caps[0] < caps[-1]
+    assert plans[-1].options.iterations > plans[0].options.iterations
+
+
+def test_no_limit_is_passed_however_much_time_there_is() -> None:
+    choice = plan_for(1e6, cap=20_000)
+    assert choice.options.max_gaussians == 20_000 and choice.options.iterations == choice.last_iteration == LONGEST
+    assert choice.megapixels is None
+
+
+def test_too_little_time_plans_the_smallest_training_and_not_none() -> None:
+    choice = plan_for(0.01, initial=500_000, size=2.0)
+    assert choice.options.iterations == FEWEST and choice.options.max_gaussians == FEWEST_GAUSSIANS
+    assert choice.megapixels == SMALLEST_MEGAPIXELS
+
+
+def test_every_photo_is_seen_often_enough_before_photos_grow() -> None:
+    many = plan_for(120.0, photos=1_000)
+    assert many.options.iterations >= 0.99 * VISITS * 1_000
+    assert (many.megapixels or 0.5) < (plan_for(120.0, photos=10).megapixels or 0.5)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `dataset` and `init.ply`."""
+    folder = tmp_path_factory.mktemp("scene")
+    tiny_scene.write_dataset(folder / "dataset")
+    parts = {"undistort.dataset": folder / "dataset"}
+    initialize.run(InitializeConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    return folder
+
+
+def make_inputs(scene: Path, began_s: float = 0.0) -> Inputs:
+    parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
+    settings = {"evaluate.every": 4, "evaluate.views": ""}
+    return Inputs(parts, scene, settings, Machine("cpu", 1, began_s))
+
+
+def read_plan(out: Path) -> Plan:
+    return Plan.from_json((out / "plan.json").read_text())
+
+
+def digest(out: Path) -> str:
+    return hashlib.sha256((out / "model.ply").read_bytes() + (out / "history.json").read_bytes()).hexdigest()
+
+
+def test_a_budget_is_planned_told_and_ends_the_training(scene: Path, tmp_path: Path) -> None:
+    recorder = tiny_scene.Recorder()
+    summary = train.run(TrainConfig(time_budget_s=5.0), make_inputs(scene), tmp_path, recorder)
+    plan = read_plan(tmp_path)
+    assert 0.0 < plan.train_seconds < 5.0
+    assert summary["planned_iterations"] == plan.options.iterations
+    assert 0 < summary["iterations"] <= plan.last_iteration
+    assert recorder.notes[0] == plan.described() and "5 s budget" in recorder.notes[0]
+    assert summary["iterations"] >= plan.options.iterations or "its time is up" in recorder.notes[1]
+    assert len(read_splat(tmp_path / "model.ply")) == summary["gaussians"] > 0
+
+
+def test_time_that_is_gone_before_training_leaves_a_look_and_one_warning(scene: Path, tmp_path: Path) -> None:
+    recorder = tiny_scene.Recorder()
+    summary = train.run(
+        TrainConfig(time_budget_s=6.0), make_inputs(scene, time.monotonic() - 100.0), tmp_path, recorder
+    )
+    assert len(recorder.warnings) == 1 and "stages before training took 100 s of the 6 s" in recorder.warnings[0]
+    assert 0.0 < read_plan(tmp_path).train_seconds <= 0.1 * 6.0
+    assert summary["iterations"] >= 1
+
+
+def trained(scene: Path, out: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch) -> tiny_scene.Recorder:
+    """Train by a plan that was made before: measuring again would fail the test."""
+    out.mkdir(exist_ok=True)
+    if not (out / "plan.json").exists():
+        (out / "plan.json").write_text(plan.to_json())
+    monkeypatch.setattr(planning, "measure", None)
+    recorder = tiny_scene.Recorder()
+    train.run(TrainConfig(time_budget_s=600.0), make_inputs(scene), out, recorder)
+    return recorder
+
+
+@pytest.fixture
+def plan(scene: Path, tmp_path: Path) -> Plan:
+    """One of a budget, with fewer iterations than it has time for."""
+    options = {"iterations": 60, "densify_from": 10, "densify_every": 10, "densify_until": 40, "time_budget_s": 600.0}
+    (tmp_path / "first").mkdir()
+    train.run(
+        TrainConfig(**options | {"time_budget_s": 0.0}), make_inputs(scene), tmp_path / "first", tiny_scene.Recorder()
+    )
+    made = read_plan(tmp_path / "first")
+    budgeted = made.options.model_copy(update={"time_budget_s": 600.0})
+    return Plan(**{**vars(made), "options": budgeted, "megapixels": 0.002, "train_seconds": 500.0})
+
+
+class Killed(BaseException):
+    """Stands for a kill."""
+
+
+def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
+    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained(scene, tmp_path / "whole", plan, monkeypatch)
+    step = loop.train_step
+
+    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+        if state.iteration + 1 == 31:
+            raise Killed
+        step(state, plan, photo)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
+        patch.setattr(loop, "train_step", dying)
+        trained(scene, tmp_path / "killed", plan, patch)
+    assert (tmp_path / "killed" / loop.CHECKPOINT).exists()
+    recorder = trained(scene, tmp_path / "killed", plan, monkeypatch)
+    assert read_plan(tmp_path / "killed") == plan
+    assert not recorder.warnings and recorder.notes == [plan.described()]
+    assert digest(tmp_path / "killed") == digest(tmp_path / "whole")
+
+
+def test_the_deadline_ends_after_a_whole_iteration_that_is_as_without_it(
+    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained(scene, tmp_path / "whole", plan, monkeypatch)
+    short = Plan(**{**vars(plan), "train_seconds": 1e-9})
+    recorder = trained(scene, tmp_path / "short", short, monkeypatch)
+    assert "its time is up after 1 of 60 planned iterations" in recorder.notes[-1]
+    curve = json.loads((tmp_path / "short/history.json").read_text())["curve"]
+    assert [point["iteration"] for point in curve] == [1]
+    assert len(read_splat(tmp_path / "short/model.ply")) == plan.initial_gaussians
+
+
+def test_iterations_beyond_the_schedule_fill_the_time_and_change_none_before(
+    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained(scene, tmp_path / "schedule", plan, monkeypatch)
+    recorder = trained(scene, tmp_path / "longer", Plan(**{**vars(plan), "last_iteration": 80}), monkeypatch)
+    assert recorder.steps[-1] == (80, 80) and recorder.notes == [plan.described()]
+    longer, schedule = (json.loads((tmp_path / name / "history.json").read_text()) for name in ("longer", "schedule"))
+    assert longer["density"] == schedule["density"]
+    assert longer["curve"][0] == schedule["curve"][0]
+    assert [point["iteration"] for point in longer["curve"]] == [50, 80]
+    assert means_rate(plan, 80) == means_rate(plan, 60)
+    assert digest(tmp_path / "longer") != digest(tmp_path / "schedule")
+
+
+def test_photos_are_trained_on_and_measured_at_the_planned_size(
+    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    trained(scene, out, plan, monkeypatch)
+    widths = {point["width"] for point in json.loads((out / "history.json").read_text())["curve"]}
+    assert len(widths) == 1 and widths.pop() < tiny_scene.WIDTH
+    parts = {"train.model": out / "model.ply", "train.plan": out / "plan.json", "undistort.dataset": scene / "dataset"}
+    evaluate.run(EvaluateConfig(every=4), Inputs(parts, scene), out, tiny_scene.Recorder())
+    for view in json.loads((out / "metrics.json").read_text())["per_view"]:
+        assert view["width"] * view["height"] <= 2000 and view["psnr"] > 10.0
+
+
+def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused(scene: Path, tmp_path: Path) -> None:
+    count = len(read_splat(scene / "init.ply"))
+    config = TrainConfig(iterations=10, max_memory_bytes=resident_bytes() + FIXED_BYTES // 2)
+    with pytest.raises(MachineError, match="libraries take") as raised:
+        train.run(config, make_inputs(scene), tmp_path, tiny_scene.Recorder())
+    assert "--max-memory at least" in raised.value.hint
+    assert not (tmp_path / "plan.json").exists()
+    assert count < FEWEST_GAUSSIANS
+
+
+TRAIN_IN_LITTLE_MEMORY = """
+import json, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+import tiny_scene
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.engine.worker import peak_memory_bytes
+from splatpipe.stages import train
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.memory import FIXED_BYTES, resident_bytes
+
+scene, out = Path(sys.argv[2]), Path(sys.argv[3])
+limit = resident_bytes() + FIXED_BYTES + int(sys.argv[4])
+parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
+inputs = Inputs(parts, scene, {"evaluate.every": 4, "evaluate.views": ""}, Machine("cpu", 1))
+config = TrainConfig(iterations=40, densify_from=2, densify_every=1, densify_until=40, densify_gradient=1e-12,
+                     prune_opacity=0.0, prune_extent=0.0, max_memory_bytes=limit)
+recorder = tiny_scene.Recorder()
+summary = train.run(config, inputs, out, recorder)
+print(json.dumps({"limit": limit, "peak": peak_memory_bytes(), **summary, "warnings": recorder.warnings}))
+"""
+
+
+def in_little_memory(scene: Path, out: Path, room: int) -> dict[str, object]:
+    out.mkdir()
+    scenes = Path(__file__).parent / "scenes"
+    command = [sys.executable, "-c", TRAIN_IN_LITTLE_MEMORY, scenes, scene, out, room]
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    told: dict[str, object] = json.loads(done.stdout)
+    return told
+
+
+def test_a_memory_limit_binds_and_the_resident_memory_stays_below_it(scene: Path, tmp_path: Path) -> None:
+    room = 30_000_000
+    told = in_little_memory(scene, tmp_path / "out", room)
+    cap = read_plan(tmp_path / "out").options.max_gaussians
+    assert cap < room // bytes_per_gaussian(TrainConfig()) < TrainConfig().max_gaussians
+    assert 0.9 * cap < told["gaussians"] <= cap  # type: ignore[operator]
+    assert told["peak"] <= told["limit"]  # type: ignore[operator]
+
+
+def test_growth_ends_where_memory_runs_out_all_the_same(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "over_memory", lambda options: True)
+    config = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=60, densify_gradient=1e-9)
+    recorder = tiny_scene.Recorder()
+    train.run(config, make_inputs(scene), tmp_path, recorder)
+    assert len(recorder.warnings) == 1 and "no Gaussian is added after iteration 10" in recorder.warnings[0]
+    history = json.loads((tmp_path / "history.json").read_text())
+    assert history["growth_ended"] == 10 and [event["iteration"] for event in history["density"]] == [10]
