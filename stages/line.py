@@ -238,7 +238,7 @@ INITIALIZE = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=1,
+    version=2,
     config=TrainConfig,
     reads=("undistort.dataset", "initialize.splat"),
     parts={"model": "model.ply", "history": "history.json", "plan": "plan.json"},
@@ -248,7 +248,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=1,
+    version=2,
     config=EvaluateConfig,
     reads=("train.model", "train.plan", "undistort.dataset"),
     parts={"metrics": "metrics.json", "views": "views"},

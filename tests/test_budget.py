@@ -109,14 +109,6 @@ def test_durations_are_told_as_people_say_them() -> None:
     assert {seconds: duration(seconds) for seconds in said} == said
 
 
-def test_room_grows_linearly_from_the_start_to_the_cap() -> None:
-    options = resolve_schedule(TrainConfig(iterations=100, densify_from=10, densify_until=50, max_gaussians=900))
-    assert [room_at(options, 100, i) for i in (1, 10, 20, 30, 50, 100)] == [100, 100, 300, 500, 900, 900]
-    assert room_at(options, 2000, 1) == 900
-    still = options.model_copy(update={"densify": False})
-    assert room_at(still, 100, 100) == 100
-
-
 def test_a_speed_is_found_again_from_its_timings() -> None:
     sizes = [(n, p) for n in (5_000, 60_000) for p in (100_000, 400_000, 1_600_000)]
     fitted = fit_speed([Timing(n, p, SPEED.seconds(n, p)) for n, p in sizes])
