@@ -117,7 +117,7 @@ class TrainConfig(StageConfig):
     """Last iteration of density control. Auto: half of the run."""
     densify_every: Length = "auto"
     """Iterations between its steps. Auto: 100, at most a tenth of the run."""
-    densify_gradient: PositiveFloat = 4e-4
+    densify_gradient: PositiveFloat = 1.2e-3
     """Gaussians are densified whose pixels' image-plane gradients (NDC), as magnitudes, sum to more than this."""
     split_extent: PositiveFloat = 0.01
     """Those larger than this share of the scene's extent are split, smaller ones cloned."""

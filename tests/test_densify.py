@@ -87,11 +87,12 @@ def test_halved_opacity_is_exact_for_any_logit(logit: float) -> None:
     assert halved == pytest.approx(math.log(alpha) - math.log1p(through) - math.log(through), rel=1e-9)
 
 
-def test_gaussians_rise_evenly_to_the_cap() -> None:
+def test_gaussians_rise_to_the_cap_fast_at_first() -> None:
     options = resolve_schedule(TrainConfig(iterations=4000, max_gaussians=1000))  # steps at 500, 600, ..., 2000
     steps = [room_at(options, 100, iteration) for iteration in range(500, 2001, 100)]
-    assert steps[-1] == 1000
-    assert {after - before for before, after in pairwise([100, *steps])} == {56, 57}  # 900 in 16 steps
+    assert steps[-1] == 1000 and steps[7] == 775  # half of the steps done: three quarters of the growth
+    growth = [after - before for before, after in pairwise([100, *steps])]
+    assert all(earlier >= later - 1 for earlier, later in pairwise(growth)) and growth[0] > 15 * growth[-1]
     assert room_at(options, 100, 400) == 100 and room_at(options, 5000, 1000) == 1000
     assert room_at(options.model_copy(update={"densify": False}), 100, 1000) == 100
 
