@@ -113,7 +113,7 @@ def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
     """The most Gaussians that density control leaves: up to the cap, fast at first and slower towards its last step.
 
     What comes early has time to be trained; what comes late has the better score. With x the share of the steps done,
-    the share of the growth is x (2 - x): an even rise was 0.1 to 0.3 dB lower on the captures tried.
+    the share of the growth is x (2 - x).
 
     Args:
         options: Resolved.
