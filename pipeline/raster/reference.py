@@ -224,8 +224,10 @@ def _blend_rows(
     top, bottom, width, magnitudes = size
     ys = torch.arange(top, bottom, dtype=means.dtype, device=means.device) + 0.5
     xs = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
-    shift = _SumOfMagnitudes.apply(probe, bottom - top, width) if magnitudes else probe[:, None, None]  # (n, r, w, 2)
-    dx = (xs[None, :] - means[:, None, 0])[:, None, :] - shift[..., 0]  # (n, r, w), each 1 where it does not matter
+    shift = probe[:, None, None]  # (n, r, w, 2), or broadcast
+    if magnitudes:
+        shift = _SumOfMagnitudes.apply(probe, bottom - top, width)  # type: ignore[no-untyped-call]
+    dx = (xs[None, :] - means[:, None, 0])[:, None, :] - shift[..., 0]  # (n, r, w), or broadcast
     dy = (ys[None, :] - means[:, None, 1])[:, :, None] - shift[..., 1]
     xy, yy = covariances[:, 1, None, None], covariances[:, 2, None, None]
     # dᵀ Σ'⁻¹ d as a sum of squares, which does not cancel in long thin Gaussians.
