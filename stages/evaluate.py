@@ -76,6 +76,7 @@ def as_trained(plan: Path, gaussians: Gaussians) -> tuple[raster.RenderOptions, 
             background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
             antialias=bool(fields["options"]["antialias"]),
             near=float(fields["near"]),
+            depth=False,
         )
         return options, None if fields["megapixels"] is None else float(fields["megapixels"])
     except (OSError, ValueError, KeyError, TypeError) as error:

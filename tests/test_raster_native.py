@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.raster import Render, RenderOptions, _native, render, set_threads
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
@@ -276,6 +277,19 @@ def same_bits(a: Outcome, b: Outcome) -> bool:
     return all(torch.equal(getattr(a.render, p), getattr(b.render, p)) for p in pictures) and all(
         torch.equal(a.gradients[name], b.gradients[name]) for name in a.gradients
     )
+
+
+def test_more_pairs_than_indices_hold_are_refused() -> None:
+    # 4096 tiles in a row, and each of 2^19 Gaussians covers them all: one pair more than 2^31 - 1.
+    one = Gaussians.empty(1, 0)
+    one.log_scales += 8.0
+    one.means += torch.tensor([0.0, 0.0, 100.0])
+    scene = one.select(torch.zeros(1 << 19, dtype=torch.int64))
+    camera = Camera("wide", 65_536, 16, 1000.0, 1000.0, 32_768.0, 8.0, np.eye(4))
+    with pytest.raises(SplatpipeError, match="32-bit") as raised:
+        render(scene, camera, RenderOptions(0, near=0.2, depth=False), backend="native")
+    assert "max_gaussians" in raised.value.hint
+    assert torch.isfinite(render(random_scene(1), random_camera(1), RenderOptions(3)).colour).all()  # it goes on
 
 
 def test_any_number_of_threads_leaves_the_same_bits() -> None:

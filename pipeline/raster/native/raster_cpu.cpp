@@ -87,12 +87,12 @@ void RasterFrame::project(const Parameters& in, float* radii, uint8_t* visible) 
 
 // Each splat's spans and slots, and the visible Gaussians in a row for the sort.
 void RasterFrame::find_tiles(int64_t count) {
+    if (rows_ > kMaxPairs) throw TooManyPairs();
     TaskCounts* tasks = tasks_.data();
     data_.spans = spans_.reserve(rows_);
     uint32_t* keys = sort_keys_.reserve(2 * visible_);
     int32_t* order = sort_order_.reserve(2 * visible_);
     const ProjectKernels& kernels = SPLAT_KERNELS(project_kernels);
-    if (rows_ > kMaxPairs) throw TooManyPairs();
     for_tasks(count, [&](int64_t task, int64_t begin, int64_t end) {
         tasks[task].pairs = kernels.find_spans(view_, begin, end, data_, tasks[task].rows);
         int64_t at = tasks[task].visible;
