@@ -50,6 +50,8 @@ Row = dict[str, Any]
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
 PARTS = ("forward", "loss", "backward", "adam")
 
+DEFAULT_START = InitializeConfig()
+
 
 class SilentReporter:
     """A stage's Reporter that tells nothing."""
@@ -228,7 +230,14 @@ def point_sets(data: Path) -> list[Path]:
     return found
 
 
-def prepare(data: Path, points: str, factor: float, folder: Path, photos: int | None = None) -> Path:
+def prepare(
+    data: Path,
+    points: str,
+    factor: float,
+    folder: Path,
+    photos: int | None = None,
+    start: InitializeConfig = DEFAULT_START,
+) -> Path:
     """Write a dataset's photos and cameras in another size, lossless, as training reads them.
 
     Args:
@@ -237,6 +246,7 @@ def prepare(data: Path, points: str, factor: float, folder: Path, photos: int | 
         factor: On both sides of every photo.
         folder: Where.
         photos: Only so many, the first in name order; None for all.
+        start: How the points become Gaussians.
     """
     whole = folder / "whole"  # the same under the names that the line has
     whole.mkdir(parents=True)
@@ -261,7 +271,7 @@ def prepare(data: Path, points: str, factor: float, folder: Path, photos: int | 
         if (mask := load_mask(view)) is not None:
             share = cv2.resize(mask.astype(np.float32), size, interpolation=how)
             _write_png(mask_path(folder, view.camera.name), np.where(share > 1.0 - 1e-6, 255, 0))
-    initialize.run(InitializeConfig(), Inputs({"undistort.dataset": whole}, folder), folder, SilentReporter())
+    initialize.run(start, Inputs({"undistort.dataset": whole}, folder), folder, SilentReporter())
     return folder
 
 

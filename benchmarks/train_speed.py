@@ -23,6 +23,8 @@ from measure import (
     time_case,
 )
 
+from splatpipe.stages.line import InitializeConfig
+
 COLUMNS = {
     "points": "points:",
     "Gauss.": "gaussians:,",
@@ -48,6 +50,7 @@ def main() -> None:
     options.add_argument("--megapixels", type=float, nargs="+", default=[0.1, 0.4, 1.6])
     options.add_argument("--points", nargs="+", help="names of the point sets; all without any")
     options.add_argument("--sh-degree", type=int, default=3, choices=range(4))
+    options.add_argument("--max-angle", type=float, default=0.1, help="initialize.max_angle; 1 leaves sizes uncapped")
     options.add_argument("--no-statistics", action="store_true", help="as in the half without density control")
     options.add_argument("--repeats", type=int, default=30, help="iterations that count")
     options.add_argument("--warmup", type=int, default=5, help="iterations before them, at least an epoch")
@@ -57,11 +60,12 @@ def main() -> None:
         return
     facts = machine(arguments.threads)
     rows: list[Row] = []
+    start = InitializeConfig(max_angle=arguments.max_angle)
     with scratch() as folder:
         for points in arguments.points or [path.name for path in point_sets(arguments.data)]:
             for megapixels in arguments.megapixels:
                 factor = size_factor(arguments.data, megapixels)
-                dataset = prepare(arguments.data, points, factor, folder / f"{points}-{megapixels}")
+                dataset = prepare(arguments.data, points, factor, folder / f"{points}-{megapixels}", start=start)
                 case = Case(
                     str(dataset),
                     str(dataset / "init.ply"),

@@ -8,6 +8,10 @@
 #include <new>
 #include <stdexcept>
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 #include "raster.h"
 
 #if defined(__SANITIZE_ADDRESS__)
@@ -42,16 +46,20 @@ class Buffer {
     T* data() const { return data_; }
 
   private:
-    static constexpr std::size_t kLine = 64;  // of the cache
+    static constexpr std::size_t kLine = 64, kHugePage = 2 << 20;  // bytes, of the cache and of memory
 
     void grow(int64_t count) {
         std::free(data_);
         data_ = nullptr, capacity_ = 0;
         const int64_t wanted = count + count / 4;  // densification grows a scene step by step
-        const std::size_t lines = (static_cast<std::size_t>(wanted) * sizeof(T) + kLine - 1) / kLine;
-        data_ = static_cast<T*>(std::aligned_alloc(kLine, lines * kLine));
+        const std::size_t bytes = static_cast<std::size_t>(wanted) * sizeof(T);
+        const std::size_t unit = bytes < kHugePage ? kLine : kHugePage, size = (bytes + unit - 1) / unit * unit;
+        data_ = static_cast<T*>(std::aligned_alloc(unit, size));
         if (!data_) throw std::bad_alloc();
-        capacity_ = static_cast<int64_t>(lines * kLine / sizeof(T));
+#if defined(__linux__)  // splats and slots are visited in all orders: with pages of 4 KiB the CPU looks up most of them
+        if (unit == kHugePage) madvise(data_, size, MADV_HUGEPAGE);
+#endif
+        capacity_ = static_cast<int64_t>(size / sizeof(T));
     }
 
     T* data_ = nullptr;
