@@ -30,7 +30,7 @@ VISITS = 10  # iterations a photo at least: one seen less often leaves floaters 
 FIRST_GROWTH = 1.5  # times the initial Gaussians that every plan has room for, before it takes larger photos
 FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer; the plan thins the initial ones down to it at most
 COARSEST_MEGAPIXELS = 0.05  # photos are halved at the start of a training no further than to this
-LOW_GRADIENT = 2e-5  # NDC; low enough that Gaussians follow ``room_at`` and so the forecast
+GRADIENT_SHARE = 0.5  # of ``densify_gradient``: Gaussians follow ``room_at``, and so the forecast, but not into noise
 
 EXPORT_GAUSSIAN_S = 8e-6  # a Gaussian of the model moved, written twice and hashed
 AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
@@ -233,7 +233,7 @@ def planned_options(config: TrainConfig, megapixels: float, cap: int, iterations
         "iterations": iterations,
         "max_gaussians": cap,
         "coarse_levels": max(config.coarse_levels, min(2, halvings)),
-        "densify_gradient": min(config.densify_gradient, LOW_GRADIENT),
+        "densify_gradient": GRADIENT_SHARE * config.densify_gradient,
     }
     return resolve_schedule(config.model_copy(update=planned))
 

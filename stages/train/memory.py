@@ -12,12 +12,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 from dataclasses import replace
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.budget import FEWEST_GAUSSIANS
@@ -30,7 +31,7 @@ STATISTICS_BYTES = 12
 PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
 PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
 FIXED_BYTES = 100_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
-GROWTH_STOPS_AT = 0.97  # of the limit: what is measured over it after a step of density control was no surprise then
+GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
 
 
 def bytes_per_gaussian(options: TrainConfig) -> int:
@@ -51,13 +52,14 @@ def within_memory(plan: Plan, largest_pixels: int, report: Reporter) -> Plan:
     Raises:
         MachineError: if not even the fewest fit beside what the process has already.
     """
+    return_free_heap()
     limit, taken = plan.options.max_memory_bytes, resident_bytes()
     room = limit - taken - FIXED_BYTES - PIXEL_BYTES * largest_pixels
     most = room // bytes_per_gaussian(plan.options)
     if most < min(FEWEST_GAUSSIANS, plan.initial_gaussians):
         least = limit - room + FEWEST_GAUSSIANS * bytes_per_gaussian(plan.options)
         raise MachineError(
-            f"Training cannot keep to {limit / 1e9:.2f} GB: its libraries take {taken / 1e9:.2f} GB of them, "
+            f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB of them already, "
             f"and photos of {largest_pixels / 1e6:.1f} megapixels need room, too.",
             hint=f"Give --max-memory at least {least / 1e6 + 1:.0f}M, or lower undistort.max_megapixels.",
         )
@@ -78,12 +80,18 @@ def over_memory(options: TrainConfig) -> bool:
     checkpoints: besides the deadline the one thing that a machine may change in a planned training, and it is told.
     """
     limit = options.max_memory_bytes
-    return limit > 0 and peak_memory_bytes() > GROWTH_STOPS_AT * limit
+    return limit > 0 and resident_bytes() > GROWTH_STOPS_AT * limit
 
 
 def without_growth(options: TrainConfig) -> TrainConfig:
     """The options without density control: no Gaussian comes, none goes, no opacity is reset."""
     return options.model_copy(update={"densify": False})
+
+
+def return_free_heap() -> None:
+    """Give back what the stages before have freed: glibc keeps it for the process."""
+    with contextlib.suppress(OSError, AttributeError):  # another libc
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def resident_bytes() -> int:
