@@ -30,7 +30,7 @@ STATE_COPIES = 4  # a parameter has a gradient and two moments
 STATISTICS_BYTES = 12
 PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
 PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
-FIXED_BYTES = 100_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
+FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
 GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
 
 
