@@ -13,7 +13,7 @@ namespace {
 
 constexpr int64_t kGaussiansATask = 1024;  // of the projection: some 100 µs
 constexpr int64_t kSplatsAChunk = 4096;    // of the binning, at least: each chunk has a counter a tile
-constexpr int64_t kKeysAChunk = 8192;     // of the sort, at least: each chunk has 2048 counters
+constexpr int64_t kKeysAChunk = 8192;      // of the sort, at least: each chunk has 2048 counters
 constexpr int kAhead = 8;                  // splats fetched in advance
 constexpr int64_t kMaxPairs = std::numeric_limits<int32_t>::max();
 constexpr std::size_t kKeptFrames = 2;
