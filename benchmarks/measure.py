@@ -269,8 +269,8 @@ def prepare(
             folder / IMAGES / view.camera.name, cv2.resize(load_colour(view), size, interpolation=how)[:, :, ::-1]
         )
         if (mask := load_mask(view)) is not None:
-            share = cv2.resize(mask.astype(np.float32), size, interpolation=how)
-            _write_png(mask_path(folder, view.camera.name), np.where(share > 1.0 - 1e-6, 255, 0))
+            masked = cv2.resize((~mask).astype(np.float32), size, interpolation=how)  # the share of masked pixels
+            _write_png(mask_path(folder, view.camera.name), np.where(masked == 0.0, 255, 0))
     initialize.run(start, Inputs({"undistort.dataset": whole}, folder), folder, SilentReporter())
     return folder
 

@@ -22,7 +22,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.evaluate import as_trained, measure, render_pixels
-from splatpipe.stages.line import LineConfig, TrainConfig
+from splatpipe.stages.line import EvaluateConfig, LineConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
 from splatpipe.stages.train.state import TrainState
@@ -80,7 +80,7 @@ def follow(dataset: Path, config: TrainConfig, arguments: argparse.Namespace) ->
     clocks, due, peak = Clocks(), arguments.every, 0
     views = load_views(dataset)
     start = read_splat(dataset / "init.ply")
-    plan = make_plan(config, views, 0, arguments.held_out, len(start))
+    plan = make_plan(config, views, EvaluateConfig().every, arguments.held_out, len(start))
     names = set(plan.train_views)
     levels = coarse_levels(plan.options)
     with loop.same_bits(arguments.threads):
@@ -129,7 +129,7 @@ def passed(rows: list[Row], marks: list[float]) -> Iterator[Row]:
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--held-out", required=True, help="names of the photos to hold out, separated by commas")
+    options.add_argument("--held-out", default="", help="photos to hold out, separated by commas; or every 8th")
     size = options.add_mutually_exclusive_group()
     size.add_argument("--megapixels", type=float, help="size that photos are reduced to")
     size.add_argument("--scale", type=float, default=1.0, help="factor on their sides instead")

@@ -189,8 +189,9 @@ def demo(
     """Run the line on the capture that ships with splatpipe, to see it work."""
     from splatpipe.demo import capture_path
 
-    assignments = _with_budgets(assignments, time_budget, max_memory)
-    run(capture_path(), out, preset, None, assignments, device=device, threads=threads, seed=seed, as_json=as_json)
+    budgets = {"time_budget": time_budget, "max_memory": max_memory}
+    machine = {"device": device, "threads": threads, "seed": seed, "as_json": as_json}
+    run(capture_path(), out, preset, None, assignments, **budgets, **machine)  # type: ignore[arg-type]
 
 
 @app.command()

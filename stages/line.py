@@ -92,7 +92,7 @@ class TrainConfig(StageConfig):
     seed: NonNegativeInt = 0
     """Seed of the order of photos and of density control."""
     max_gaussians: PositiveInt = 1_000_000
-    """Hard cap on Gaussians, about 1 kB of memory each; where it binds, the largest gradients are densified first."""
+    """Hard cap on Gaussians, at most 1.8 kB of memory each; where it binds, the largest scores are densified first."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics that are trained."""
     sh_every: Length = "auto"

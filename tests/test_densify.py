@@ -80,6 +80,11 @@ def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
     assert growth.opacity_logits[1] == gaussians.opacity_logits[2]
 
 
+def test_halved_opacity_stays_finite_in_float32() -> None:
+    halved = half_opacity(torch.tensor([-1000.0, -210.0, 210.0, 1000.0]))
+    torch.testing.assert_close(halved, torch.tensor([-1000.0 - math.log(2.0), -210.0 - math.log(2.0), 105.0, 500.0]))
+
+
 @pytest.mark.parametrize("logit", [-80.0, -20.0, 0.0, 9.0, 80.0])
 def test_halved_opacity_is_exact_for_any_logit(logit: float) -> None:
     halved = float(half_opacity(torch.tensor([logit], dtype=torch.float64)))
@@ -95,6 +100,8 @@ def test_gaussians_rise_to_the_cap_fast_at_first() -> None:
     assert all(earlier >= later - 1 for earlier, later in pairwise(growth)) and growth[0] > 15 * growth[-1]
     assert room_at(options, 100, 400) == 100 and room_at(options, 5000, 1000) == 1000
     assert room_at(options.model_copy(update={"densify": False}), 100, 1000) == 100
+    never = options.model_copy(update={"densify_until": 400})  # ends before it begins
+    assert [room_at(never, 100, iteration) for iteration in (1, 400, 500, 4000)] == [100] * 4
 
 
 def test_transparent_huge_and_broken_gaussians_are_pruned() -> None:

@@ -1,11 +1,15 @@
 """The native photometric loss against its definition by kornia in float64."""
 
 import functools
+from pathlib import Path
 
 import kornia
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from splatpipe.demo import capture_path
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 
@@ -23,6 +27,13 @@ def smooth(h: int, w: int) -> torch.Tensor:
     return torch.stack([0.5 + 0.4 * torch.sin(x / 30), 0.5 + 0.45 * torch.cos(y / 25), (x + y) / (h + w)], dim=-1)
 
 
+def crop(path: Path, h: int, w: int) -> torch.Tensor:
+    """A part of a photo that has some of everything."""
+    with Image.open(path) as image:
+        part = np.array(image.convert("RGB"))[200 : 200 + h, 300 : 300 + w]
+    return torch.from_numpy(part.astype(np.float32) / 255.0)
+
+
 def pair(kind: str, h: int, w: int) -> tuple[torch.Tensor, torch.Tensor]:
     """A render and its photo."""
     generator = torch.Generator().manual_seed(h * w)
@@ -38,6 +49,9 @@ def pair(kind: str, h: int, w: int) -> tuple[torch.Tensor, torch.Tensor]:
             return 0.01 * noise, torch.zeros(h, w, 3)
         case "white":
             return 1 - 0.01 * noise, torch.ones(h, w, 3)
+        case "photo":  # two neighbouring photos of a house: edges, shadows, sky
+            first, second = sorted(capture_path().glob("*.JPG"))[:2]
+            return crop(first, h, w), crop(second, h, w)
         case _:
             raise ValueError(kind)
 
@@ -79,7 +93,7 @@ def isa(request):
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("kind", ["random", "smooth", "nearly equal", "black", "white"])
+@pytest.mark.parametrize("kind", ["random", "smooth", "nearly equal", "black", "white", "photo"])
 def test_native_loss_and_gradient_are_the_reference(isa, kind, size):
     assert_as_reference(kind, size)
 

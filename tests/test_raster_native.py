@@ -279,6 +279,20 @@ def same_bits(a: Outcome, b: Outcome) -> bool:
     )
 
 
+def test_a_render_keeps_its_instruction_set_for_its_gradient() -> None:
+    scene, camera, options = random_scene(12), random_camera(12), RenderOptions(3, near=0.2)
+    expected = evaluate(scene, camera, options).gradients["means"]
+    leaves = scene.detach().clone().requires_grad_()
+    result = render(leaves, camera, options, backend="native")
+    generator = torch.Generator().manual_seed(5)
+    pictures = (result.colour, result.alpha[..., None], result.depth_sum[..., None])
+    total = sum((picture * torch.randn(picture.shape, generator=generator)).sum() for picture in pictures)
+    for other in _native.isas():
+        _native.set_isa(other)
+        gradient = torch.autograd.grad(total, leaves.means, retain_graph=True)[0]
+        torch.testing.assert_close(gradient, expected, rtol=0.0, atol=0.0)
+
+
 def test_more_pairs_than_indices_hold_are_refused() -> None:
     # 4096 tiles in a row, and each of 2^19 Gaussians covers them all: one pair more than 2^31 - 1.
     one = Gaussians.empty(1, 0)

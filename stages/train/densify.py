@@ -122,7 +122,7 @@ def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
     """
     first, last, every = int(options.densify_from), int(options.densify_until), int(options.densify_every)
     initial = min(initial, options.max_gaussians)
-    if not options.densify or iteration < first:
+    if not options.densify or iteration < first or last < first:
         return initial
     done = min(1.0, (iteration - first + every) / (last - first + every))
     return initial + int(done * (2.0 - done) * (options.max_gaussians - initial))
@@ -171,9 +171,9 @@ def half_opacity(logits: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
 
     Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024, eq. 9.
     """
-    through = torch.exp(0.5 * torch.nn.functional.logsigmoid(-logits))  # √(1 - α), exact for any logit
+    log_through = 0.5 * torch.nn.functional.logsigmoid(-logits)  # ln √(1 - α), finite for any logit
     # 1 - √(1 - α) = α / (1 + √(1 - α)), which does not cancel for small α.
-    return torch.nn.functional.logsigmoid(logits) - torch.log1p(through) - torch.log(through)
+    return torch.nn.functional.logsigmoid(logits) - torch.log1p(torch.exp(log_through)) - log_through
 
 
 def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit: int) -> Int64[Tensor, " k"]:

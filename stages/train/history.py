@@ -18,7 +18,7 @@ class History:
     """The curve of the loss and the events of density control.
 
     Attributes:
-        curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and halvings of the photos.
+        curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and width of the photo.
         density: Steps of density control.
         resets: Iterations after which opacities were reset.
         growth_ended: Iteration from which memory allowed no more Gaussians; 0 where it did.

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import torch
 
 from splatpipe.pipeline import raster
@@ -112,13 +113,15 @@ def check_device(machine: Machine) -> None:
 @contextmanager
 def same_bits(threads: int) -> Iterator[None]:
     """Give the native kernels their threads and torch one: its sums depend on how many there are."""
-    before = torch.get_num_threads()
+    before, before_cv2 = torch.get_num_threads(), cv2.getNumThreads()
     raster.set_threads(threads)
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)  # the reader's photos are resized on its one thread
     try:
         yield
     finally:
         torch.set_num_threads(before)
+        cv2.setNumThreads(before_cv2)
 
 
 def resume(path: Path, plan: Plan, report: Reporter) -> TrainState | None:
@@ -222,7 +225,7 @@ def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str
 def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
-    observed = options.densify and iteration <= int(options.densify_until)
+    observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
     settings = raster.RenderOptions(
         sh_degree=sh_degree_at(options, iteration),
         background=background(options, iteration),

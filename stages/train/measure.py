@@ -83,8 +83,8 @@ def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, eff
     # Cost grows a little slower than size, so the line through two sizes is right near them only.
     megapixels = SMALLEST_MEGAPIXELS * max(2.0, effort.iteration_s / first.seconds)
     large, decode_s = _photos(chosen, megapixels)
-    _evaluation_seconds(states[0].finished(), small[0], plan)  # pays for what is loaded once
-    evaluate_s = _evaluation_seconds(states[0].finished(), large[0], plan)
+    _evaluation_seconds(states[-1].finished(), small[0], plan)  # pays for what is loaded once
+    evaluate_s = _evaluation_seconds(states[-1].finished(), large[0], plan)
     timings = [first]
     for photos in zip(small, large, strict=True):
         for state in states:
@@ -157,7 +157,9 @@ def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Plan) 
     """What a held-out view takes a megapixel: a render, every measure, the pictures as PNG."""
     began = time.monotonic()
     with torch.no_grad():
-        options = raster.RenderOptions(sh_degree=gaussians.sh_degree, antialias=plan.options.antialias, near=plan.near)
+        options = raster.RenderOptions(
+            gaussians.sh_degree, antialias=plan.options.antialias, near=plan.near, depth=False
+        )
         colour = raster.render(gaussians, photo.camera, options).colour.clamp(0.0, 1.0)
     for function in metrics.METRICS.values():
         try:

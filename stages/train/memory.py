@@ -31,6 +31,7 @@ STATISTICS_BYTES = 12
 PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
 PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
 FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
+RESIDENT_STEP = 16_000_000  # what the process has is rounded up to it: a few pages more or less change no plan
 GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
 
 
@@ -53,7 +54,7 @@ def within_memory(plan: Plan, largest_pixels: int, report: Reporter) -> Plan:
         MachineError: if not even the fewest fit beside what the process has already.
     """
     return_free_heap()
-    limit, taken = plan.options.max_memory_bytes, resident_bytes()
+    limit, taken = plan.options.max_memory_bytes, -(-resident_bytes() // RESIDENT_STEP) * RESIDENT_STEP
     room = limit - taken - FIXED_BYTES - PIXEL_BYTES * largest_pixels
     most = room // bytes_per_gaussian(plan.options)
     if most < min(FEWEST_GAUSSIANS, plan.initial_gaussians):
@@ -80,7 +81,10 @@ def over_memory(options: TrainConfig) -> bool:
     checkpoints: besides the deadline the one thing that a machine may change in a planned training, and it is told.
     """
     limit = options.max_memory_bytes
-    return limit > 0 and resident_bytes() > GROWTH_STOPS_AT * limit
+    if limit == 0 or resident_bytes() <= GROWTH_STOPS_AT * limit:
+        return False
+    return_free_heap()
+    return resident_bytes() > GROWTH_STOPS_AT * limit
 
 
 def without_growth(options: TrainConfig) -> TrainConfig:

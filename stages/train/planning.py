@@ -93,7 +93,7 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
         last_iteration=choice.last_iteration,
         megapixels=choice.megapixels,
         train_megapixels=mean_megapixels(cameras, choice.megapixels),
-        train_seconds=round(choice.seconds, 2),
+        train_seconds=max(0.01, round(choice.seconds, 2)),
         forecast_seconds=round(choice.forecast_s, 2),
     )
 
@@ -125,6 +125,6 @@ def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
         photos=len(cameras),
         megapixels=mean_megapixels(cameras),
         speed=measured.speed,
-        prepare_s=measured.decode_s * len(cameras) / scene.machine.threads,
+        prepare_s=measured.decode_s * len(cameras),
         seconds=seconds,
     )

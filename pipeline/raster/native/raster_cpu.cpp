@@ -34,6 +34,7 @@ void for_tasks(int64_t count, const Body& body) {
 
 void RasterFrame::forward(const View& view, const Parameters& in, const Pictures& out, float* radii, uint8_t* visible) {
     view_ = view;
+    project_ = &SPLAT_KERNELS(project_kernels), blend_ = &SPLAT_KERNELS(blend_kernels);
     const int tiles = tile_count(view);
     data_.transmittance = transmittance_.reserve(int64_t{tiles} * kTilePixels);
     data_.pixel_end = pixel_end_.reserve(int64_t{tiles} * kTilePixels);
@@ -41,27 +42,23 @@ void RasterFrame::forward(const View& view, const Parameters& in, const Pictures
     find_tiles(in.count);
     sort_by_depth();
     bin();
-    const BlendKernels& blend = SPLAT_KERNELS(blend_kernels);
-    data_.pair_blocks = pair_blocks_.reserve(pairs_ * blend.mask_bytes);
-    parallel_for(tiles, [&](int64_t tile) { blend.blend_tile(view_, data_, static_cast<int>(tile), out); });
+    data_.pair_blocks = pair_blocks_.reserve(pairs_ * blend_->mask_bytes);
+    parallel_for(tiles, [&](int64_t tile) { blend_->blend_tile(view_, data_, static_cast<int>(tile), out); });
 }
 
 void RasterFrame::backward(const Parameters& in, const PictureGradients& gradients, const ParameterGradients& out) {
     data_.slots = slots_.reserve(pairs_ * kSlotFloats);
-    const BlendKernels& blend = SPLAT_KERNELS(blend_kernels);
     parallel_for(tile_count(view_), [&](int64_t tile) {
-        blend.blend_tile_backward(view_, data_, static_cast<int>(tile), gradients, out.magnitudes);
+        blend_->blend_tile_backward(view_, data_, static_cast<int>(tile), gradients, out.magnitudes);
     });
-    const ProjectKernels& project = SPLAT_KERNELS(project_kernels);
     for_tasks(in.count, [&](int64_t, int64_t begin, int64_t end) {
-        project.project_backward(view_, in, begin, end, data_, out);
+        project_->project_backward(view_, in, begin, end, data_, out);
     });
 }
 
 int64_t RasterFrame::contributions() const {
-    const BlendKernels& blend = SPLAT_KERNELS(blend_kernels);
     int64_t count = 0;
-    for (int tile = 0; tile < tile_count(view_); ++tile) count += blend.count_contributions(view_, data_, tile);
+    for (int tile = 0; tile < tile_count(view_); ++tile) count += blend_->count_contributions(view_, data_, tile);
     return count;
 }
 
@@ -70,9 +67,8 @@ void RasterFrame::project(const Parameters& in, float* radii, uint8_t* visible) 
     data_.keys = keys_.reserve(in.count);
     data_.touched = touched_.reserve(in.count + 1);
     TaskCounts* tasks = tasks_.reserve(divide_up(in.count, kGaussiansATask));
-    const ProjectKernels& kernels = SPLAT_KERNELS(project_kernels);
     for_tasks(in.count, [&](int64_t task, int64_t begin, int64_t end) {
-        kernels.project(view_, in, begin, end, data_, radii, visible);
+        project_->project(view_, in, begin, end, data_, radii, visible);
         TaskCounts counts{0, 0, 0};
         for (int64_t i = begin; i < end; ++i)
             counts.visible += data_.keys[i] != kCulled, counts.rows += data_.touched[i].rows;
@@ -92,9 +88,8 @@ void RasterFrame::find_tiles(int64_t count) {
     data_.spans = spans_.reserve(rows_);
     uint32_t* keys = sort_keys_.reserve(2 * visible_);
     int32_t* order = sort_order_.reserve(2 * visible_);
-    const ProjectKernels& kernels = SPLAT_KERNELS(project_kernels);
     for_tasks(count, [&](int64_t task, int64_t begin, int64_t end) {
-        tasks[task].pairs = kernels.find_spans(view_, begin, end, data_, tasks[task].rows);
+        tasks[task].pairs = project_->find_spans(view_, begin, end, data_, tasks[task].rows);
         int64_t at = tasks[task].visible;
         for (int64_t i = begin; i < end; ++i)
             if (data_.keys[i] != kCulled) keys[at] = data_.keys[i], order[at++] = static_cast<int32_t>(i);

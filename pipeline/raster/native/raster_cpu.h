@@ -92,6 +92,8 @@ class RasterFrame {
     void bin();
     void prefix_tiles(int chunks, int tiles);
 
+    const ProjectKernels* project_ = nullptr;  // of the last forward(), which lays out what the others read
+    const BlendKernels* blend_ = nullptr;
     View view_{};
     FrameData data_{};
     int64_t visible_ = 0, rows_ = 0, pairs_ = 0;

@@ -2,6 +2,7 @@
 // with operators; what the compilers' vector extensions lack is here. Everything has internal linkage (see isa.h).
 #pragma once
 
+#include <stddef.h>
 #include <stdint.h>
 
 #if defined(__x86_64__)

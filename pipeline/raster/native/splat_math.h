@@ -24,9 +24,6 @@ SPLAT_INLINE Vec3 cross(const Vec3& a, const Vec3& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 SPLAT_INLINE Vec3 fill3(const float* p) { return {fill(p[0]), fill(p[1]), fill(p[2])}; }
-SPLAT_INLINE Vec3 gather3(const float* p, int stride) {
-    return {gather(p, stride), gather(p + 1, stride), gather(p + 2, stride)};
-}
 
 // The raw parameters of a vector of Gaussians, SH apart.
 struct Lanes {
