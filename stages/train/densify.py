@@ -5,7 +5,7 @@ section 5 and its published settings, changed in three ways. The score of a Gaus
 gradients, which do not cancel in one that is too large for what it covers (Ye et al., "AbsGS", ACM MM 2024). The number
 of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
 "Taming 3DGS", SIGGRAPH Asia 2024). And two that take the place of one have the opacity that lets as much light through
-as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024, section 3.3).
+as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024).
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def grow(
 def half_opacity(logits: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
     """The logit of the opacity of which two let as much light through as one of the given: 1 - √(1 - α).
 
-    Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024, eq. 9.
+    Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024.
     """
     log_through = 0.5 * torch.nn.functional.logsigmoid(-logits)  # ln √(1 - α), finite for any logit
     # 1 - √(1 - α) = α / (1 + √(1 - α)), which does not cancel for small α.
