@@ -297,6 +297,7 @@ void project_backward(const View& view, const Parameters& in, int64_t begin, int
         put_rows(d, sh, sh_row, less(fill(0.0f), load(touched)), valid == kLanes ? here : stack);
         if (valid < kLanes) copy_rows(ragged, sh_row, valid, here);
     }
+    streamed();
 }
 
 }  // namespace

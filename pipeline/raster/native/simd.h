@@ -25,6 +25,14 @@ using Mask = __mmask16;
 SPLAT_INLINE Floats fill(float x) { return _mm512_set1_ps(x); }
 SPLAT_INLINE Floats load(const float* p) { return _mm512_loadu_ps(p); }
 SPLAT_INLINE void store(float* p, Floats v) { _mm512_storeu_ps(p, v); }
+// Past the caches, where p is aligned: for what is written whole and not read soon. `streamed` before others read it.
+SPLAT_INLINE void stream(float* p, Floats v) {
+    if ((reinterpret_cast<uintptr_t>(p) & (sizeof v - 1)) == 0)
+        _mm512_stream_ps(p, v);
+    else
+        store(p, v);
+}
+SPLAT_INLINE void streamed() { _mm_sfence(); }
 SPLAT_INLINE Floats fma(Floats a, Floats b, Floats c) { return _mm512_fmadd_ps(a, b, c); }    // ab + c
 SPLAT_INLINE Floats fnma(Floats a, Floats b, Floats c) { return _mm512_fnmadd_ps(a, b, c); }  // c - ab
 SPLAT_INLINE Floats min(Floats a, Floats b) { return _mm512_min_ps(a, b); }                   // b where either is NaN
@@ -274,6 +282,8 @@ SPLAT_INLINE bool any(Mask m) { return bits(m) != 0; }
 #endif
 
 #if !SPLAT_ISA_AVX512
+SPLAT_INLINE void stream(float* p, Floats v) { store(p, v); }
+SPLAT_INLINE void streamed() {}
 SPLAT_INLINE void store_rgb(float* p, Floats red, Floats green, Floats blue) {
     float r[kLanes], g[kLanes], b[kLanes];
     store(r, red), store(g, green), store(b, blue);
@@ -298,7 +308,7 @@ SPLAT_INLINE void store_columns(float* rows, int width, Floats* columns) {
     int column = 0;
     for (; column + kLanes <= width; column += kLanes) {
         transpose(columns + column);
-        for (int i = 0; i < kLanes; ++i) store(rows + i * width + column, columns[column + i]);
+        for (int i = 0; i < kLanes; ++i) stream(rows + i * width + column, columns[column + i]);
     }
     for (; column < width; ++column) {
         float lanes[kLanes];
@@ -316,11 +326,32 @@ SPLAT_INLINE Ints fill_int(int32_t x) { return Ints{} + x; }
 SPLAT_INLINE Floats magnitude(Floats x) { return as_floats(as_ints(x) & fill_int(0x7fffffff)); }
 SPLAT_INLINE Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
 
-// 2^x for x in [-126, 127]; elsewhere anything at all comes out. A polynomial of degree 5, minimax of the relative
-// error (1e-7 with its rounding), of what x is above a whole number, which goes to the exponent. AVX-512 has
-// instructions for both, but they take the multipliers' time, sums and integers do not.
+// 2^x for x in [-126, 127]; elsewhere anything at all comes out. What x is above a whole number goes into a polynomial,
+// minimax of the relative error, and the number to the exponent. AVX-512 has instructions for both, but they take the
+// multipliers' time; sums, integers and permutations do not.
+#if SPLAT_ISA_AVX512
+// x is the nearest sixteenth and a rest: 2^(i/16) from a table, 2^rest from a polynomial of degree 2 (4e-7).
 template <int kCount>
 SPLAT_INLINE void exp2_each(Floats (&x)[kCount]) {
+    const Floats magic = fill(12582912.0f / 16.0f);  // 1.5 · 2^19: the sum's low bits are the nearest sixteenth
+    // Bits of 2^(i/16) less those that i adds to the exponent's below, so that one sum does both.
+    const __m512i powers = _mm512_setr_epi32(1065353216, 1065200323, 1065063874, 1064944595, 1064843248, 1064760626,
+                                             1064697559, 1064654911, 1064633587, 1064634532, 1064658730, 1064707212,
+                                             1064781053, 1064881375, 1065009351, 1065166205);
+    Floats f[kCount], power[kCount];
+    for (int k = 0; k < kCount; ++k) {
+        const Floats shifted = x[k] + magic;
+        const __m512i n = _mm512_castps_si512(shifted);
+        f[k] = x[k] - (shifted - magic);  // in [-1/32, 1/32]
+        power[k] = _mm512_castsi512_ps(_mm512_add_epi32(_mm512_permutexvar_epi32(n, powers), _mm512_slli_epi32(n, 19)));
+    }
+    for (int k = 0; k < kCount; ++k) x[k] = fma(f[k], fill(0.240226507f), fill(0.693187833f));
+    for (int k = 0; k < kCount; ++k) x[k] = fma(f[k] * power[k], x[k], power[k]);
+}
+#else
+template <int kCount>
+SPLAT_INLINE void exp2_each(Floats (&x)[kCount]) {
+    // Degree 5: 1e-7 with its rounding.
     constexpr float kPowers[] = {0.00967151299f, 0.0555073358f, 0.240222424f, 0.693147004f, 1.0f};
     const Floats magic = fill(12582912.0f);  // 1.5 · 2^23: the sum's low bits are the nearest whole number
     Floats shifted[kCount], f[kCount];
@@ -331,6 +362,7 @@ SPLAT_INLINE void exp2_each(Floats (&x)[kCount]) {
         for (int k = 0; k < kCount; ++k) x[k] = fma(x[k], f[k], fill(power));
     for (int k = 0; k < kCount; ++k) x[k] = as_floats(as_ints(x[k]) + (as_ints(shifted[k]) << 23));
 }
+#endif
 
 SPLAT_INLINE Floats exp2(Floats x) {
     Floats one[1] = {x};
