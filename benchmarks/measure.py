@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import torch
 from ceilings import measure_ceilings
+from rasterizing import contributing_pairs, raster_alone
 from rich.console import Console
 from rich.table import Table
 
@@ -34,14 +35,13 @@ from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import IMAGES, MODEL, View, load_model, load_views, mask_path
-from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize
 from splatpipe.stages.line import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.draws import permutation
-from splatpipe.stages.train.plan import Plan, make_plan, sh_degree_at
+from splatpipe.stages.train.plan import make_plan
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream
 
@@ -176,43 +176,27 @@ def time_case(case: Case) -> Row:
             with timed_parts(parts):
                 trained_on = parts.timed("iteration", iteration)()
             assert trained_on == camera.name
-    return {
-        "gaussians": len(state.gaussians),
-        "megapixels": round(1e-6 * pixels / case.repeats, 6),
-        "threads": case.threads,
-        "sh_degree": state.gaussians.sh_degree,
-        "peak_bytes": peak_memory_bytes() - before,
-        "pairs": round(statistics.fmean(pairs)),
-        "pairs_per_pixel": sum(pairs) / pixels,
-        "gpairs_per_s_per_core": 1e-9 * sum(pairs) / sum(parts.cpu_s["forward"] + parts.cpu_s["backward"]),
-    } | parts.row()
+        alone = raster_alone(state, plan, [camera_of(views, case.seed, 1 + i) for i in range(case.repeats)])
+    return (
+        {
+            "gaussians": len(state.gaussians),
+            "megapixels": round(1e-6 * pixels / case.repeats, 6),
+            "threads": case.threads,
+            "sh_degree": state.gaussians.sh_degree,
+            "peak_bytes": peak_memory_bytes() - before,
+            "pairs": round(statistics.fmean(pairs)),
+            "pairs_per_pixel": sum(pairs) / pixels,
+            "gpairs_per_s_per_core": 1e-9 * sum(pairs) / sum(parts.cpu_s["forward"] + parts.cpu_s["backward"]),
+        }
+        | alone
+        | parts.row()
+    )
 
 
 def camera_of(views: Sequence[View], seed: int, iteration: int) -> Camera:
     """Which view's turn it is in an iteration (from 1)."""
     epoch, place = divmod(iteration - 1, len(views))
     return views[int(permutation(seed, epoch, len(views))[place])].camera
-
-
-def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iteration: int) -> int:
-    """Pixel-Gaussian pairs that training's render in an iteration blends: alpha ≥ 1/255, before the pixel's end.
-
-    Args:
-        gaussians: As they are before the iteration.
-        camera: The iteration's.
-        plan: The training's.
-        iteration: From 1.
-    """
-    options = plan.options
-    n, h, w = len(gaussians), camera.height, camera.width
-    frame = _native.Frame()
-    frame.forward(
-        tuple(tensor.detach().contiguous() for tensor in gaussians.tensors().values()),
-        (np.ascontiguousarray(camera.cam_from_world, np.float64), (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
-        (sh_degree_at(options, iteration), options.antialias, plan.near, loop.background(options, iteration)),
-        (torch.empty(h, w, 3), torch.empty(h, w), None, None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
-    )
-    return int(frame.contributing_pairs())
 
 
 def restart_peak() -> int:
@@ -366,7 +350,7 @@ def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str
         columns: Heading of each column, and the format of its value: ``key:format``; times with ``ms``, bytes ``MB``.
         path: Of the JSON; None for none.
     """
-    console = Console(width=180 if not sys.stdout.isatty() else None)
+    console = Console(width=220 if not sys.stdout.isatty() else None)
     table = Table(title=name)
     for heading in columns:
         table.add_column(heading, justify="right")

@@ -226,16 +226,9 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
-    settings = raster.RenderOptions(
-        sh_degree=sh_degree_at(options, iteration),
-        background=background(options, iteration),
-        antialias=options.antialias,
-        near=plan.near,
-        depth=False,
-        magnitudes=observed,
-    )
+    settings = render_options(plan, iteration, observed)
     probe = state.probe() if observed else None
-    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
+    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
     loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
     loss.backward()  # type: ignore[no-untyped-call]
@@ -246,6 +239,19 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
             state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
             if options.prune_screen_px > 0.0:
                 state.statistics.observe_radii(rendered.radii)
+
+
+def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:
+    """How an iteration renders; with ``magnitudes`` of the screen gradient where density control looks on."""
+    options = plan.options
+    return raster.RenderOptions(
+        sh_degree=sh_degree_at(options, iteration),
+        background=background(options, iteration),
+        antialias=options.antialias,
+        near=plan.near,
+        depth=False,
+        magnitudes=magnitudes,
+    )
 
 
 def background(options: TrainConfig, iteration: int) -> tuple[float, float, float]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatpipe.pipeline.raster import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
@@ -44,6 +45,7 @@ class TrainState:
         history: What happened so far.
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
+        buffers: Memory of the gradients.
     """
 
     gaussians: Gaussians
@@ -52,6 +54,7 @@ class TrainState:
     history: History
     iteration: int = 0
     seconds: float = 0.0
+    buffers: GradientBuffers = field(default_factory=GradientBuffers)
 
     @staticmethod
     def begin(start: Gaussians, options: TrainConfig) -> TrainState:
@@ -120,6 +123,7 @@ class TrainState:
 
     def _densify(self, options: TrainConfig, extent: float, limit: int, iteration: int) -> None:
         """Prune, then grow to at most ``limit`` Gaussians."""
+        self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
         gaussians, statistics = self.gaussians.detach(), self.statistics
         gone = prune_mask(gaussians, options, extent, iteration, statistics.max_radius_px)
         pruned = int(gone.sum())
