@@ -18,6 +18,8 @@ from splatpipe.stages.train import loop
 from splatpipe.stages.train.plan import Plan, sh_degree_at
 from splatpipe.stages.train.state import TrainState
 
+WARMUP = 3  # renders that do not count
+
 
 def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> dict[str, Any]:
     """Forward and backward pass of the rasterizer one after the other, with nothing of training between them.
@@ -32,16 +34,19 @@ def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> di
     """
     options = loop.render_options(plan, max(1, state.iteration), False)
     pairs, wall, cpu = 0, [], 0.0
-    for index, camera in enumerate(cameras):
+    for index, camera in enumerate([*cameras[:WARMUP], *cameras]):
         generator = torch.Generator().manual_seed(index)
         upstream = torch.randn(camera.height, camera.width, 3, generator=generator) / (camera.width * camera.height)
         began, began_cpu = time.perf_counter(), time.process_time()
         rendered = raster.render(state.gaussians, camera, options, buffers=state.buffers)
         rendered.colour.backward(upstream)  # type: ignore[no-untyped-call]
-        wall.append(time.perf_counter() - began)
-        cpu += time.process_time() - began_cpu
+        took, took_cpu = time.perf_counter() - began, time.process_time() - began_cpu
         for tensor in state.gaussians.tensors().values():
             tensor.grad = None
+        if index < WARMUP:
+            continue
+        wall.append(took)
+        cpu += took_cpu
         pairs += contributing_pairs(state.gaussians, camera, plan, state.iteration)
     return {"alone_wall_s": statistics.median(wall), "alone_gpairs_per_s_per_core": 1e-9 * pairs / cpu}
 
