@@ -160,7 +160,7 @@ def time_case(case: Case) -> Row:
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
     with loop.same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
-        state = TrainState.begin(start, plan.options)
+        state = TrainState.begin(start, plan)
         for photo in islice(photos, warmup):
             loop.train_step(state, plan, photo)
 

@@ -85,7 +85,7 @@ def follow(dataset: Path, config: TrainConfig, arguments: argparse.Namespace) ->
     levels = coarse_levels(plan.options)
     with loop.same_bits(arguments.threads):
         clocks.start()
-        state = TrainState.begin(start, plan.options)
+        state = TrainState.begin(start, plan)
         trained_on = [view for view in views if view.camera.name in names]
         with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:

@@ -21,6 +21,7 @@ from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.draws import BACKGROUND, uniform
+from splatpipe.stages.train.exposure import exposures_json
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
@@ -43,7 +44,7 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `model.ply`, `history.json` and `plan.json`; go on from a checkpoint where a killed run left one.
+    """Write the model, its history, plan and exposures; go on from a checkpoint where a killed run left one.
 
     Raises:
         SplatpipeError: if nothing is left to train on.
@@ -65,7 +66,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         if budgeted(plan):
             report.note(plan.described())
         levels = coarse_levels(plan.options, plan.last_iteration)
-        state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan.options)
+        state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
@@ -73,6 +74,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
+    (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
     return {
         "gaussians": len(gaussians),
         "iterations": state.iteration,
@@ -128,7 +130,7 @@ def resume(path: Path, plan: Plan, report: Reporter) -> TrainState | None:
     """The state that a killed run left, or None; a broken one is told and ignored."""
     try:
         checkpoint = load_checkpoint(path, plan.digest())
-        state = TrainState.restore(checkpoint, plan.options)
+        state = TrainState.restore(checkpoint, plan)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:
@@ -230,11 +232,16 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     probe = state.probe() if observed else None
     rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
+    shown = rendered.colour
+    if state.exposure is not None:
+        shown = state.exposure.shown(shown, photo.camera.name)
+    loss = measure(shown, photo.colour, options.ssim_weight, photo.mask)
     loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))
     with torch.no_grad():
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
+        if state.exposure is not None:
+            state.exposure.step(photo.camera.name, iteration, options)
         if probe is not None and probe.grad is not None:
             state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
             if options.prune_screen_px > 0.0:

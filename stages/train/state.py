@@ -25,13 +25,16 @@ from splatpipe.stages.train.densify import (
     reset_opacity,
     room_at,
 )
+from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.history import History
+from splatpipe.stages.train.plan import Plan
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
 LARGEST_SCALE = 1e2  # a sky is no farther than that
 
 _ADAM = "adam."
 _STATISTICS = "statistics."
+_EXPOSURE = "exposure."
 
 
 @dataclass
@@ -46,6 +49,7 @@ class TrainState:
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
         buffers: Memory of the gradients.
+        exposure: The photos' colours, where they are modelled.
     """
 
     gaussians: Gaussians
@@ -55,15 +59,17 @@ class TrainState:
     iteration: int = 0
     seconds: float = 0.0
     buffers: GradientBuffers = field(default_factory=GradientBuffers)
+    exposure: Exposure | None = None
 
     @staticmethod
-    def begin(start: Gaussians, options: TrainConfig) -> TrainState:
+    def begin(start: Gaussians, plan: Plan) -> TrainState:
         """The state before the first iteration.
 
         Args:
             start: The Gaussians to start with; evenly thinned where there are more than the cap allows.
-            options: Resolved.
+            plan: The training's.
         """
+        options = plan.options
         if len(start) > options.max_gaussians:
             start = start.select(torch.arange(options.max_gaussians) * len(start) // options.max_gaussians)
         columns = coefficient_count(options.sh_degree)
@@ -73,7 +79,8 @@ class TrainState:
         model = start.clone()
         model.sh = sh
         gaussians = model.requires_grad_()
-        return TrainState(gaussians, Adam(gaussians.tensors()), DensityStatistics(len(start)), History())
+        adam, statistics = Adam(gaussians.tensors()), DensityStatistics(len(start))
+        return TrainState(gaussians, adam, statistics, History(), exposure=new_exposure(plan))
 
     def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
         """Step the parameters against their gradients, which are dropped.
@@ -156,12 +163,14 @@ class TrainState:
         tensors = dict(self.gaussians.detach().tensors())
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
         tensors |= {_STATISTICS + name: tensor for name, tensor in self.statistics.to_arrays().items()}
+        if self.exposure is not None:
+            tensors |= {_EXPOSURE + name: tensor for name, tensor in self.exposure.arrays().items()}
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
         facts["instruction_set"] = instruction_set
         return Checkpoint({name: tensor.numpy() for name, tensor in tensors.items()}, facts)
 
     @staticmethod
-    def restore(checkpoint: Checkpoint, options: TrainConfig) -> TrainState:
+    def restore(checkpoint: Checkpoint, plan: Plan) -> TrainState:
         """The inverse of ``checkpoint``.
 
         Raises:
@@ -170,18 +179,26 @@ class TrainState:
         try:
             tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
             gaussians = Gaussians.from_tensors({name: tensors[name] for name in PARAMETERS}).requires_grad_()
-            if gaussians.sh.shape[1] != coefficient_count(options.sh_degree):
+            if gaussians.sh.shape[1] != coefficient_count(plan.options.sh_degree):
                 raise ValueError("another degree of spherical harmonics")
             adam = Adam(gaussians.tensors())
             adam.load_state_dict(_under(_ADAM, tensors))
             statistics = DensityStatistics(len(gaussians))
             for name, tensor in _under(_STATISTICS, tensors).items():
                 getattr(statistics, name).copy_(tensor)
+            exposure = new_exposure(plan)
+            if exposure is not None:
+                exposure.load(_under(_EXPOSURE, tensors))
             history = History(**checkpoint.facts["history"])
             counts = (int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"]))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
-        return TrainState(gaussians, adam, statistics, history, *counts)
+        return TrainState(gaussians, adam, statistics, history, *counts, exposure=exposure)
+
+
+def new_exposure(plan: Plan) -> Exposure | None:
+    """The exposures' model before the first iteration, if the plan has one."""
+    return Exposure(plan.train_views) if plan.options.exposure != "off" else None
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

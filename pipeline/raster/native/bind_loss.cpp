@@ -103,10 +103,10 @@ void bind_loss(nb::module_& m) {
     m.def("photo_loss", &photo_loss, "render"_a.noconvert(), "photo"_a.noconvert(), "mask"_a.noconvert().none(),
           "ssim_weight"_a, "gradient"_a.noconvert(),
           "(1 - w) L1 + w (1 - SSIM) of two (h, w, 3) images; its gradient by the render goes to `gradient`.");
-    m.def("affine_colour", &affine_colour, "map"_a.noconvert(), "picture"_a.noconvert(), "out"_a.noconvert(),
+    m.def("affine_colour", &affine_colour, "affine"_a.noconvert(), "picture"_a.noconvert(), "out"_a.noconvert(),
           "The colours of an (h, w, 3) picture through a (3, 4) affine map, to `out`.");
-    m.def("affine_colour_backward", &affine_colour_backward, "map"_a.noconvert(), "picture"_a.noconvert(),
-          "upstream"_a.noconvert(), "gradient"_a.noconvert(), "map_gradient"_a.noconvert(),
+    m.def("affine_colour_backward", &affine_colour_backward, "affine"_a.noconvert(), "picture"_a.noconvert(),
+          "upstream"_a.noconvert(), "gradient"_a.noconvert(), "by_affine"_a.noconvert(),
           "Gradients by the picture and by the map, from the one by the result.");
     m.def(
         "adam_step",
