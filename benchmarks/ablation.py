@@ -112,7 +112,7 @@ def placed(captures: dict[str, Path], work: Path, arguments: argparse.Namespace)
                 failures.append({"capture": end.command.name, "message": end.failure})
             else:
                 (datasets[end.command.name],) = (front / "stages").glob("undistort-*/dataset")
-    return datasets, failures
+    return {name: datasets[name] for name in captures if name in datasets}, failures
 
 
 def contents(path: Path, work: Path, threads: int) -> dict[str, str]:

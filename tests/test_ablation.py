@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,19 @@ def test_runs_what_is_new_and_nothing_else(dataset: Path, tmp_path: Path, capfd:
     assert code == 0 and "min left" not in retold.err
     assert again["rows"] == first["rows"] and tables(retold.out) == tables(told.out)
 
-    changed = ("--only", "smooth", "broken", "--variant", "smooth=train.antialias=true train.sh_degree=0")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a.jpg").write_text("no picture")
+    changed = (
+        "--data",
+        f"tiny={dataset}",
+        f"lost={photos}",
+        "--only",
+        "smooth",
+        "broken",
+        "--variant",
+        "smooth=train.antialias=true train.sh_degree=0",
+    )
     broken = ("--variant", "broken=ingest.min_size=9999", "--seeds", "1")
     code, partly = ablate(dataset, work, *changed, *broken)
     told = capfd.readouterr()
@@ -81,9 +94,10 @@ def test_runs_what_is_new_and_nothing_else(dataset: Path, tmp_path: Path, capfd:
     found = {each["variant"]: each for each in partly["rows"]}
     assert found.keys() == {"base", "smooth"} and found["base"] == by_name["base", 0]
     assert found["smooth"]["psnr"] != by_name["smooth", 0]["psnr"]
-    (failure,) = partly["machine"]["failed"]
-    assert failure["variant"] == "broken" and "ingest.min_size=9999" in failure["message"]
-    assert "None of the 9 pictures" in " ".join(told.out.split())
+    lost, failure = partly["machine"]["failed"]
+    assert (failure["capture"], failure["variant"]) == ("tiny", "broken")
+    assert "ingest.min_size=9999" in failure["message"] and "None of the 9" in " ".join(told.out.split())
+    assert (lost["capture"], lost["variant"]) == ("lost", None) and "a.jpg" in lost["message"]
 
 
 @pytest.mark.parametrize(
@@ -195,10 +209,11 @@ def test_ending_early_leaves_no_process(dataset: Path, tmp_path: Path) -> None:
     ended = next(ends)
     assert ended.command.name == "fails" and "There is no folder" in ended.failure
     running = processes_with(str(tmp_path / "out"))
-    assert running
+    while not any(processes_with(pid) for pid in running):  # a worker names its parent
+        time.sleep(0.02)
     ends.close()
     assert not processes_with(str(tmp_path / "out")) and not (tmp_path / "never").exists()
-    assert not any(processes_with(pid) for pid in running)  # a worker names its parent
+    assert not any(processes_with(pid) for pid in running)
 
 
 def processes_with(word: str) -> list[str]:
