@@ -8,17 +8,18 @@ the work folder and not run again: the same command goes on where it was stopped
 from __future__ import annotations
 
 import argparse
+import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from commands import Command, run_all
+from commands import Command, End, run_all, splatpipe
 from comparison import MEASURES, differences, means, written
-from finished import Finished, clear, figures, tidy, work_folder
-from measure import SilentReporter, machine, write_figures
+from finished import Finished, best_and_end, clear, figures, tidy, work_folder
+from measure import SilentReporter, machine, size_factor, write_figures
 from tables import Row, print_table
 from variants import NAME, Variant, choose, config_of, split
 
@@ -32,6 +33,9 @@ from splatpipe.stages.line import LINE
 VARIANTS = Path(__file__).with_suffix(".toml")
 FRONT_SIZE = 4.0  # photos are placed once at this multiple of the training's megapixels, and each run reduces them
 LARGEST_FRONT = 200.0  # megapixels
+FOLLOW = VARIANTS.with_name("time_to_quality.py")
+CURVE = "curve.json"
+TOLD = ("psnr", "psnr_cc", "best_psnr")  # of a run that ended, on the way
 FRONT = ("ingest", "features", "matches", "sparse", "georef", "undistort")
 
 
@@ -46,6 +50,7 @@ class Case:
         key: Digest of all that the figures depend on.
         command: That makes them.
         out: Where it leaves them.
+        followed: It is `time_to_quality`, which has nothing to say but the best and the end.
     """
 
     variant: str
@@ -54,10 +59,15 @@ class Case:
     key: str
     command: Command
     out: Path
+    followed: bool = False
 
     def named(self, figures: Row) -> Row:
         """A row of the result."""
         return {"variant": self.variant, "capture": self.capture, "seed": self.seed} | figures
+
+    def figures(self, end: End, threads: int) -> Row:
+        """What the command left."""
+        return best_and_end(self.out / CURVE) if self.followed else figures(self.out / "out", end, threads)
 
 
 def base_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
@@ -102,7 +112,7 @@ def placed(captures: dict[str, Path], work: Path, arguments: argparse.Namespace)
         datasets[name] = out = work / "fronts" / f"{name}-{key[:12]}"
         words = ("run", str(path), str(out), "--until", FRONT[-1], "--seed", "0", *options(sets))
         threads = ("--threads", str(arguments.threads * arguments.jobs))
-        commands.append(Command(name, (*words, *threads), out.with_name(f"{out.name}.log")))
+        commands.append(splatpipe(name, (*words, *threads), out.with_name(f"{out.name}.log")))
     failures = []
     with closing(run_all(commands, 1)) as ends:
         for end in ends:
@@ -143,9 +153,25 @@ def cases_of(
                 name = f"{capture}-{variant.name}-{seed}-{key[:12]}"
                 out = work / "runs" / name
                 words = ("run", str(dataset), str(out / "out"), "--seed", str(seed), *options(sets))
-                command = Command(name, (*words, "--threads", str(arguments.threads)), out / "log")
+                command = splatpipe(name, (*words, "--threads", str(arguments.threads)), out / "log")
                 cases.append(Case(variant.name, capture, seed, key, command, out))
+                if arguments.curve is not None:
+                    cases.append(followed(cases[-1], sets, dataset, arguments))
     return cases
+
+
+def followed(case: Case, sets: Sequence[str], dataset: Path, arguments: argparse.Namespace) -> Case:
+    """The same training once more, its held-out photos measured on the way."""
+    name = f"{case.command.name}-curve"
+    out = case.out.with_name(name)
+    config = config_of(sets, case.seed)
+    facts = {"data": dataset, "threads": arguments.threads, "every": arguments.curve, "seed": case.seed}
+    facts |= {"scale": min(1.0, size_factor(dataset, config.undistort.max_megapixels)), "json": out / CURVE}
+    facts |= {"iterations": config.train.iterations, "max-gaussians": config.train.max_gaussians}
+    words = [word for key, value in facts.items() for word in (f"--{key}", str(value))]
+    command = Command(name, (str(FOLLOW), *words, "--held-out", config.evaluate.views, "--set", *sets), out / "log")
+    key = digest([case.key, arguments.curve])
+    return Case(case.variant, case.capture, case.seed, key, command, out, followed=True)
 
 
 def run_cases(cases: Sequence[Case], finished: Finished, arguments: argparse.Namespace) -> dict[str, str]:
@@ -165,9 +191,9 @@ def run_cases(cases: Sequence[Case], finished: Finished, arguments: argparse.Nam
             case = by_name[end.command.name]
             outcome = end.failure
             if not outcome:
-                row = figures(case.out / "out", end, arguments.threads)
+                row = case.figures(end, arguments.threads)
                 finished.add(case.key, row)
-                outcome = f"PSNR {row['psnr']:.2f} dB" if row.get("psnr") is not None else "no PSNR"
+                outcome = ", ".join(f"{key} {row[key]:.2f} dB" for key in TOLD if row.get(key) is not None) or "done"
             else:
                 failures[case.key] = outcome
             if not arguments.keep:
@@ -204,12 +230,13 @@ def ablate(arguments: argparse.Namespace) -> int:
     variants = choose(arguments.variants, arguments.variant, arguments.only, base_sets(arguments))
     captures = captures_of(arguments.data)
     with work_folder(arguments.work) as work:
+        tell(f"What is finished is kept in {work}")
         facts = machine(arguments.threads) | {"jobs": arguments.jobs, "seeds": arguments.seeds}
         datasets, lost = placed(captures, work, arguments)
         finished = Finished(work)
         cases = cases_of(variants, datasets, work, arguments)
         failures = run_cases(cases, finished, arguments)
-        rows = [case.named(finished.rows[case.key]) for case in cases if case.key in finished.rows]
+        rows = rows_of(cases, finished.rows)
     failed = [{"variant": None, "seed": None} | row for row in lost]
     failed += [case.named({"message": failures[case.key]}) for case in cases if case.key in failures]
     names = [variant.name for variant in variants]
@@ -217,7 +244,19 @@ def ablate(arguments: argparse.Namespace) -> int:
     facts |= {"failed": failed, "base": base_sets(arguments)}
     facts["variants"] = [{"variant": each.name, "set": each.sets, "what": each.what} for each in variants]
     write_figures("ablation", facts, rows, arguments.json)
+    if arguments.work is None and not failed:
+        shutil.rmtree(work)
     return 1 if failed else 0
+
+
+def rows_of(cases: Sequence[Case], finished: Mapping[str, Row]) -> list[Row]:
+    """A row a training, with what following it showed."""
+    curves = {(case.variant, case.capture, case.seed): finished.get(case.key, {}) for case in cases if case.followed}
+    return [
+        case.named(finished[case.key] | curves.get((case.variant, case.capture, case.seed), {}))
+        for case in cases
+        if not case.followed and case.key in finished
+    ]
 
 
 def tell(text: str) -> None:
@@ -242,6 +281,7 @@ def parser() -> argparse.ArgumentParser:
     say("--variants", type=Path, default=VARIANTS, metavar="FILE.toml", help="instead of the ones beside this script")
     say("--variant", action="append", default=[], metavar="NAME='SECTION.OPTION=VALUE …'", help="one more; repeatable")
     say("--only", nargs="+", metavar="NAME", help="these variants besides the base")
+    say("--curve", type=float, metavar="CPU_S", help="train once more, measured so often: is the end the best?")
     say("--keep", action="store_true", help="keep all that the runs leave, and not just their metrics.json and log")
     return options
 
@@ -263,11 +303,12 @@ def main(words: Sequence[str] | None = None) -> int:
         tell(f"{error.message} {error.hint}")
         return error.exit_code
     except KeyboardInterrupt:
-        tell("Stopped. The same command with the same --work goes on.")
+        tell("Stopped. The same command with --work and that folder goes on.")
         return 130
 
 
 if __name__ == "__main__":
     for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup means it
+            signal.signal(number, signal.default_int_handler)
     sys.exit(main())

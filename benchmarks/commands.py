@@ -18,17 +18,22 @@ LONGEST_MESSAGE = 400  # characters of a failure that are told; the log has the 
 
 @dataclass(frozen=True)
 class Command:
-    """A call of ``splatpipe``.
+    """A call of this interpreter.
 
     Attributes:
         name: For people.
-        arguments: After the program's name, without ``--json``.
+        words: After the interpreter: a script or module, and its arguments.
         log: File that takes what it tells.
     """
 
     name: str
-    arguments: tuple[str, ...]
+    words: tuple[str, ...]
     log: Path
+
+
+def splatpipe(name: str, arguments: Sequence[str], log: Path) -> Command:
+    """A call of the line, whose message of failure is told."""
+    return Command(name, ("-m", "splatpipe.pipeline.cli", *arguments, "--json"), log)
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class End:
 
 
 def run_all(commands: Sequence[Command], jobs: int) -> Iterator[End]:
-    """Run commands by this interpreter's splatpipe; those that run when this ends early are ended.
+    """Run commands; those that run when this ends early are ended.
 
     Args:
         commands: In the order in which they start.
@@ -84,7 +89,7 @@ class _Running:
     @staticmethod
     def start(command: Command) -> _Running:
         command.log.parent.mkdir(parents=True, exist_ok=True)
-        words = [sys.executable, "-m", "splatpipe.pipeline.cli", *command.arguments, "--json"]
+        words = [sys.executable, *command.words]
         with command.log.open("wb") as log, _told(command).open("wb") as told:
             # A session of its own: the terminal's Ctrl-C reaches only us, and we end it.
             process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=told, stderr=log, start_new_session=True)
@@ -102,7 +107,7 @@ class _Running:
 
 
 def _told(command: Command) -> Path:
-    """Where its JSON object goes."""
+    """Where what it prints goes: the line's JSON object."""
     return command.log.with_name(f"{command.log.name}.json")
 
 

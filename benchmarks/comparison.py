@@ -15,6 +15,7 @@ MEASURES = {
     "PSNR dB": ("psnr", ".2f"),
     "PSNR cc": ("psnr_cc", ".2f"),
     "SSIM": ("ssim", ".4f"),
+    "best − end": ("below_best", ".2f"),
     "free space": ("floaters.free_space*", ".4f"),
     "depth": ("floaters.depth*", ".4f"),
     "loss": ("loss", ".4f"),

@@ -83,6 +83,12 @@ def figures(out: Path, end: End, threads: int) -> Row:
     return row | metrics | {"loss": _last_loss(out)}
 
 
+def best_and_end(path: Path) -> Row:
+    """The highest held-out PSNR of a training that was followed, and how far below it the end is, dB."""
+    curve = [row["psnr"] for row in json.loads(path.read_text(encoding="utf-8"))["rows"]]
+    return {"best_psnr": max(curve), "below_best": max(curve) - curve[-1]}
+
+
 def _numbers(prefix: str, table: dict[str, Any]) -> Iterator[tuple[str, float]]:
     for key, value in table.items():
         if isinstance(value, dict):
@@ -101,7 +107,7 @@ def _last_loss(out: Path) -> float | None:
 
 @contextlib.contextmanager
 def work_folder(wanted: Path | None) -> Iterator[Path]:
-    """The folder, ours alone while this lasts; a temporary one is removed at a good end.
+    """The folder, ours alone while this lasts; a new temporary one if none is wanted.
 
     Raises:
         UsageError: if another process uses it.
@@ -116,5 +122,3 @@ def work_folder(wanted: Path | None) -> Iterator[Path]:
                 f"Another run works in {folder}.", hint="Wait for it, or choose another --work."
             ) from error
         yield folder
-    if wanted is None:
-        shutil.rmtree(folder)

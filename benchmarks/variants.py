@@ -16,7 +16,8 @@ from splatpipe.stages.line import LineConfig
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}")  # also a folder's
 PRESET = "standard"  # what `splatpipe run` takes without --preset
-SHARED = ("features", "matches", "sparse")  # sections that act before the dataset that all variants train on
+# What all variants have in common: the dataset that they train on, and what they are measured against.
+SHARED = ("features.", "matches.", "sparse.", "undistort.max_megapixels", "evaluate.every", "evaluate.views")
 
 
 @dataclass(frozen=True)
@@ -103,10 +104,8 @@ def check(variant: Variant, sets: Sequence[str]) -> None:
     if config_of(sets, 1).train.seed != 1:
         raise UsageError("train.seed is not a variant's.", hint="Say how many with --seeds.")
     for each in variant.sets:
-        if each.split(".")[0].strip() in SHARED:
-            raise UsageError(
-                f"{each} acts before the dataset that all variants share.", hint="Give it with --base, to photos."
-            )
+        if each.partition("=")[0].strip().startswith(SHARED):
+            raise UsageError(f"{each} would not act on this variant alone.", hint="Give it to all with --base.")
 
 
 def split(text: str) -> tuple[str, ...]:

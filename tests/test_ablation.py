@@ -15,7 +15,7 @@ import ablation
 import comparison
 import tiny_scene
 import variants
-from commands import Command, End, run_all
+from commands import Command, End, run_all, splatpipe
 from finished import Finished, figures, work_folder
 
 from splatpipe.pipeline.engine.errors import UsageError
@@ -87,7 +87,7 @@ def test_runs_what_is_new_and_nothing_else(dataset: Path, tmp_path: Path, capfd:
         "--variant",
         "smooth=train.antialias=true train.sh_degree=0",
     )
-    broken = ("--variant", "broken=ingest.min_size=9999", "--seeds", "1")
+    broken = ("--variant", "broken=ingest.min_size=9999", "--seeds", "1")  # fails as soon as it runs
     code, partly = ablate(dataset, work, *changed, *broken)
     told = capfd.readouterr()
     assert code == 1 and told.err.count("min left") == 2  # the base is there
@@ -100,13 +100,26 @@ def test_runs_what_is_new_and_nothing_else(dataset: Path, tmp_path: Path, capfd:
     assert (lost["capture"], lost["variant"]) == ("lost", None) and "a.jpg" in lost["message"]
 
 
+def test_following_a_training_tells_how_far_its_end_is_below_its_best(dataset: Path, tmp_path: Path) -> None:
+    words = ["--data", str(dataset), "--seeds", "1", "--iterations", "10", "--jobs", "1", "--curve", "1e-3"]
+    arguments = ablation.parser().parse_args([*words, "--base", TINY])
+    run, follow = ablation.cases_of([variants.Variant("base")], {"tiny": dataset}, tmp_path, arguments)
+    finished = Finished(tmp_path)
+    assert ablation.run_cases([follow], finished, arguments) == {}
+    curve = [each["psnr"] for each in json.loads((follow.out / "curve.json").read_text())["rows"]]
+    assert len(curve) == 10
+    (only,) = ablation.rows_of([run, follow], finished.rows | {run.key: {"psnr": 9.0}})
+    assert only == row("base", "tiny", 0, psnr=9.0, best_psnr=max(curve), below_best=max(curve) - curve[-1])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--variant", "typo=train.antialiased=true"], "Variant typo: There is no option train.antialiased. Did you"),
         (["--variant", "wrong=train.iterations=-3"], "Variant wrong: train.iterations = -3"),
         (["--variant", "seeded=train.seed=7"], "Variant seeded: train.seed is not a variant's"),
-        (["--variant", "front=sparse.min_model_size=4"], "acts before the dataset that all variants share"),
+        (["--variant", "front=sparse.min_model_size=4"], "would not act on this variant alone"),
+        (["--variant", "easy=evaluate.every=2"], "would not act on this variant alone"),
         (["--variant", "base=train.antialias=true"], "cannot be a variant's name"),
         (["--only", "nothing"], "There is no variant nothing. There are: published"),
         (["--base", "train.nonsense=1"], "Variant base: There is no option train.nonsense"),
@@ -193,17 +206,14 @@ def test_results_survive_a_line_cut_off(tmp_path: Path) -> None:
 def test_a_work_folder_has_one_owner(tmp_path: Path) -> None:
     with work_folder(tmp_path), pytest.raises(UsageError, match="Another run works"), work_folder(tmp_path):
         pass
-    with work_folder(None) as temporary:
-        assert temporary.is_dir()
-    assert not temporary.exists()
 
 
 def test_ending_early_leaves_no_process(dataset: Path, tmp_path: Path) -> None:
     long = ("--threads", "1", "--set", "train.iterations=1000000", "--set", TINY)
     commands = [
-        Command("long", ("run", str(dataset), str(tmp_path / "out"), *long), tmp_path / "long.log"),
-        Command("fails", ("run", str(tmp_path / "nowhere"), str(tmp_path / "no")), tmp_path / "fails.log"),
-        Command("never", ("run", str(dataset), str(tmp_path / "never"), *long), tmp_path / "never.log"),
+        splatpipe("long", ("run", str(dataset), str(tmp_path / "out"), *long), tmp_path / "long.log"),
+        splatpipe("fails", ("run", str(tmp_path / "nowhere"), str(tmp_path / "no")), tmp_path / "fails.log"),
+        splatpipe("never", ("run", str(dataset), str(tmp_path / "never"), *long), tmp_path / "never.log"),
     ]
     ends = run_all(commands, 2)
     ended = next(ends)
