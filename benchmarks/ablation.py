@@ -184,30 +184,34 @@ def run_cases(cases: Sequence[Case], finished: Finished, arguments: argparse.Nam
     by_name = {case.command.name: case for case in wanted.values()}
     for case in wanted.values():
         clear(case.out)
+    leave = (lambda _out: None) if arguments.keep else tidy
     failures: dict[str, str] = {}
     walls: list[float] = []
-    with closing(run_all([case.command for case in wanted.values()], arguments.jobs)) as ends:
-        for end in ends:
-            case = by_name[end.command.name]
-            outcome = end.failure
-            if not outcome:
-                row = case.figures(end, arguments.threads)
-                finished.add(case.key, row)
-                outcome = ", ".join(f"{key} {row[key]:.2f} dB" for key in TOLD if row.get(key) is not None) or "done"
-            else:
-                failures[case.key] = outcome
-            if not arguments.keep:
-                tidy(case.out)
-            walls.append(end.wall_s)
-            left = sum(walls) / len(walls) * (len(wanted) - len(walls)) / arguments.jobs
-            what = f"{case.capture} {case.variant} seed {case.seed}: {outcome}"
-            tell(f"{len(walls)}/{len(wanted)}  {what}, {end.wall_s:.0f} s; about {left / 60.0:.0f} min left")
+    try:
+        with closing(run_all([case.command for case in wanted.values()], arguments.jobs)) as ends:
+            for end in ends:
+                case = by_name[end.command.name]
+                if end.failure:
+                    failures[case.key] = outcome = end.failure
+                else:
+                    row = case.figures(end, arguments.threads)
+                    finished.add(case.key, row)
+                    outcome = ", ".join(f"{key} {row[key]:.2f} dB" for key in TOLD if row.get(key) is not None)
+                leave(case.out)
+                walls.append(end.wall_s)
+                left = sum(walls) / len(walls) * (len(wanted) - len(walls)) / arguments.jobs
+                what = f"{case.capture} {case.variant} seed {case.seed}: {outcome or 'done'}"
+                tell(f"{len(walls)}/{len(wanted)}  {what}, {end.wall_s:.0f} s; about {left / 60.0:.0f} min left")
+    finally:
+        for case in wanted.values():
+            leave(case.out)
     return failures
 
 
 def show(rows: Sequence[Row], failed: Sequence[Row], variants: Sequence[str]) -> list[Row]:
     """Print a table a capture and the differences, which are returned."""
-    headings = {heading: f"{heading}:" for heading in MEASURES}
+    followed = any("below_best" in row for row in rows)
+    headings = {heading: f"{heading}:" for heading, (key, _) in MEASURES.items() if followed or key != "below_best"}
     for capture in dict.fromkeys(row["capture"] for row in (*rows, *failed)):
         table = means([row for row in rows if row["capture"] == capture], variants)
         columns = {"variant": "variant:", "runs": "runs:"} | headings

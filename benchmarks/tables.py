@@ -12,7 +12,7 @@ from rich.table import Table
 
 Row = dict[str, Any]
 
-PIPE_WIDTH = 180  # columns where nobody's window limits them
+PIPE_WIDTH = 200  # columns where nobody's window limits them
 
 
 def console() -> Console:
