@@ -19,7 +19,7 @@ from pathlib import Path
 from commands import Command, End, run_all, splatpipe
 from comparison import MEASURES, differences, means, written
 from finished import Finished, best_and_end, clear, figures, tidy, work_folder
-from measure import SilentReporter, machine, size_factor, write_figures
+from measure import SilentReporter, machine, write_figures
 from tables import Row, print_table
 from variants import NAME, Variant, choose, config_of, split
 
@@ -99,14 +99,28 @@ def captures_of(texts: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def placed(captures: dict[str, Path], work: Path, arguments: argparse.Namespace) -> tuple[dict[str, Path], list[Row]]:
-    """The captures' datasets, and the failures: photos are taken through the line up to `undistort` first."""
+def front_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """The base's, for photos: larger than the training's, since each run reduces them."""
     size = min(LARGEST_FRONT, FRONT_SIZE * config_of(base_sets(arguments), 0).undistort.max_megapixels)
-    sets = (*base_sets(arguments), f"undistort.max_megapixels={size!r}")
+    return (*base_sets(arguments), f"undistort.max_megapixels={size!r}")
+
+
+def placed(
+    captures: Mapping[str, Path], work: Path, arguments: argparse.Namespace, sets: Sequence[str], *, photos_only: bool
+) -> tuple[dict[str, Path], list[Row]]:
+    """The captures' datasets, and the failures: taken through the line up to `undistort`.
+
+    Args:
+        captures: By name.
+        work: The work folder.
+        arguments: The command line.
+        sets: Options.
+        photos_only: Leave captures that are datasets as they are.
+    """
     sections = {stage: getattr(config_of(sets, 0), stage).model_dump(mode="json") for stage in FRONT}
     datasets, commands = dict(captures), []
     for name, path in captures.items():
-        if open_source(path, work).model is not None:
+        if photos_only and open_source(path, work).model is not None:
             continue
         key = digest([contents(path, work, arguments.threads), sections, versions()])
         datasets[name] = out = work / "fronts" / f"{name}-{key[:12]}"
@@ -116,7 +130,7 @@ def placed(captures: dict[str, Path], work: Path, arguments: argparse.Namespace)
     failures = []
     with closing(run_all(commands, 1)) as ends:
         for end in ends:
-            tell(f"{end.command.name}: {end.failure or 'photos placed'}, {end.wall_s:.0f} s")
+            tell(f"{end.command.name}: {end.failure or 'dataset made'}, {end.wall_s:.0f} s")
             front = datasets.pop(end.command.name)
             if end.failure:
                 failures.append({"capture": end.command.name, "message": end.failure})
@@ -137,9 +151,21 @@ def options(sets: Sequence[str]) -> tuple[str, ...]:
 
 
 def cases_of(
-    variants: Sequence[Variant], datasets: dict[str, Path], work: Path, arguments: argparse.Namespace
+    variants: Sequence[Variant],
+    datasets: Mapping[str, Path],
+    reduced: Mapping[str, Path],
+    work: Path,
+    arguments: argparse.Namespace,
 ) -> list[Case]:
-    """Every variant on every capture with every seed; whole rounds of a seed first."""
+    """Every variant on every capture with every seed; whole rounds of a seed first.
+
+    Args:
+        variants: The base and the others.
+        datasets: What the line is run on, by capture.
+        reduced: The same at the size of training, as each run makes them, of the captures that are followed.
+        work: The work folder.
+        arguments: The command line.
+    """
     build = {"stages": {stage.name: stage.version for stage in LINE}, "versions": versions(), "isa": raster.isa_name()}
     digests = {name: contents(path, work, arguments.threads) for name, path in datasets.items()}
     cases = []
@@ -155,19 +181,19 @@ def cases_of(
                 words = ("run", str(dataset), str(out / "out"), "--seed", str(seed), *options(sets))
                 command = splatpipe(name, (*words, "--threads", str(arguments.threads)), out / "log")
                 cases.append(Case(variant.name, capture, seed, key, command, out))
-                if arguments.curve is not None:
-                    cases.append(followed(cases[-1], sets, dataset, arguments))
+                if capture in reduced:
+                    cases.append(followed(cases[-1], sets, reduced[capture], arguments))
     return cases
 
 
 def followed(case: Case, sets: Sequence[str], dataset: Path, arguments: argparse.Namespace) -> Case:
-    """The same training once more, its held-out photos measured on the way."""
+    """The same training once more, to the bit, its held-out photos measured on the way."""
     name = f"{case.command.name}-curve"
     out = case.out.with_name(name)
     config = config_of(sets, case.seed)
     facts = {"data": dataset, "threads": arguments.threads, "every": arguments.curve, "seed": case.seed}
-    facts |= {"scale": min(1.0, size_factor(dataset, config.undistort.max_megapixels)), "json": out / CURVE}
-    facts |= {"iterations": config.train.iterations, "max-gaussians": config.train.max_gaussians}
+    facts |= {"json": out / CURVE, "iterations": config.train.iterations}
+    facts |= {"max-gaussians": config.train.max_gaussians}
     words = [word for key, value in facts.items() for word in (f"--{key}", str(value))]
     command = Command(name, (str(FOLLOW), *words, "--held-out", config.evaluate.views, "--set", *sets), out / "log")
     key = digest([case.key, arguments.curve])
@@ -236,9 +262,13 @@ def ablate(arguments: argparse.Namespace) -> int:
     with work_folder(arguments.work) as work:
         tell(f"What is finished is kept in {work}")
         facts = machine(arguments.threads) | {"jobs": arguments.jobs, "seeds": arguments.seeds}
-        datasets, lost = placed(captures, work, arguments)
+        datasets, lost = placed(captures, work, arguments, front_sets(arguments), photos_only=True)
+        reduced: dict[str, Path] = {}
+        if arguments.curve is not None:
+            reduced, lost_here = placed(datasets, work, arguments, base_sets(arguments), photos_only=False)
+            lost += lost_here
         finished = Finished(work)
-        cases = cases_of(variants, datasets, work, arguments)
+        cases = cases_of(variants, datasets, reduced, work, arguments)
         failures = run_cases(cases, finished, arguments)
         rows = rows_of(cases, finished.rows)
     failed = [{"variant": None, "seed": None} | row for row in lost]

@@ -101,15 +101,13 @@ def test_runs_what_is_new_and_nothing_else(dataset: Path, tmp_path: Path, capfd:
 
 
 def test_following_a_training_tells_how_far_its_end_is_below_its_best(dataset: Path, tmp_path: Path) -> None:
-    words = ["--data", str(dataset), "--seeds", "1", "--iterations", "10", "--jobs", "1", "--curve", "1e-3"]
-    arguments = ablation.parser().parse_args([*words, "--base", TINY])
-    run, follow = ablation.cases_of([variants.Variant("base")], {"tiny": dataset}, tmp_path, arguments)
-    finished = Finished(tmp_path)
-    assert ablation.run_cases([follow], finished, arguments) == {}
-    curve = [each["psnr"] for each in json.loads((follow.out / "curve.json").read_text())["rows"]]
-    assert len(curve) == 10
-    (only,) = ablation.rows_of([run, follow], finished.rows | {run.key: {"psnr": 9.0}})
-    assert only == row("base", "tiny", 0, psnr=9.0, best_psnr=max(curve), below_best=max(curve) - curve[-1])
+    work = tmp_path / "work"
+    code, found = ablate(dataset, work, "--variants", "/dev/null", "--seeds", "1", "--curve", "1e-3")
+    (path,) = (work / "runs").glob("*/curve.json")
+    curve = [each["psnr"] for each in json.loads(path.read_text())["rows"]]
+    (only,) = found["rows"]
+    assert code == 0 and len(curve) == 10 and curve[-1] == pytest.approx(only["psnr"], abs=1e-6)  # the same training
+    assert (only["best_psnr"], only["below_best"]) == (max(curve), max(curve) - curve[-1])
 
 
 @pytest.mark.parametrize(
