@@ -25,8 +25,7 @@ import numpy as np
 import torch
 from ceilings import measure_ceilings
 from rasterizing import contributing_pairs, raster_alone
-from rich.console import Console
-from rich.table import Table
+from tables import Row, console, print_table
 
 from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.runner import versions
@@ -44,8 +43,6 @@ from splatpipe.stages.train.draws import permutation
 from splatpipe.stages.train.plan import make_plan
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream
-
-Row = dict[str, Any]
 
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
 PARTS = ("forward", "loss", "backward", "adam")
@@ -347,29 +344,18 @@ def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str
         name: Of the benchmark.
         facts: Of the machine and the run.
         rows: The figures.
-        columns: Heading of each column, and the format of its value: ``key:format``; times with ``ms``, bytes ``MB``.
+        columns: As ``print_table`` takes them.
         path: Of the JSON; None for none.
     """
-    console = Console(width=220 if not sys.stdout.isatty() else None)
-    table = Table(title=name)
-    for heading in columns:
-        table.add_column(heading, justify="right")
-    for row in rows:
-        table.add_row(*(_cell(row, spec) for spec in columns.values()))
-    console.print(table)
+    print_table(name, rows, columns)
+    write_figures(name, facts, rows, path)
+
+
+def write_figures(name: str, facts: Row, rows: Sequence[Row], path: Path | None) -> None:
+    """Print the facts that are one value, and write all of them and the rows where there is a path."""
     for fact, value in facts.items():
         if isinstance(value, str | int | float):
-            console.print(f"{fact}: {value}", highlight=False)
+            console().print(f"{fact}: {value}", highlight=False)
     if path is not None:
         text = json.dumps({"benchmark": name, "machine": facts, "rows": list(rows)}, indent=1, allow_nan=False)
         path.write_text(text + "\n", encoding="utf-8")
-
-
-def _cell(row: Row, spec: str) -> str:
-    key, _, how = spec.partition(":")
-    value = row.get(key)
-    if value is None:
-        return "-"
-    if how == "ms":
-        return f"{1e3 * value:.2f}"
-    return f"{1e-6 * value:.0f}" if how == "MB" else format(value, how)
