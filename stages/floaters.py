@@ -77,8 +77,8 @@ def _look(
     plain = replace(options, sh_degree=0, background=(0.0, 0.0, 0.0), depth=True)
     with torch.no_grad():
         rendered = raster.render(flagged, camera, plain)
-    light = rendered.colour[..., 0].sum(dtype=torch.float64), rendered.alpha.sum(dtype=torch.float64)
-    return rendered.median_depth.numpy(), np.array([float(part) for part in light])
+    light = [part.numpy().sum(dtype=np.float64) for part in (rendered.colour[..., 0], rendered.alpha)]
+    return rendered.median_depth.numpy(), np.array(light)
 
 
 def _rounded(value: float | None) -> float | None:

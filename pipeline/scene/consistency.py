@@ -1,15 +1,15 @@
 """Whether neighbouring views agree on how far the surface is: the disagreement of their median depths.
 
-A floater that was fitted to one photo is a surface in that view alone: the neighbour, which sees the same place from
-beside, looks through it. So the pixels of a view are placed in space by its median depth and looked up in the
+Haze that was fitted to one photo is a surface along that photo's rays alone: the neighbour, which sees the same place
+from beside, looks through it. So the pixels of a view are placed in space by its median depth and looked up in the
 neighbour's depth map, as the consistency checks of multi-view stereo do (Schönberger et al.: "Pixelwise View Selection
 for Unstructured Multi-View Stereo", ECCV 2016).
 
 What the neighbour sees nearer says nothing: something may hide the place from it, as corners do. What it sees farther
 is a contradiction: it looks through what the other calls a surface. The check is one-sided, and runs in both
-directions: a floater before the neighbour is a hidden place in one direction and a contradiction in the other. One
-pixel is allowed: of the nine around, the depth that agrees best counts, or the outline of everything real would be a
-contradiction. A floater that both views see in the same place is none; ``free_space`` finds those.
+directions: haze before the neighbour is a hidden place in one direction and a contradiction in the other. One pixel is
+allowed: of the nine around, the depth that agrees best counts, or the outline of everything real would be a
+contradiction. A solid floater that both views see in the same place is none; ``free_space`` finds those.
 """
 
 from __future__ import annotations
