@@ -136,7 +136,7 @@ def share_of_opacity(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> float:
         chosen: Which.
     """
     opacity = torch.sigmoid(gaussians.opacity_logits.detach().to(torch.float64))
-    opacities = torch.where(gaussians.finite(), opacity, 0.0).numpy(force=True)  # torch's sums depend on its threads
+    opacities = torch.where(_usable(gaussians), opacity, 0.0).numpy(force=True)  # torch's sums depend on its threads
     total = float(opacities.sum())
     return float(opacities[chosen.numpy(force=True)].sum()) / total if total > 0.0 else 0.0
 
@@ -188,7 +188,7 @@ def _cells(
 def _judge(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """In how many photos each Gaussian hangs in front of what they observe, and which are right before a camera."""
     through, near = np.zeros(len(gaussians), np.int64), np.zeros(len(gaussians), np.bool_)
-    for chunk in _chunks(np.flatnonzero(gaussians.finite().numpy(force=True))):
+    for chunk in _chunks(np.flatnonzero(_usable(gaussians).numpy(force=True))):
         means = gaussians.means[torch.from_numpy(chunk)].detach().cpu().numpy().astype(np.float64)
         for photo in space.photos:
             rows, pixels, cells, depths = _cells(photo.camera, means)
@@ -211,6 +211,12 @@ def _within(
     left, top, right, bottom = photo.box[:, cells[:, 0], cells[:, 1]]
     x, y = pixels.T
     return np.asarray((x >= left) & (x <= right) & (y >= top) & (y <= bottom))
+
+
+def _usable(gaussians: Gaussians) -> Bool[Tensor, " n"]:
+    """Which Gaussians have a finite place, size, turn and opacity; their colours, most of the memory, are not read."""
+    tensors = (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits[:, None])
+    return torch.stack([torch.isfinite(tensor.detach()).all(1) for tensor in tensors]).all(0)
 
 
 def _chunks(rows: Int64[np.ndarray, " _"]) -> Iterator[Int64[np.ndarray, " _"]]:
