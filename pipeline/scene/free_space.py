@@ -8,15 +8,13 @@ the surface there. All choices keep real things rather than find every floater:
 - A cell says nothing without two points of its own, nor beyond the outermost of the points around it: its neighbours
   lower its bound and do not give it one. So textureless things wider than a cell stay unjudged, and so does the ground
   before the foot of a wall: below the wall's last points it comes nearer by a third within one cell.
-- The least depth, not a percentile: points that were left out for the test were called free less often by it, and free
-  places were found as often. A wrong point that is too near costs a floater that stays.
+- The least depth, not a percentile: a wrong point that is too near costs a floater that stays, and no surface.
 - A Gaussian is in front where its centre and one of its standard deviations along the view axis are nearer than the
   bound less a tenth: most of it is. A haze that three of them would let reach the wall is a floater all the same.
 - Two photos have to say so, and a well-observed point right beside the Gaussian refutes them: a post in front of a
   wall is thinner than a cell, but has points of its own.
 
-On the demo capture, whose surface is known, 5 of 9,190 places on it are called free, and 73 % of places in the air
-between it and the cameras; 0.27 % and 77 % without the rule of the outermost points.
+`tests/test_truth.py` holds this against the true surface of the demo capture.
 
 Close to a camera there are hardly two photos, so one is enough: nearer than a fifth of the depth at which its points
 begin, and than all of them, there is nothing but floaters.
@@ -38,12 +36,12 @@ from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians, multiply_quats
 
 CELLS = 24  # along the longer side: some 30 pixels at half a megapixel, 4 % of the depth
-OWN_POINTS = 2  # of a cell whose bound is defined; one alone called twice as many left-out points free
+OWN_POINTS = 2  # of a cell whose bound is defined: one alone may look past the edge of what is in front
 POINTS_AROUND = 6  # with its eight neighbours
 MARGIN = 0.1  # of the depth: sparse points of a tenth of a pixel are much better, surfaces between them curve
 VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin thing
 SUPPORT_TRACK = 3  # photos that observe a point which refutes: those of two are the ones that hang in free space
-SUPPORT_SHARE = 0.02  # of the distance to the nearest camera, half a cell: nearer to such a point is on its surface
+SUPPORT_SHARE = 0.04  # of the distance to the nearest camera, a cell: nearer to such a point is on its surface
 NEAR_SHARE = 0.2  # of the depth where a photo's points begin
 NEAR_PERCENTILE = 5  # of the depths of its points: where they begin
 CHUNK = 65_536  # Gaussians at a time: a few megabytes
