@@ -260,7 +260,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=2,
+    version=3,
     config=EvaluateConfig,
     reads=("train.model", "train.plan", "undistort.dataset"),
     parts={"metrics": "metrics.json", "views": "views"},

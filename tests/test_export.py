@@ -44,6 +44,7 @@ REQUIRED = [
     "test_views",
     "psnr",
     "psnr_cc",
+    "floaters",
     "ssim",
     "per_view",
     "versions",
