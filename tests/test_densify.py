@@ -71,7 +71,7 @@ def test_the_largest_scores_come_first_and_the_rest_is_counted() -> None:
 
 def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
     gaussians = model([0.05, 0.5, 0.5])
-    gaussians.opacity_logits[:] = torch.tensor([2.0, -5.0, 1.0])
+    gaussians.opacity_logits[:] = torch.tensor([2.0, -4.0, 1.0])
     growth, _ = grow(gaussians, torch.tensor([1.0, 1.0, 0.0]), 9, OPTIONS, EXTENT, 1)
     assert growth.source.tolist() == [0, 2, 0, 1, 1]
     before, after = 1.0 - torch.sigmoid(gaussians.opacity_logits), 1.0 - torch.sigmoid(growth.opacity_logits)

@@ -20,6 +20,7 @@ from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step
+from splatpipe.stages.train.density import BLIND, Seen
 from splatpipe.stages.train.draws import BACKGROUND, uniform
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
@@ -226,26 +227,26 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
+    look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
     settings = raster.RenderOptions(
         sh_degree=sh_degree_at(options, iteration),
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
         depth=False,
-        magnitudes=observed,
+        magnitudes=look.magnitudes,
     )
-    probe = state.probe() if observed else None
+    probe = state.probe() if look.probe else None
     rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
     loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))
     with torch.no_grad():
+        if observed:
+            gradient_px = None if probe is None else probe.grad
+            state.density.observe(Seen(state.gaussians, rendered, photo, look, gradient_px), options)
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
-        if probe is not None and probe.grad is not None:
-            state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
-            if options.prune_screen_px > 0.0:
-                state.statistics.observe_radii(rendered.radii)
 
 
 def background(options: TrainConfig, iteration: int) -> tuple[float, float, float]:
