@@ -80,6 +80,18 @@ def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
     assert growth.opacity_logits[1] == gaussians.opacity_logits[2]
 
 
+def test_what_would_be_pruned_when_halved_is_not_densified() -> None:
+    gaussians = model([0.05, 0.5, 0.05, 0.5])
+    gaussians.opacity_logits[:] = torch.logit(torch.tensor([0.0099, 0.0099, 0.0101, 0.0101]))
+    growth, counts = grow(gaussians, torch.ones(4), 9, OPTIONS, EXTENT, 1)
+    assert counts == {"cloned": 1, "split": 1, "held_back": 0} and growth.source.tolist() == [0, 1, 2, 2, 3, 3]
+    grown = gaussians.select(growth.source)
+    grown.opacity_logits = growth.opacity_logits
+    assert not prune_mask(grown, OPTIONS, EXTENT, 50, torch.zeros(6)).any()
+    unlimited = OPTIONS.model_copy(update={"prune_opacity": 0.0})
+    assert grow(gaussians, torch.ones(4), 9, unlimited, EXTENT, 1)[1] == {"cloned": 2, "split": 2, "held_back": 0}
+
+
 def test_halved_opacity_stays_finite_in_float32() -> None:
     halved = half_opacity(torch.tensor([-1000.0, -210.0, 210.0, 1000.0]))
     torch.testing.assert_close(halved, torch.tensor([-1000.0 - math.log(2.0), -210.0 - math.log(2.0), 105.0, 500.0]))

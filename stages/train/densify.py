@@ -1,9 +1,8 @@
-"""Adaptive density control: where Gaussians are cloned, split, pruned and their opacity reset.
+"""Adaptive density control: how Gaussians are cloned, split, pruned and their opacity reset, and how many there may be.
 
 Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023,
-section 5 and its published settings, changed in three ways. The score of a Gaussian sums the magnitudes of its pixels'
-gradients, which do not cancel in one that is too large for what it covers (Ye et al., "AbsGS", ACM MM 2024). The number
-of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
+section 5 and its published settings, changed in two ways whatever the score (which the strategies in `density/` make).
+The number of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
 "Taming 3DGS", SIGGRAPH Asia 2024). And two that take the place of one have the opacity that lets as much light through
 as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024).
 """
