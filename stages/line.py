@@ -121,11 +121,19 @@ class TrainConfig(StageConfig):
     densify_from: Length = "auto"
     """First iteration of density control. Auto: 500, at most a fifth of the run."""
     densify_until: Length = "auto"
-    """Last iteration of density control. Auto: half of the run."""
+    """Last iteration of density control. Auto: half of the run; for `mcmc` five sixths of it."""
     densify_every: Length = "auto"
     """Iterations between its steps. Auto: 100, at most a tenth of the run."""
-    densify_gradient: PositiveFloat = 1.2e-3
-    """Gaussians are densified whose pixels' image-plane gradients (NDC), as magnitudes, sum to more than this."""
+    density: Literal["published", "absolute", "error", "mcmc"] = "absolute"
+    """Where Gaussians are added: where the screen gradient is large, summed as `published` or as `absolute` magnitudes;
+    where Gaussians answer for the photos' `error`; or `mcmc`: where opacity is high, dead ones moving there."""
+    densify_gradient: Literal["auto"] | PositiveFloat = "auto"
+    """Gaussians are densified whose score is above this: the image-plane gradient (NDC), for `error` pixels of full
+    error a photo; `mcmc` has no score. Auto: 1.2e-3 for `absolute`, 2e-4 for `published`, 0.1 for `error`."""
+    opacity_decay: Literal["auto"] | NonNegativeFloat = "auto"
+    """Weight of the mean opacity in the loss: what photos do not ask for fades. Auto: 0.01 for `mcmc`, else 0."""
+    scale_decay: Literal["auto"] | NonNegativeFloat = "auto"
+    """Weight of the mean scale in the loss. Auto: 0.01 for `mcmc`, else 0."""
     split_extent: PositiveFloat = 0.01
     """Those larger than this share of the scene's extent are split, smaller ones cloned."""
     split_shrink: Annotated[float, Field(ge=1.0, le=10.0)] = 1.6
@@ -137,7 +145,7 @@ class TrainConfig(StageConfig):
     prune_screen_px: NonNegativeFloat = 0.0
     """Those with a larger radius on screen are removed, too (published: 20); 0 for never: it eats aerial ground."""
     reset_every: LengthOrZero = "auto"
-    """Iterations between opacity resets, 0 for none. Auto: 3000; below 10,000 iterations none."""
+    """Iterations between opacity resets, 0 for none. Auto: 3000; below 10,000 iterations and for `mcmc` none."""
     reset_opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01
     """An opacity reset leaves no Gaussian above this."""
     lr_boost: Literal["auto"] | PositiveFloat = "auto"

@@ -71,13 +71,25 @@ def test_the_largest_scores_come_first_and_the_rest_is_counted() -> None:
 
 def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
     gaussians = model([0.05, 0.5, 0.5])
-    gaussians.opacity_logits[:] = torch.tensor([2.0, -5.0, 1.0])
+    gaussians.opacity_logits[:] = torch.tensor([2.0, -4.0, 1.0])
     growth, _ = grow(gaussians, torch.tensor([1.0, 1.0, 0.0]), 9, OPTIONS, EXTENT, 1)
     assert growth.source.tolist() == [0, 2, 0, 1, 1]
     before, after = 1.0 - torch.sigmoid(gaussians.opacity_logits), 1.0 - torch.sigmoid(growth.opacity_logits)
     torch.testing.assert_close(after[0] * after[2], before[0])
     torch.testing.assert_close(after[3] * after[4], before[1])
     assert growth.opacity_logits[1] == gaussians.opacity_logits[2]
+
+
+def test_what_would_be_pruned_when_halved_is_not_densified() -> None:
+    gaussians = model([0.05, 0.5, 0.05, 0.5])
+    gaussians.opacity_logits[:] = torch.logit(torch.tensor([0.0099, 0.0099, 0.0101, 0.0101]))
+    growth, counts = grow(gaussians, torch.ones(4), 9, OPTIONS, EXTENT, 1)
+    assert counts == {"cloned": 1, "split": 1, "held_back": 0} and growth.source.tolist() == [0, 1, 2, 2, 3, 3]
+    grown = gaussians.select(growth.source)
+    grown.opacity_logits = growth.opacity_logits
+    assert not prune_mask(grown, OPTIONS, EXTENT, 50, torch.zeros(6)).any()
+    unlimited = OPTIONS.model_copy(update={"prune_opacity": 0.0})
+    assert grow(gaussians, torch.ones(4), 9, unlimited, EXTENT, 1)[1] == {"cloned": 2, "split": 2, "held_back": 0}
 
 
 def test_halved_opacity_stays_finite_in_float32() -> None:

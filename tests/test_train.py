@@ -152,6 +152,20 @@ def test_killed_training_with_every_technique_ends_with_the_same_bits(scene: Pat
         assert (tmp_path / "killed" / part).read_bytes() == (whole / part).read_bytes()
 
 
+@pytest.mark.parametrize(("density", "when"), [("published", 18), ("error", 20), ("mcmc", 35)])
+def test_killed_training_of_every_strategy_ends_with_the_same_bits(
+    scene: Path, undisturbed: Path, tmp_path: Path, density: str, when: int
+) -> None:
+    config = TrainConfig.model_validate(QUICK.model_dump() | {"density": density})
+    whole = trained(scene, tmp_path / "whole", config)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        die_at(patch, when, killed)
+        trained(scene, tmp_path / "killed", config)
+    assert digest(trained(scene, tmp_path / "killed", config, threads=2)) == digest(whole) != digest(undisturbed)
+    events = json.loads((whole / "history.json").read_text())["density"]
+    assert sum(event["added"] + event["cloned"] + event["split"] for event in events) > 0
+
+
 def test_interrupt_saves_a_checkpoint_and_is_passed_on(scene: Path, undisturbed: Path, tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGTERM)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -218,6 +232,7 @@ def test_fewer_gaussians_than_points_may_be_asked_for(scene: Path, tmp_path: Pat
         {"sparse_adam": False},
         {"loss": "kornia", "iterations": 20},
         {"prune_screen_px": 5.0},
+        {"opacity_decay": 0.01, "scale_decay": 0.01},
     ],
 )
 def test_options_train_to_a_finite_model_and_repeat(

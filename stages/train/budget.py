@@ -234,7 +234,7 @@ def planned_options(config: TrainConfig, megapixels: float, cap: int, iterations
         "iterations": iterations,
         "max_gaussians": cap,
         "coarse_levels": max(config.coarse_levels, min(2, halvings)),
-        "densify_gradient": GRADIENT_SHARE * config.densify_gradient,
+        "densify_gradient": GRADIENT_SHARE * float(resolve_schedule(config).densify_gradient),
     }
     return resolve_schedule(config.model_copy(update=planned))
 

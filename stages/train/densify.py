@@ -1,9 +1,8 @@
-"""Adaptive density control: where Gaussians are cloned, split, pruned and their opacity reset.
+"""Adaptive density control: how Gaussians are cloned, split, pruned and their opacity reset, and how many there may be.
 
 Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023,
-section 5 and its published settings, changed in three ways. The score of a Gaussian sums the magnitudes of its pixels'
-gradients, which do not cancel in one that is too large for what it covers (Ye et al., "AbsGS", ACM MM 2024). The number
-of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
+section 5 and its published settings, changed in two ways whatever the score (which the strategies in `density/` make).
+The number of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
 "Taming 3DGS", SIGGRAPH Asia 2024). And two that take the place of one have the opacity that lets as much light through
 as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024).
 """
@@ -11,7 +10,7 @@ as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 import torch
@@ -43,6 +42,10 @@ class Growth:
     log_scales: Float[Tensor, "m 3"]
     opacity_logits: Float[Tensor, " m"]
 
+    def select(self, rows: Bool[Tensor, " m"]) -> Growth:
+        """The rows of a mask."""
+        return Growth(*(getattr(self, field.name)[rows] for field in fields(self)))
+
 
 @dataclass(frozen=True)
 class DensityEvent:
@@ -55,6 +58,8 @@ class DensityEvent:
         pruned: Gaussians removed.
         held_back: Gaussians that the schedule kept from being densified.
         gaussians: How many there are now.
+        relocated: Dead Gaussians that took the place of live ones.
+        added: Copies of live Gaussians that were drawn.
     """
 
     iteration: int
@@ -63,6 +68,8 @@ class DensityEvent:
     pruned: int
     held_back: int
     gaussians: int
+    relocated: int = 0
+    added: int = 0
 
     def to_json(self) -> dict[str, int]:
         """For `history.json`."""
@@ -73,27 +80,30 @@ class DensityStatistics:
     """Running sums over the photos since the last step.
 
     Attributes:
-        gradient_sum: (n,) sum of the norms of the pixels' summed |dL/d(mean2D)|, NDC.
+        score_sum: (n,) sum of the photos' scores.
         seen: (n,) photos that saw the Gaussian.
         max_radius_px: (n,) largest radius on screen.
     """
 
     def __init__(self, count: int) -> None:
-        self.gradient_sum = torch.zeros(count)
+        self.score_sum = torch.zeros(count)
         self.seen = torch.zeros(count)
         self.max_radius_px = torch.zeros(count)
 
     def observe(self, gradient_px: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"], width: int, height: int) -> None:
-        """Add an iteration's image-plane gradients.
+        """Add an iteration's image-plane gradients, by their norm in NDC.
 
         Args:
-            gradient_px: Sums of |dL/d(mean2D)| over the pixels, x and y apart.
+            gradient_px: dL/d(mean2D) summed over the pixels, or its magnitudes, x and y apart.
             visible: Which Gaussians the photo saw.
             width: Of the render, pixels.
             height: Of the render, pixels.
         """
-        ndc = torch.hypot(gradient_px[:, 0] * (0.5 * width), gradient_px[:, 1] * (0.5 * height))
-        self.gradient_sum += torch.where(visible & torch.isfinite(ndc), ndc, 0.0)
+        self.add(torch.hypot(gradient_px[:, 0] * (0.5 * width), gradient_px[:, 1] * (0.5 * height)), visible)
+
+    def add(self, score: Float[Tensor, " n"], visible: Bool[Tensor, " n"]) -> None:
+        """Add an iteration's scores, which are overwritten; those that are not finite count as 0."""
+        self.score_sum += score.nan_to_num_(0.0, 0.0, 0.0).mul_(visible)
         self.seen += visible
 
     def observe_radii(self, radii_px: Float[Tensor, " n"]) -> None:
@@ -102,11 +112,11 @@ class DensityStatistics:
 
     def score(self) -> Float[Tensor, " n"]:
         """The statistic: averaged over the photos that saw the Gaussian."""
-        return self.gradient_sum / self.seen.clamp(min=1.0)
+        return self.score_sum / self.seen.clamp(min=1.0)
 
     def to_arrays(self) -> dict[str, Tensor]:
         """Its tensors by name, for a checkpoint."""
-        return {"gradient_sum": self.gradient_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
+        return {"score_sum": self.score_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
 
 
 def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
@@ -133,6 +143,8 @@ def grow(
 ) -> tuple[Growth, dict[str, int]]:
     """Clone the small and split the large Gaussians whose score asks for it.
 
+    Those whose halved opacity would be under the pruning limit are left: both halves would go in the next step.
+
     Args:
         gaussians: The model.
         score: ``DensityStatistics.score`` of each.
@@ -145,7 +157,8 @@ def grow(
         The new rows (kept ones in their order, then clones, then two children for each split), and the counts
         ``cloned``, ``split`` and ``held_back``.
     """
-    wanted = torch.nonzero(score > options.densify_gradient).flatten()
+    lasting = gaussians.opacity_logits >= lowest_logit_to_halve(options.prune_opacity)
+    wanted = torch.nonzero((score > float(options.densify_gradient)) & lasting).flatten()
     chosen = _largest(wanted, score, max(0, room))
     size = gaussians.log_scales.amax(dim=1)
     large = size[chosen] > math.log(options.split_extent * extent)
@@ -176,6 +189,12 @@ def half_opacity(logits: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
     return torch.nn.functional.logsigmoid(logits) - torch.log1p(torch.exp(log_through)) - log_through
 
 
+def lowest_logit_to_halve(limit: float) -> float:
+    """The logit of the opacity whose half, by ``half_opacity``, is the limit: 1 - (1 - α)²."""
+    opacity = limit * (2.0 - limit)
+    return math.log(opacity / (1.0 - opacity)) if opacity > 0.0 else -math.inf
+
+
 def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit: int) -> Int64[Tensor, " k"]:
     """Up to ``limit`` candidates of the largest value (ties: the first row), in row order."""
     if len(candidates) <= limit:
@@ -192,10 +211,15 @@ def _split_offsets(gaussians: Gaussians, rows: Int64[Tensor, " s"], seed: int, i
     unit = torch.from_numpy(normal(seed, iteration, SPLIT_POSITION, index).astype(np.float32))  # (2s, 3)
     both = torch.cat((rows, rows))
     local = unit * torch.exp(gaussians.log_scales[both])
-    w, vector = gaussians.quats[both, :1], gaussians.quats[both, 1:]  # q v q⁻¹ = v + 2 u×(u×v + w v) for |q| = 1
-    norm = gaussians.quats[both].norm(dim=1, keepdim=True).clamp(min=1e-12)
-    w, vector = w / norm, vector / norm
-    return local + 2.0 * torch.cross(vector, torch.cross(vector, local, dim=1) + w * local, dim=1)
+    return rotate(gaussians.quats[both], local)
+
+
+def rotate(quats: Float[Tensor, "k 4"], vectors: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
+    """Turn each vector by its quaternion, which need not be a unit one."""
+    w, axis = quats[:, :1], quats[:, 1:]  # q v q⁻¹ = v + 2 u×(u×v + w v) for |q| = 1
+    norm = quats.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    w, axis = w / norm, axis / norm
+    return vectors + 2.0 * torch.cross(axis, torch.cross(axis, vectors, dim=1) + w * vectors, dim=1)
 
 
 def prune_mask(

@@ -22,6 +22,8 @@ _TO_UNIT = 2.0**-53
 PHOTO_ORDER = 1
 SPLIT_POSITION = 2
 BACKGROUND = 3
+RELOCATION = 4
+POSITION_NOISE = 5
 
 
 def _mix(bits: Bits) -> Bits:

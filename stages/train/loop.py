@@ -20,6 +20,7 @@ from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step
+from splatpipe.stages.train.density import BLIND, Seen
 from splatpipe.stages.train.draws import BACKGROUND, uniform
 from splatpipe.stages.train.exposure import exposures_json
 from splatpipe.stages.train.interrupts import deferred_interrupts
@@ -228,24 +229,29 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
-    settings = render_options(plan, iteration, observed)
-    probe = state.probe() if observed else None
-    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
-    measure = photo_loss if options.loss == "native" else photo_loss_reference
+    look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
+    probe = state.probe() if look.probe else None
+    rendered = raster.render(
+        state.gaussians,
+        photo.camera,
+        render_options(plan, iteration, look.magnitudes),
+        means2d_probe=probe,
+        buffers=None if look.again else state.buffers,
+    )
     shown = rendered.colour
     if state.exposure is not None:
         shown = state.exposure.shown(shown, photo.camera.name)
+    measure = photo_loss if options.loss == "native" else photo_loss_reference
     loss = measure(shown, photo.colour, options.ssim_weight, photo.mask)
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))
     with torch.no_grad():
+        if observed:
+            gradient_px = None if probe is None else probe.grad
+            state.density.observe(Seen(state.gaussians, rendered, photo, look, gradient_px), options)
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
         if state.exposure is not None:
             state.exposure.step(photo.camera.name, iteration, options)
-        if probe is not None and probe.grad is not None:
-            state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
-            if options.prune_screen_px > 0.0:
-                state.statistics.observe_radii(rendered.radii)
 
 
 def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:

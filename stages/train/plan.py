@@ -26,6 +26,31 @@ SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it
 
 
 @dataclass(frozen=True)
+class _Defaults:
+    """What `auto` means for a strategy of density control.
+
+    Attributes:
+        gradient: Score above which Gaussians are densified.
+        until: Last step, as a share of the run.
+        resets: Whether opacities are reset.
+        decay: Weight of mean opacity and of mean scale in the loss.
+    """
+
+    gradient: float
+    until: float = 0.5
+    resets: bool = True
+    decay: float = 0.0
+
+
+DENSITY_DEFAULTS = {
+    "published": _Defaults(2e-4),
+    "absolute": _Defaults(1.2e-3),
+    "error": _Defaults(0.1),
+    "mcmc": _Defaults(1.0, until=25 / 30, resets=False, decay=0.01),  # it has no score
+}
+
+
+@dataclass(frozen=True)
 class Plan:
     """What a training does, resolved.
 
@@ -111,14 +136,17 @@ def duration(seconds: float) -> str:
 
 def resolve_schedule(config: TrainConfig) -> TrainConfig:
     """Replace every `auto` by the published value, changed for short runs as the option's text says."""
-    run = config.iterations
-    until = config.densify_until if config.densify_until != "auto" else run // 2
+    run, strategy = config.iterations, DENSITY_DEFAULTS[config.density]
+    until = config.densify_until if config.densify_until != "auto" else int(run * strategy.until)
     auto = {
         "sh_every": max(1, min(1000, run // 5)),
         "densify_from": max(1, min(500, run // 5)),
         "densify_until": max(1, until),
         "densify_every": max(1, min(100, run // 10)),
-        "reset_every": 3000 if run >= SHORT_RUN else 0,
+        "reset_every": 3000 if run >= SHORT_RUN and strategy.resets else 0,
+        "densify_gradient": strategy.gradient,
+        "opacity_decay": strategy.decay,
+        "scale_decay": strategy.decay,
         "coarse_until": until,
         "lr_boost": round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / run))), 4),
     }

@@ -15,16 +15,9 @@ from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, Checkpoint
-from splatpipe.stages.train.densify import (
-    DensityEvent,
-    DensityStatistics,
-    grow,
-    is_density_step,
-    is_opacity_reset,
-    prune_mask,
-    reset_opacity,
-    room_at,
-)
+from splatpipe.stages.train.densify import DensityEvent, is_density_step, is_opacity_reset, reset_opacity, room_at
+from splatpipe.stages.train.density import Density, DensityStep, make_density
+from splatpipe.stages.train.density.decay import add_decay
 from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.history import History
 from splatpipe.stages.train.plan import Plan
@@ -33,7 +26,7 @@ SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covarian
 LARGEST_SCALE = 1e2  # a sky is no farther than that
 
 _ADAM = "adam."
-_STATISTICS = "statistics."
+_DENSITY = "density."
 _EXPOSURE = "exposure."
 
 
@@ -44,7 +37,7 @@ class TrainState:
     Attributes:
         gaussians: The model; its tensors are leaves of autograd.
         adam: The optimiser's moments.
-        statistics: Of density control, since its last step.
+        density: The strategy of density control, with what it has observed since its last step.
         history: What happened so far.
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
@@ -54,7 +47,7 @@ class TrainState:
 
     gaussians: Gaussians
     adam: Adam
-    statistics: DensityStatistics
+    density: Density
     history: History
     iteration: int = 0
     seconds: float = 0.0
@@ -79,8 +72,8 @@ class TrainState:
         model = start.clone()
         model.sh = sh
         gaussians = model.requires_grad_()
-        adam, statistics = Adam(gaussians.tensors()), DensityStatistics(len(start))
-        return TrainState(gaussians, adam, statistics, History(), exposure=new_exposure(plan))
+        adam, density = Adam(gaussians.tensors()), make_density(options, len(start))
+        return TrainState(gaussians, adam, density, History(), exposure=new_exposure(plan))
 
     def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
         """Step the parameters against their gradients, which are dropped.
@@ -100,12 +93,14 @@ class TrainState:
             "opacity_logits": options.lr_opacity,
             "sh": sh_rates(self.gaussians.sh.shape[1], colour, colour / options.lr_sh_rest_divisor),
         }
+        add_decay(self.gaussians, options)
         tensors = self.gaussians.tensors()
         rows = gradient_rows if options.sparse_adam else None
         self.history.skipped_gradients += self.adam.step(tensors, rates, rows)
         for tensor in tensors.values():
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))
+        self.density.stepped(self.gaussians.detach(), options, means_rate, self.iteration + 1)
 
     def probe(self) -> Float[Tensor, "n 2"]:
         """Zeros whose gradient a render makes the one by the means on the image plane."""
@@ -129,23 +124,17 @@ class TrainState:
                 self.history.resets.append(iteration)
 
     def _densify(self, options: TrainConfig, extent: float, limit: int, iteration: int) -> None:
-        """Prune, then grow to at most ``limit`` Gaussians."""
+        """Give the model the rows that the strategy chooses, at most ``limit``."""
         self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
-        gaussians, statistics = self.gaussians.detach(), self.statistics
-        gone = prune_mask(gaussians, options, extent, iteration, statistics.max_radius_px)
-        pruned = int(gone.sum())
-        score = torch.where(gone, 0.0, statistics.score())
-        growth, counts = grow(gaussians, score, limit - len(gaussians) + pruned, options, extent, iteration)
-        kept = ~gone[growth.source]
-        source, fresh = growth.source[kept], growth.fresh[kept]
-        grown = gaussians.select(source)
-        grown.means, grown.log_scales = growth.means[kept], growth.log_scales[kept]
-        grown.opacity_logits = growth.opacity_logits[kept]
+        gaussians = self.gaussians.detach()
+        growth, counts = self.density.control(gaussians, DensityStep(options, extent, limit, iteration))
+        grown = gaussians.select(growth.source)
+        grown.means, grown.log_scales, grown.opacity_logits = growth.means, growth.log_scales, growth.opacity_logits
         self.gaussians = grown.requires_grad_()
-        self.adam.select(source)
-        self.adam.zero_state(rows=fresh)
-        self.statistics = DensityStatistics(len(self.gaussians))
-        self.history.add_density(DensityEvent(iteration, pruned=pruned, gaussians=len(self.gaussians), **counts))
+        self.adam.select(growth.source)
+        self.adam.zero_state(rows=growth.fresh)
+        self.density.restart(len(grown))
+        self.history.add_density(DensityEvent(iteration, gaussians=len(grown), **counts))
 
     def finished(self) -> Gaussians:
         """The trained model: finite, with unit quaternions."""
@@ -162,7 +151,7 @@ class TrainState:
         """
         tensors = dict(self.gaussians.detach().tensors())
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
-        tensors |= {_STATISTICS + name: tensor for name, tensor in self.statistics.to_arrays().items()}
+        tensors |= {_DENSITY + name: tensor for name, tensor in self.density.to_arrays().items()}
         if self.exposure is not None:
             tensors |= {_EXPOSURE + name: tensor for name, tensor in self.exposure.arrays().items()}
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
@@ -183,9 +172,8 @@ class TrainState:
                 raise ValueError("another degree of spherical harmonics")
             adam = Adam(gaussians.tensors())
             adam.load_state_dict(_under(_ADAM, tensors))
-            statistics = DensityStatistics(len(gaussians))
-            for name, tensor in _under(_STATISTICS, tensors).items():
-                getattr(statistics, name).copy_(tensor)
+            density = make_density(plan.options, len(gaussians))
+            density.load(_under(_DENSITY, tensors))
             exposure = new_exposure(plan)
             if exposure is not None:
                 exposure.load(_under(_EXPOSURE, tensors))
@@ -193,7 +181,7 @@ class TrainState:
             counts = (int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"]))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
-        return TrainState(gaussians, adam, statistics, history, *counts, exposure=exposure)
+        return TrainState(gaussians, adam, density, history, *counts, exposure=exposure)
 
 
 def new_exposure(plan: Plan) -> Exposure | None:

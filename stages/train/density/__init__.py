@@ -1,0 +1,35 @@
+"""Strategies of density control: four ways to choose where Gaussians are added, behind one interface.
+
+| `train.density` | adds Gaussians where | source |
+|---|---|---|
+| `published` | the summed screen gradient is long | Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023 |
+| `absolute` | its pixels' magnitudes sum to much | Ye et al., "AbsGS", ACM MM 2024 |
+| `error` | a Gaussian answers for much of the photos' error | Rota Bulò et al., "Revising Densification", ECCV 2024 |
+| `mcmc` | opacity is high, and moves dead Gaussians there | Kheradmand et al., "3DGS as MCMC", NeurIPS 2024 |
+"""
+
+from __future__ import annotations
+
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.density.error import ErrorDensity
+from splatpipe.stages.train.density.gradient import AbsoluteDensity, PublishedDensity
+from splatpipe.stages.train.density.mcmc import McmcDensity
+from splatpipe.stages.train.density.strategy import BLIND, Density, DensityStep, Look, Seen
+
+__all__ = ["BLIND", "Density", "DensityStep", "Look", "Seen", "make_density"]
+
+
+def make_density(options: TrainConfig, count: int) -> Density:
+    """The strategy of `train.density`, with nothing observed yet.
+
+    Args:
+        options: Resolved.
+        count: Gaussians in the model.
+    """
+    strategies: dict[str, type[Density]] = {
+        "published": PublishedDensity,
+        "absolute": AbsoluteDensity,
+        "error": ErrorDensity,
+        "mcmc": McmcDensity,
+    }
+    return strategies[options.density](count)
