@@ -152,6 +152,18 @@ class TrainConfig(StageConfig):
     """Learning rate of rotations."""
     sparse_adam: bool = True
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
+    depth_weight: NonNegativeFloat = 0.0
+    """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training."""
+    sh_limit: bool = False
+    """Hold the degree of each Gaussian's colour to what the photos that saw it can tell by number and angles."""
+    opacity_decay: NonNegativeFloat = 0.0
+    """Weight of the mean opacity in the loss (3DGS-MCMC: 0.01): what no photo holds fades. 0: none."""
+    scale_decay: NonNegativeFloat = 0.0
+    """Weight of the mean size (three axes, over the extent) in the loss: what no photo holds shrinks. 0: none."""
+    max_anisotropy: NonNegativeFloat = 0.0
+    """No axis of a Gaussian is longer than this many times its middle one (at least 1): no needles. 0: no limit."""
+    dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+    """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian: 0.2)."""
 
 
 class EvaluateConfig(StageConfig):

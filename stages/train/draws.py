@@ -22,6 +22,7 @@ _TO_UNIT = 2.0**-53
 PHOTO_ORDER = 1
 SPLIT_POSITION = 2
 BACKGROUND = 3
+DROPOUT = 12
 
 
 def _mix(bits: Bits) -> Bits:

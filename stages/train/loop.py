@@ -20,7 +20,9 @@ from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step
+from splatpipe.stages.train.depth import supervised, with_depth
 from splatpipe.stages.train.draws import BACKGROUND, uniform
+from splatpipe.stages.train.dropout import dropped
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
@@ -32,6 +34,7 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
+from splatpipe.stages.train.regularise import add_decay
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
 
@@ -51,7 +54,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     check_device(inputs.machine)
-    views = load_views(inputs["undistort.dataset"])
+    views = supervised(load_views(inputs["undistort.dataset"]), inputs["undistort.dataset"], config)
     start = read_splat(inputs["initialize.splat"])
     every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
 
@@ -204,6 +207,7 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     options, iteration = plan.options, state.iteration + 1
     if photo.mask is None or bool(photo.mask.any()):
         descend(state, plan, photo, iteration)
+    state.end_epoch(iteration, len(plan.train_views))
     growing = not state.history.growth_ended
     control = options if growing else without_growth(options)
     state.control_density(control, plan.extent, plan.initial_gaussians, iteration)
@@ -231,15 +235,18 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
-        depth=False,
+        depth=options.depth_weight > 0.0,
         magnitudes=observed,
     )
     probe = state.probe() if observed else None
-    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
+    model = dropped(state.gaussians, options, iteration)
+    rendered = raster.render(model, photo.camera, settings, means2d_probe=probe)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
     loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
-    loss.backward()  # type: ignore[no-untyped-call]
+    with_depth(loss, rendered, photo, options, iteration).backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))
+    state.observe_directions(photo.camera)
+    add_decay(state.gaussians, rendered.visible, options, plan.extent)
     with torch.no_grad():
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
         if probe is not None and probe.grad is not None:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
+from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages.line import TrainConfig
@@ -25,12 +26,15 @@ from splatpipe.stages.train.densify import (
     room_at,
 )
 from splatpipe.stages.train.history import History
+from splatpipe.stages.train.regularise import limit_needles
+from splatpipe.stages.train.sh_limit import Coverage
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
 LARGEST_SCALE = 1e2  # a sky is no farther than that
 
 _ADAM = "adam."
 _STATISTICS = "statistics."
+_COVERAGE = "coverage."
 
 
 @dataclass
@@ -44,6 +48,7 @@ class TrainState:
         history: What happened so far.
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
+        coverage: Directions that Gaussians were seen from; None without `sh_limit`.
     """
 
     gaussians: Gaussians
@@ -52,6 +57,7 @@ class TrainState:
     history: History
     iteration: int = 0
     seconds: float = 0.0
+    coverage: Coverage | None = None
 
     @staticmethod
     def begin(start: Gaussians, options: TrainConfig) -> TrainState:
@@ -70,7 +76,9 @@ class TrainState:
         model = start.clone()
         model.sh = sh
         gaussians = model.requires_grad_()
-        return TrainState(gaussians, Adam(gaussians.tensors()), DensityStatistics(len(start)), History())
+        state = TrainState(gaussians, Adam(gaussians.tensors()), DensityStatistics(len(start)), History())
+        state.coverage = Coverage(len(start)) if options.sh_limit else None
+        return state
 
     def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
         """Step the parameters against their gradients, which are dropped.
@@ -96,6 +104,21 @@ class TrainState:
         for tensor in tensors.values():
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))
+        limit_needles(self.gaussians.log_scales.detach(), options)
+
+    def observe_directions(self, camera: Camera) -> None:
+        """With `sh_limit`: note what the photo saw, and clear the gradients of degrees that are not allowed."""
+        logits, sh = self.gaussians.opacity_logits, self.gaussians.sh
+        if self.coverage is not None and logits.grad is not None and sh.grad is not None:
+            self.coverage.observe(self.gaussians.means.detach(), camera, logits.grad != 0.0)
+            self.coverage.clear(sh.grad)
+
+    def end_epoch(self, iteration: int, photos: int) -> None:
+        """With `sh_limit`, after the last iteration of an epoch: take its degrees, and clear what exceeds them."""
+        if self.coverage is not None and iteration % photos == 0:
+            self.coverage.end_epoch()
+            for coefficients in (self.gaussians.sh.detach(), self.adam.mean["sh"], self.adam.square["sh"]):
+                self.coverage.clear(coefficients)
 
     def probe(self) -> Float[Tensor, "n 2"]:
         """Zeros whose gradient a render makes the one by the means on the image plane."""
@@ -133,6 +156,8 @@ class TrainState:
         self.gaussians = grown.requires_grad_()
         self.adam.select(source)
         self.adam.zero_state(rows=fresh)
+        if self.coverage is not None:
+            self.coverage.select(source)
         self.statistics = DensityStatistics(len(self.gaussians))
         self.history.add_density(DensityEvent(iteration, pruned=pruned, gaussians=len(self.gaussians), **counts))
 
@@ -152,6 +177,8 @@ class TrainState:
         tensors = dict(self.gaussians.detach().tensors())
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
         tensors |= {_STATISTICS + name: tensor for name, tensor in self.statistics.to_arrays().items()}
+        if self.coverage is not None:
+            tensors |= {_COVERAGE + name: tensor for name, tensor in self.coverage.to_arrays().items()}
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
         facts["instruction_set"] = instruction_set
         return Checkpoint({name: tensor.numpy() for name, tensor in tensors.items()}, facts)
@@ -173,11 +200,15 @@ class TrainState:
             statistics = DensityStatistics(len(gaussians))
             for name, tensor in _under(_STATISTICS, tensors).items():
                 getattr(statistics, name).copy_(tensor)
+            coverage = Coverage(len(gaussians)) if options.sh_limit else None
+            if coverage is not None:
+                for name, tensor in coverage.to_arrays().items():
+                    tensor.copy_(tensors[_COVERAGE + name])
             history = History(**checkpoint.facts["history"])
             counts = (int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"]))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
-        return TrainState(gaussians, adam, statistics, history, *counts)
+        return TrainState(gaussians, adam, statistics, history, *counts, coverage)
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
