@@ -6,7 +6,8 @@
 | their gradients | 236 |
 | Adam's two moments | 472 |
 | statistics of density control | 12 |
-| **state of training** | **956** |
+| with `sh_limit`, where it was seen from | 20 |
+| **state of training**, without `sh_limit` | **956** |
 | while density control copies parameters and moments, and the model is written | 860 |
 """
 
