@@ -131,9 +131,9 @@ class TrainConfig(StageConfig):
     """Gaussians are densified whose score is above this: the image-plane gradient (NDC), for `error` pixels of full
     error a photo; `mcmc` has no score. Auto: 1.2e-3 for `absolute`, 2e-4 for `published`, 0.1 for `error`."""
     opacity_decay: Literal["auto"] | NonNegativeFloat = "auto"
-    """Weight of the mean opacity in the loss: what photos do not ask for fades. Auto: 0.01 for `mcmc`, else 0."""
+    """Weight of the mean opacity in the loss: what no photo holds fades. Auto: 0.01 for `mcmc`, else 0."""
     scale_decay: Literal["auto"] | NonNegativeFloat = "auto"
-    """Weight of the mean scale in the loss. Auto: 0.01 for `mcmc`, else 0."""
+    """Weight of the mean size (three axes, over the extent): what no photo holds shrinks. Auto: 0.01 for `mcmc`, else 0."""
     split_extent: PositiveFloat = 0.01
     """Those larger than this share of the scene's extent are split, smaller ones cloned."""
     split_shrink: Annotated[float, Field(ge=1.0, le=10.0)] = 1.6
@@ -167,6 +167,14 @@ class TrainConfig(StageConfig):
     """Learning rate of rotations."""
     sparse_adam: bool = True
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
+    depth_weight: NonNegativeFloat = 0.0
+    """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training."""
+    sh_limit: bool = False
+    """Hold the degree of each Gaussian's colour to what the photos that saw it can tell by number and angles."""
+    max_anisotropy: NonNegativeFloat = 0.0
+    """No axis of a Gaussian is longer than this many times its middle one (at least 1): no needles. 0: no limit."""
+    dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+    """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian: 0.2)."""
 
 
 class EvaluateConfig(StageConfig):

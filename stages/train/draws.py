@@ -24,6 +24,7 @@ SPLIT_POSITION = 2
 BACKGROUND = 3
 RELOCATION = 4
 POSITION_NOISE = 5
+DROPOUT = 12
 
 
 def _mix(bits: Bits) -> Bits:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import torch
+from torch import Tensor
 
 from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.errors import MachineError
@@ -21,7 +22,9 @@ from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.density import BLIND, Seen
+from splatpipe.stages.train.depth import supervised, with_depth
 from splatpipe.stages.train.draws import BACKGROUND, uniform
+from splatpipe.stages.train.dropout import dropped
 from splatpipe.stages.train.exposure import exposures_json
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
@@ -34,6 +37,9 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
+from splatpipe.stages.train.regularise import add_decay
+from splatpipe.stages.train.sky import SkyModel
+from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
 
@@ -53,7 +59,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     check_device(inputs.machine)
-    views = load_views(inputs["undistort.dataset"])
+    views = supervised(load_views(inputs["undistort.dataset"]), inputs["undistort.dataset"], config)
     start = read_splat(inputs["initialize.splat"])
     every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
 
@@ -207,6 +213,7 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     options, iteration = plan.options, state.iteration + 1
     if photo.mask is None or bool(photo.mask.any()):
         descend(state, plan, photo, iteration)
+    state.end_epoch(iteration, len(plan.train_views))
     growing = not state.history.growth_ended
     control = options if growing else without_growth(options)
     state.control_density(control, plan.extent, plan.initial_gaussians, iteration)
@@ -230,21 +237,17 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     options = plan.options
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
     look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
+    settings = render_options(plan, iteration, look.magnitudes)
     probe = state.probe() if look.probe else None
-    rendered = raster.render(
-        state.gaussians,
-        photo.camera,
-        render_options(plan, iteration, look.magnitudes),
-        means2d_probe=probe,
-        buffers=None if look.again else state.buffers,
-    )
-    shown = rendered.colour
-    if state.exposure is not None:
-        shown = state.exposure.shown(shown, photo.camera.name)
-    measure = photo_loss if options.loss == "native" else photo_loss_reference
-    loss = measure(shown, photo.colour, options.ssim_weight, photo.mask)
+    model = dropped(state.rendered_model(options), options, iteration)
+    buffers = None if look.again else state.buffers
+    rendered = raster.render(model, photo.camera, settings, means2d_probe=probe, buffers=buffers)
+    photometric, penalties = losses(state, plan, photo, rendered, settings.background)
+    loss = with_depth(photometric, rendered, photo, options, iteration) + penalties
     loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
-    state.history.add_loss(float(loss.detach()))
+    state.history.add_loss(float(photometric.detach()))
+    state.observe_directions(photo.camera)
+    add_decay(state.gaussians, rendered.visible, options, plan.extent)
     with torch.no_grad():
         if observed:
             gradient_px = None if probe is None else probe.grad
@@ -252,6 +255,30 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
         if state.exposure is not None:
             state.exposure.step(photo.camera.name, iteration, options)
+        if state.sky is not None:
+            state.sky.step(min(1.0, iteration / options.iterations))
+
+
+def losses(
+    state: TrainState, plan: Plan, photo: TrainingPhoto, rendered: raster.Render, behind: tuple[float, float, float]
+) -> tuple[Tensor, Tensor]:
+    """How far a render is from its photo, shown as the photo's sky and exposure would, and what the sky adds to that.
+
+    Args:
+        state: Of whose side models the render is completed.
+        plan: The training's.
+        photo: What to compare with.
+        rendered: The Gaussians alone.
+        behind: The colour that they were rendered over.
+    """
+    options, shown, penalty = plan.options, rendered.colour, rendered.colour.new_zeros(())
+    if state.sky is not None:
+        shown = state.sky.composite(rendered, photo.camera, behind)
+        penalty = state.sky.penalty(rendered.alpha, photo.camera, options.sky_opacity_weight)
+    if state.exposure is not None:
+        shown = state.exposure.shown(shown, photo.camera.name)
+    measure = photo_loss if options.loss == "native" else photo_loss_reference
+    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty
 
 
 def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:
@@ -262,7 +289,7 @@ def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.Rende
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
-        depth=False,
+        depth=options.depth_weight > 0.0,
         magnitudes=magnitudes,
     )
 

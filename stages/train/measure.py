@@ -142,7 +142,8 @@ def _photos(views: Sequence[View], megapixels: float) -> tuple[list[TrainingPhot
     for view in views:
         camera, pixels, mask = reduced_view(view, megapixels)
         colour = torch.from_numpy(pixels.astype(np.float32) * np.float32(1.0 / 255.0))
-        photos.append(TrainingPhoto(camera, colour, None if mask is None else torch.from_numpy(mask)))
+        counts = None if mask is None else torch.from_numpy(mask)
+        photos.append(TrainingPhoto(camera, colour, counts, view.depths))
     return photos, (time.monotonic() - began) / len(photos)
 
 

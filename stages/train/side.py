@@ -36,13 +36,13 @@ class SideModel:
         for tensor in self.tensors.values():
             tensor.grad = None
 
-    def arrays(self) -> dict[str, Tensor]:
+    def to_arrays(self) -> dict[str, Tensor]:
         """All that changes, by name, for a checkpoint; not copied."""
         moments = {_MOMENTS + name: tensor for name, tensor in self.adam.state_dict().items()}
         return {name: tensor.detach() for name, tensor in self.tensors.items()} | moments
 
     def load(self, arrays: Mapping[str, Tensor]) -> None:
-        """The inverse of ``arrays``.
+        """The inverse of ``to_arrays``.
 
         Raises:
             KeyError, ValueError, RuntimeError: if something is missing or has another shape.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,23 +13,33 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
+from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, Checkpoint
 from splatpipe.stages.train.densify import DensityEvent, is_density_step, is_opacity_reset, reset_opacity, room_at
 from splatpipe.stages.train.density import Density, DensityStep, make_density
-from splatpipe.stages.train.density.decay import add_decay
 from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.history import History
 from splatpipe.stages.train.plan import Plan
+from splatpipe.stages.train.regularise import limit_needles
+from splatpipe.stages.train.sh_limit import Coverage
+from splatpipe.stages.train.sky import SkyModel
+from splatpipe.stages.train.smoothing import REFRESH_EVERY, Sampling, raw_opacity_limits, smoothed
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
 LARGEST_SCALE = 1e2  # a sky is no farther than that
 
 _ADAM = "adam."
-_DENSITY = "density."
-_EXPOSURE = "exposure."
+_FILTER = "filter_sigmas"
+
+
+class Stateful(Protocol):
+    """What a checkpoint keeps tensors of."""
+
+    def to_arrays(self) -> dict[str, Tensor]: ...
+    def load(self, arrays: Mapping[str, Tensor]) -> None: ...
 
 
 @dataclass
@@ -35,7 +47,7 @@ class TrainState:
     """Parameters, moments, statistics and history.
 
     Attributes:
-        gaussians: The model; its tensors are leaves of autograd.
+        gaussians: The model, raw; its tensors are leaves of autograd.
         adam: The optimiser's moments.
         density: The strategy of density control, with what it has observed since its last step.
         history: What happened so far.
@@ -43,6 +55,10 @@ class TrainState:
         seconds: Spent so far, over all runs; of no influence.
         buffers: Memory of the gradients.
         exposure: The photos' colours, where they are modelled.
+        sky: Trained beside the Gaussians; None where there is none.
+        coverage: Directions that Gaussians were seen from; None without `sh_limit`.
+        sampling: The training cameras, with `filter_3d`; not in the checkpoint.
+        filter_sigmas: Of the 3D filter, a Gaussian each, world units; None before the first and after density control.
     """
 
     gaussians: Gaussians
@@ -53,14 +69,19 @@ class TrainState:
     seconds: float = 0.0
     buffers: GradientBuffers = field(default_factory=GradientBuffers)
     exposure: Exposure | None = None
+    sky: SkyModel | None = None
+    coverage: Coverage | None = None
+    sampling: Sampling | None = None
+    filter_sigmas: Float[Tensor, " n"] | None = None
 
     @staticmethod
-    def begin(start: Gaussians, plan: Plan) -> TrainState:
+    def begin(start: Gaussians, plan: Plan, sky: SkyModel | None = None) -> TrainState:
         """The state before the first iteration.
 
         Args:
             start: The Gaussians to start with; evenly thinned where there are more than the cap allows.
             plan: The training's.
+            sky: As it begins.
         """
         options = plan.options
         if len(start) > options.max_gaussians:
@@ -72,8 +93,33 @@ class TrainState:
         model = start.clone()
         model.sh = sh
         gaussians = model.requires_grad_()
-        adam, density = Adam(gaussians.tensors()), make_density(options, len(start))
-        return TrainState(gaussians, adam, density, History(), exposure=new_exposure(plan))
+        return TrainState.of(gaussians, plan, History(), sky)
+
+    @staticmethod
+    def of(gaussians: Gaussians, plan: Plan, history: History, sky: SkyModel | None) -> TrainState:
+        """Gaussians with everything that the plan wants beside them, nothing of it trained."""
+        options = plan.options
+        state = TrainState(gaussians, Adam(gaussians.tensors()), make_density(options, len(gaussians)), history)
+        state.exposure = Exposure(plan.train_views) if options.exposure != "off" else None
+        state.coverage = Coverage(len(gaussians)) if options.sh_limit else None
+        state.sky = sky
+        return state
+
+    def rendered_model(self, options: TrainConfig) -> Gaussians:
+        """What an iteration renders: the raw Gaussians, or what the 3D filter makes of them."""
+        assert (self.sampling is not None) == options.filter_3d, "the 3D filter needs the training cameras"
+        if self.iteration % REFRESH_EVERY == 0:
+            self.filter_sigmas = None
+        return self._filtered(self.gaussians)
+
+    def _filtered(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians if self.sampling is None else smoothed(gaussians, self._filter(self.sampling))
+
+    def _filter(self, sampling: Sampling) -> Float[Tensor, " n"]:
+        """``filter_sigmas``, made where there are none."""
+        if self.filter_sigmas is None:
+            self.filter_sigmas = sampling.filter_sigmas(self.gaussians.means)
+        return self.filter_sigmas
 
     def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
         """Step the parameters against their gradients, which are dropped.
@@ -93,14 +139,28 @@ class TrainState:
             "opacity_logits": options.lr_opacity,
             "sh": sh_rates(self.gaussians.sh.shape[1], colour, colour / options.lr_sh_rest_divisor),
         }
-        add_decay(self.gaussians, options)
         tensors = self.gaussians.tensors()
         rows = gradient_rows if options.sparse_adam else None
         self.history.skipped_gradients += self.adam.step(tensors, rates, rows)
         for tensor in tensors.values():
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))
+        limit_needles(self.gaussians.log_scales.detach(), options)
         self.density.stepped(self.gaussians.detach(), options, means_rate, self.iteration + 1)
+
+    def observe_directions(self, camera: Camera) -> None:
+        """With `sh_limit`: note what the photo saw, and clear the gradients of degrees that are not allowed."""
+        logits, sh = self.gaussians.opacity_logits, self.gaussians.sh
+        if self.coverage is not None and logits.grad is not None and sh.grad is not None:
+            self.coverage.observe(self.gaussians.means.detach(), camera, logits.grad != 0.0)
+            self.coverage.clear(sh.grad)
+
+    def end_epoch(self, iteration: int, photos: int) -> None:
+        """With `sh_limit`, after the last iteration of an epoch: take its degrees, and clear what exceeds them."""
+        if self.coverage is not None and iteration % photos == 0:
+            self.coverage.end_epoch()
+            for coefficients in (self.gaussians.sh.detach(), self.adam.mean["sh"], self.adam.square["sh"]):
+                self.coverage.clear(coefficients)
 
     def probe(self) -> Float[Tensor, "n 2"]:
         """Zeros whose gradient a render makes the one by the means on the image plane."""
@@ -119,29 +179,50 @@ class TrainState:
             if is_density_step(options, iteration):
                 self._densify(options, extent, room_at(options, initial, iteration), iteration)
             if is_opacity_reset(options, iteration):
-                reset_opacity(self.gaussians.opacity_logits.detach(), options.reset_opacity)
+                self._reset_opacity(options.reset_opacity)
                 self.adam.zero_state(names=("opacity_logits",))
                 self.history.resets.append(iteration)
+
+    def _reset_opacity(self, limit: float) -> None:
+        """Leave no opacity as it is rendered above ``limit``."""
+        logits = self.gaussians.opacity_logits.detach()
+        if self.sampling is None:
+            reset_opacity(logits, limit)
+        else:
+            logits.clamp_(max=raw_opacity_limits(self.gaussians, self._filter(self.sampling), limit))
 
     def _densify(self, options: TrainConfig, extent: float, limit: int, iteration: int) -> None:
         """Give the model the rows that the strategy chooses, at most ``limit``."""
         self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
         gaussians = self.gaussians.detach()
-        growth, counts = self.density.control(gaussians, DensityStep(options, extent, limit, iteration))
+        step = DensityStep(options, extent, limit, iteration, self._filtered(gaussians))
+        growth, counts = self.density.control(gaussians, step)
         grown = gaussians.select(growth.source)
         grown.means, grown.log_scales, grown.opacity_logits = growth.means, growth.log_scales, growth.opacity_logits
-        self.gaussians = grown.requires_grad_()
+        self.gaussians, self.filter_sigmas = grown.requires_grad_(), None
         self.adam.select(growth.source)
         self.adam.zero_state(rows=growth.fresh)
+        if self.coverage is not None:
+            self.coverage.select(growth.source)
         self.density.restart(len(grown))
         self.history.add_density(DensityEvent(iteration, gaussians=len(grown), **counts))
 
     def finished(self) -> Gaussians:
-        """The trained model: finite, with unit quaternions."""
-        model = self.gaussians.detach()
+        """The trained model as it is rendered, with its 3D filter: finite, with unit quaternions."""
+        model = self._filtered(self.gaussians.detach())
         model = model.select(model.finite())
         model.quats = model.quats / torch.linalg.vector_norm(model.quats, dim=1, keepdim=True).clamp(min=1e-30)
         return model
+
+    def _parts(self) -> dict[str, Stateful]:
+        """What has tensors of its own beside the Gaussians and their moments, by the name that a checkpoint gives it."""
+        parts: dict[str, Stateful | None] = {
+            "density": self.density,
+            "exposure": self.exposure,
+            "coverage": self.coverage,
+            "sky": self.sky,
+        }
+        return {name: part for name, part in parts.items() if part is not None}
 
     def checkpoint(self, instruction_set: str) -> Checkpoint:
         """All of it for a file; not copied.
@@ -151,16 +232,22 @@ class TrainState:
         """
         tensors = dict(self.gaussians.detach().tensors())
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
-        tensors |= {_DENSITY + name: tensor for name, tensor in self.density.to_arrays().items()}
-        if self.exposure is not None:
-            tensors |= {_EXPOSURE + name: tensor for name, tensor in self.exposure.arrays().items()}
+        for part, stateful in self._parts().items():
+            tensors |= {f"{part}.{name}": tensor for name, tensor in stateful.to_arrays().items()}
+        if self.filter_sigmas is not None:
+            tensors[_FILTER] = self.filter_sigmas
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
         facts["instruction_set"] = instruction_set
         return Checkpoint({name: tensor.numpy() for name, tensor in tensors.items()}, facts)
 
     @staticmethod
-    def restore(checkpoint: Checkpoint, plan: Plan) -> TrainState:
+    def restore(checkpoint: Checkpoint, plan: Plan, sky: SkyModel | None = None) -> TrainState:
         """The inverse of ``checkpoint``.
+
+        Args:
+            checkpoint: As it was written.
+            plan: The training's.
+            sky: As it began; takes the checkpoint's colours.
 
         Raises:
             BrokenCheckpointError: if something is missing or does not fit.
@@ -170,23 +257,15 @@ class TrainState:
             gaussians = Gaussians.from_tensors({name: tensors[name] for name in PARAMETERS}).requires_grad_()
             if gaussians.sh.shape[1] != coefficient_count(plan.options.sh_degree):
                 raise ValueError("another degree of spherical harmonics")
-            adam = Adam(gaussians.tensors())
-            adam.load_state_dict(_under(_ADAM, tensors))
-            density = make_density(plan.options, len(gaussians))
-            density.load(_under(_DENSITY, tensors))
-            exposure = new_exposure(plan)
-            if exposure is not None:
-                exposure.load(_under(_EXPOSURE, tensors))
-            history = History(**checkpoint.facts["history"])
-            counts = (int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"]))
+            state = TrainState.of(gaussians, plan, History(**checkpoint.facts["history"]), sky)
+            state.adam.load_state_dict(_under(_ADAM, tensors))
+            state.iteration, state.seconds = int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"])
+            state.filter_sigmas = tensors.get(_FILTER)
+            for part, stateful in state._parts().items():  # the sky last: what fails before leaves it as it began
+                stateful.load(_under(f"{part}.", tensors))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
-        return TrainState(gaussians, adam, density, history, *counts, exposure=exposure)
-
-
-def new_exposure(plan: Plan) -> Exposure | None:
-    """The exposures' model before the first iteration, if the plan has one."""
-    return Exposure(plan.train_views) if plan.options.exposure != "off" else None
+        return state
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

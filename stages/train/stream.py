@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import View
+from splatpipe.pipeline.scene.dataset import PointDepths, View
 from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.stages.train.draws import permutation
 from splatpipe.stages.train.photo_cache import PhotoCache, stored_bytes
@@ -31,11 +31,13 @@ class TrainingPhoto:
         camera: Its camera, at the size of ``colour``.
         colour: In [0, 1].
         mask: True where the photo counts; None where all of it does.
+        depths: Of the sparse points that it shows; None where they do not count.
     """
 
     camera: Camera
     colour: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None
+    depths: PointDepths | None = None
 
 
 class PhotoStream:
@@ -129,12 +131,13 @@ class PhotoStream:
         return self.view_index(iteration), self._levels[iteration - 1]
 
     def _photo(self, iteration: int) -> TrainingPhoto:
-        camera, pixels, mask = self._decoded(self._key(iteration))
+        key = self._key(iteration)
+        camera, pixels, mask = self._decoded(key)
         # A fresh array each: as fast as a ring of buffers here, and none is overwritten while the trainer holds it.
         colour = pixels.astype(np.float32)
         colour *= np.float32(1.0 / 255.0)
         counts = None if mask is None else torch.from_numpy(mask.copy())
-        return TrainingPhoto(camera, torch.from_numpy(colour), counts)
+        return TrainingPhoto(camera, torch.from_numpy(colour), counts, self._views[key[0]].depths)
 
     def _decoded(self, key: tuple[int, int]) -> tuple[Camera, Pixels, Mask | None]:
         stored = self._cache.get(key)

@@ -63,12 +63,14 @@ class DensityStep:
         extent: Of the scene, world units.
         limit: The most Gaussians that may be left.
         iteration: The one that ends.
+        rendered: The model as it is rendered, for its opacities and sizes.
     """
 
     options: TrainConfig
     extent: float
     limit: int
     iteration: int
+    rendered: Gaussians
 
 
 class Density(ABC):
@@ -140,7 +142,7 @@ class ScoredDensity(Density):
     def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[Growth, dict[str, int]]:
         """Prune, then grow to at most the limit."""
         options, extent, iteration = step.options, step.extent, step.iteration
-        gone = prune_mask(gaussians, options, extent, iteration, self.statistics.max_radius_px)
+        gone = prune_mask(step.rendered, options, extent, iteration, self.statistics.max_radius_px)
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, self.statistics.score())
         growth, counts = grow(gaussians, score, step.limit - len(gaussians) + pruned, options, extent, iteration)
