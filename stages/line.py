@@ -103,6 +103,8 @@ class TrainConfig(StageConfig):
     """Who computes the loss and its gradient: our kernels, or kornia's SSIM under torch, some 50 times slower."""
     antialias: bool = False
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
+    filter_3d: bool = False
+    """3D smoothing filter (Mip-Splatting): no Gaussian finer than the photos could show; for close-up views."""
     background: Literal["black", "white", "random"] = "black"
     """What is behind the Gaussians in training; `random` (a colour an iteration) forbids holes."""
     coarse_levels: Annotated[int, Field(ge=0, le=4)] = 0

@@ -32,6 +32,7 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
+from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
 
@@ -66,6 +67,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             report.note(plan.described())
         levels = coarse_levels(plan.options, plan.last_iteration)
         state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan.options)
+        state.sampling = sampling_of(plan, views_of(plan, views))
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
@@ -235,7 +237,7 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         magnitudes=observed,
     )
     probe = state.probe() if observed else None
-    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
+    rendered = raster.render(state.rendered_model(options), photo.camera, settings, means2d_probe=probe)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
     loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
     loss.backward()  # type: ignore[no-untyped-call]

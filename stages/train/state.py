@@ -25,12 +25,14 @@ from splatpipe.stages.train.densify import (
     room_at,
 )
 from splatpipe.stages.train.history import History
+from splatpipe.stages.train.smoothing import REFRESH_EVERY, Sampling, raw_opacity_limits, smoothed
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
 LARGEST_SCALE = 1e2  # a sky is no farther than that
 
 _ADAM = "adam."
 _STATISTICS = "statistics."
+_FILTER = "filter_sigmas"
 
 
 @dataclass
@@ -38,12 +40,14 @@ class TrainState:
     """Parameters, moments, statistics and history.
 
     Attributes:
-        gaussians: The model; its tensors are leaves of autograd.
+        gaussians: The model, raw; its tensors are leaves of autograd.
         adam: The optimiser's moments.
         statistics: Of density control, since its last step.
         history: What happened so far.
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
+        sampling: The training cameras, with `filter_3d`; not in the checkpoint.
+        filter_sigmas: Of the 3D filter, a Gaussian each, world units; None before the first and after density control.
     """
 
     gaussians: Gaussians
@@ -52,6 +56,8 @@ class TrainState:
     history: History
     iteration: int = 0
     seconds: float = 0.0
+    sampling: Sampling | None = None
+    filter_sigmas: Float[Tensor, " n"] | None = None
 
     @staticmethod
     def begin(start: Gaussians, options: TrainConfig) -> TrainState:
@@ -71,6 +77,22 @@ class TrainState:
         model.sh = sh
         gaussians = model.requires_grad_()
         return TrainState(gaussians, Adam(gaussians.tensors()), DensityStatistics(len(start)), History())
+
+    def rendered_model(self, options: TrainConfig) -> Gaussians:
+        """What an iteration renders: the raw Gaussians, or what the 3D filter makes of them."""
+        assert (self.sampling is not None) == options.filter_3d, "the 3D filter needs the training cameras"
+        if self.iteration % REFRESH_EVERY == 0:
+            self.filter_sigmas = None
+        return self._filtered(self.gaussians)
+
+    def _filtered(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians if self.sampling is None else smoothed(gaussians, self._filter(self.sampling))
+
+    def _filter(self, sampling: Sampling) -> Float[Tensor, " n"]:
+        """``filter_sigmas``, made where there are none."""
+        if self.filter_sigmas is None:
+            self.filter_sigmas = sampling.filter_sigmas(self.gaussians.means)
+        return self.filter_sigmas
 
     def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
         """Step the parameters against their gradients, which are dropped.
@@ -114,14 +136,22 @@ class TrainState:
             if is_density_step(options, iteration):
                 self._densify(options, extent, room_at(options, initial, iteration), iteration)
             if is_opacity_reset(options, iteration):
-                reset_opacity(self.gaussians.opacity_logits.detach(), options.reset_opacity)
+                self._reset_opacity(options.reset_opacity)
                 self.adam.zero_state(names=("opacity_logits",))
                 self.history.resets.append(iteration)
+
+    def _reset_opacity(self, limit: float) -> None:
+        """Leave no opacity as it is rendered above ``limit``."""
+        logits = self.gaussians.opacity_logits.detach()
+        if self.sampling is None:
+            reset_opacity(logits, limit)
+        else:
+            logits.clamp_(max=raw_opacity_limits(self.gaussians, self._filter(self.sampling), limit))
 
     def _densify(self, options: TrainConfig, extent: float, limit: int, iteration: int) -> None:
         """Prune, then grow to at most ``limit`` Gaussians."""
         gaussians, statistics = self.gaussians.detach(), self.statistics
-        gone = prune_mask(gaussians, options, extent, iteration, statistics.max_radius_px)
+        gone = prune_mask(self._filtered(gaussians), options, extent, iteration, statistics.max_radius_px)
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, statistics.score())
         growth, counts = grow(gaussians, score, limit - len(gaussians) + pruned, options, extent, iteration)
@@ -130,15 +160,15 @@ class TrainState:
         grown = gaussians.select(source)
         grown.means, grown.log_scales = growth.means[kept], growth.log_scales[kept]
         grown.opacity_logits = growth.opacity_logits[kept]
-        self.gaussians = grown.requires_grad_()
+        self.gaussians, self.filter_sigmas = grown.requires_grad_(), None
         self.adam.select(source)
         self.adam.zero_state(rows=fresh)
         self.statistics = DensityStatistics(len(self.gaussians))
         self.history.add_density(DensityEvent(iteration, pruned=pruned, gaussians=len(self.gaussians), **counts))
 
     def finished(self) -> Gaussians:
-        """The trained model: finite, with unit quaternions."""
-        model = self.gaussians.detach()
+        """The trained model as it is rendered, with its 3D filter: finite, with unit quaternions."""
+        model = self._filtered(self.gaussians.detach())
         model = model.select(model.finite())
         model.quats = model.quats / torch.linalg.vector_norm(model.quats, dim=1, keepdim=True).clamp(min=1e-30)
         return model
@@ -152,6 +182,8 @@ class TrainState:
         tensors = dict(self.gaussians.detach().tensors())
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
         tensors |= {_STATISTICS + name: tensor for name, tensor in self.statistics.to_arrays().items()}
+        if self.filter_sigmas is not None:
+            tensors[_FILTER] = self.filter_sigmas
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
         facts["instruction_set"] = instruction_set
         return Checkpoint({name: tensor.numpy() for name, tensor in tensors.items()}, facts)
@@ -173,11 +205,14 @@ class TrainState:
             statistics = DensityStatistics(len(gaussians))
             for name, tensor in _under(_STATISTICS, tensors).items():
                 getattr(statistics, name).copy_(tensor)
+            filter_sigmas = tensors.get(_FILTER)
+            if filter_sigmas is not None and filter_sigmas.shape != (len(gaussians),):
+                raise ValueError("its 3D filter is of other Gaussians")
             history = History(**checkpoint.facts["history"])
             counts = (int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"]))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
-        return TrainState(gaussians, adam, statistics, history, *counts)
+        return TrainState(gaussians, adam, statistics, history, *counts, filter_sigmas=filter_sigmas)
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
