@@ -17,8 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -87,7 +88,9 @@ def sampling_of(plan: Plan, views: Sequence[View]) -> Sampling | None:
     return Sampling(tuple(reduced_camera(view.camera, plan.megapixels) for view in views), plan.near)
 
 
-def _affine(points: Float[Tensor, "3 n"], axis: Any, shift: float, out: Float[Tensor, " n"]) -> None:
+def _affine(
+    points: Float[Tensor, "3 n"], axis: Float64[np.ndarray, " 3"], shift: float, out: Float[Tensor, " n"]
+) -> None:
     """``out`` = axis · point + shift, for all points."""
     torch.mul(points[0], float(axis[0]), out=out)
     out.add_(points[1], alpha=float(axis[1])).add_(points[2], alpha=float(axis[2])).add_(float(shift))
