@@ -245,6 +245,13 @@ def test_the_file_renders_as_training_did(scene: Path, tmp_path: Path, monkeypat
     assert float((raw - as_trained).abs().max()) > 1e-3
 
 
+def test_a_time_budget_is_planned_with_the_filter(scene: Path, tmp_path: Path) -> None:
+    out = trained(scene, tmp_path / "out", TrainConfig(time_budget_s=3.0, filter_3d=True))
+    plan = Plan.from_json((out / "plan.json").read_text())
+    assert plan.options.filter_3d and plan.train_seconds > 0.0
+    assert bool(read_splat(out / "model.ply").finite().all())
+
+
 @pytest.fixture(scope="module")
 def models(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Gaussians]:
     """Trained long enough that Gaussians become finer than the pixels: plain, with the 3D filter, with both filters."""
