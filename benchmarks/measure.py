@@ -41,6 +41,7 @@ from splatpipe.stages.line import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.draws import permutation
 from splatpipe.stages.train.plan import make_plan
+from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream
 
@@ -72,6 +73,7 @@ class Case:
         sh_degree: Of the Gaussians' colours, all of it from the first iteration that counts.
         seed: Of the order of photos.
         statistics: Collect what density control ranks by, as the first half of a training does.
+        filter_3d: Train with the 3D smoothing filter.
     """
 
     dataset: str
@@ -82,6 +84,7 @@ class Case:
     sh_degree: int = 3
     seed: int = 0
     statistics: bool = True
+    filter_3d: bool = False
 
 
 @dataclass
@@ -147,6 +150,7 @@ def time_case(case: Case) -> Row:
         seed=case.seed,
         max_gaussians=10**9,
         densify=case.statistics,
+        filter_3d=case.filter_3d,
     )
     views = load_views(Path(case.dataset))
     start = read_splat(Path(case.splat))
@@ -158,6 +162,7 @@ def time_case(case: Case) -> Row:
     parts, pairs, pixels = Parts(), [], 0
     with loop.same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
         state = TrainState.begin(start, plan)
+        state.sampling = sampling_of(plan, views)
         for photo in islice(photos, warmup):
             loop.train_step(state, plan, photo)
 
@@ -168,7 +173,7 @@ def time_case(case: Case) -> Row:
 
         for _ in range(case.repeats):
             camera = camera_of(views, case.seed, state.iteration + 1)
-            pairs.append(contributing_pairs(state.gaussians, camera, plan, state.iteration + 1))
+            pairs.append(contributing_pairs(state.rendered_model(plan.options), camera, plan, state.iteration + 1))
             pixels += camera.width * camera.height
             with timed_parts(parts):
                 trained_on = parts.timed("iteration", iteration)()

@@ -110,6 +110,8 @@ class TrainConfig(StageConfig):
     """Learning rate of the maps at the start; a tenth of it at the end."""
     antialias: bool = False
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
+    filter_3d: bool = False
+    """3D smoothing filter (Mip-Splatting): no Gaussian finer than the photos could show; for close-up views."""
     background: Literal["black", "white", "random"] = "black"
     """What is behind the Gaussians in training; `random` (a colour an iteration) forbids holes."""
     coarse_levels: Annotated[int, Field(ge=0, le=4)] = 0

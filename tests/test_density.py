@@ -137,7 +137,7 @@ def test_every_strategy_keeps_to_the_limit_and_its_statistics_survive(name: str)
     again = make_density(options, 50)
     again.load({key: tensor.clone() for key, tensor in density.to_arrays().items()})
     for limit in (50, 61):
-        step = DensityStep(options, 5.0, limit, 600)
+        step = DensityStep(options, 5.0, limit, 600, gaussians)
         growth, counts = density.control(gaussians, step)
         assert len(growth.source) == limit
         repeated, same = again.control(gaussians, step)
@@ -158,7 +158,7 @@ def test_relocation_moves_dead_and_broken_gaussians_and_no_others() -> None:
     gaussians = scene(40)
     gaussians.opacity_logits[3:7] = -6.0  # 0.0025
     gaussians.means[20, 1] = math.nan
-    growth, counts = make_density(MCMC, 40).control(gaussians, DensityStep(MCMC, 5.0, 45, 600))
+    growth, counts = make_density(MCMC, 40).control(gaussians, DensityStep(MCMC, 5.0, 45, 600, gaussians))
     assert (counts["relocated"], counts["added"], counts["pruned"]) == (5, 5, 0)
     dead = [3, 4, 5, 6, 20]
     live = [row for row in range(40) if row not in dead]
@@ -175,7 +175,7 @@ def test_relocation_moves_dead_and_broken_gaussians_and_no_others() -> None:
 def test_relocation_leaves_a_model_of_dead_gaussians_alone() -> None:
     gaussians = scene(4)
     gaussians.opacity_logits[:] = -9.0
-    growth, counts = make_density(MCMC, 4).control(gaussians, DensityStep(MCMC, 5.0, 9, 600))
+    growth, counts = make_density(MCMC, 4).control(gaussians, DensityStep(MCMC, 5.0, 9, 600, gaussians))
     assert growth.source.tolist() == [0, 1, 2, 3] and counts["relocated"] == counts["added"] == 0
 
 

@@ -229,6 +229,7 @@ def test_fewer_gaussians_than_points_may_be_asked_for(scene: Path, tmp_path: Pat
         {"background": "random"},
         {"background": "white"},
         {"antialias": True},
+        {"filter_3d": True},
         {"sparse_adam": False},
         {"loss": "kornia", "iterations": 20},
         {"prune_screen_px": 5.0},

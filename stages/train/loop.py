@@ -74,6 +74,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             report.note(plan.described())
         levels = coarse_levels(plan.options, plan.last_iteration)
         state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan)
+        state.sampling = sampling_of(plan, views_of(plan, views))
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)

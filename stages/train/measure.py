@@ -19,6 +19,7 @@ from splatpipe.pipeline.scene.images import reduced_view
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
 from splatpipe.stages.train.plan import Plan
+from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import TrainingPhoto
 
@@ -77,7 +78,7 @@ def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, eff
     trial = replace(plan, options=pilot_options(plan))
     small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
-    states = [_pilot_state(stretched(start, count, plan.options.seed), trial) for count in counts]
+    states = [_pilot_state(stretched(start, count, plan.options.seed), trial, views) for count in counts]
     _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
     first = _timed(states[0], trial, small[0], step)
     # Cost grows a little slower than size, so the line through two sizes is right near them only.
@@ -118,9 +119,9 @@ def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
     return model
 
 
-def _pilot_state(start: Gaussians, trial: Plan) -> TrainState:
+def _pilot_state(start: Gaussians, trial: Plan, views: Sequence[View]) -> TrainState:
     state = TrainState.begin(start, trial)
-    state.iteration = PILOT_ITERATION
+    state.iteration, state.sampling = PILOT_ITERATION, sampling_of(trial, views)
     return state
 
 

@@ -54,7 +54,7 @@ class McmcDensity(Density):
     def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[Growth, dict[str, int]]:
         """Relocate the dead and add up to the limit."""
         options = step.options
-        opacity = torch.sigmoid(gaussians.opacity_logits.double())
+        opacity = torch.sigmoid(step.rendered.opacity_logits.double())
         dead = (opacity < options.prune_opacity) | ~gaussians.finite()
         live, moved = torch.nonzero(~dead).flatten(), torch.nonzero(dead).flatten()
         added = max(0, step.limit - len(gaussians))
