@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.scene.sky import agreed, find_skies, find_sky, points_in, up_of
-from splatpipe.pipeline.scene.upright import up_without_orientation
+from splatpipe.pipeline.scene.sky import agreed, find_skies, find_sky, points_in, up_of, votes_of
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
@@ -109,10 +108,10 @@ def test_what_others_see_in_the_same_direction_decides() -> None:
     sky[:80] = True
     wall = np.zeros_like(sky)
     wall[80:] = True
-    kept = agreed(cameras, [sky, sky, sky, wall], skies.UP)
-    assert [bool(mask.any()) for mask in kept] == [True, True, True, False]
-    alone = agreed([cameras[0], skies.look(heading_deg=180.0)], [sky, wall], skies.UP)
-    assert all(mask.any() for mask in alone)
+    pairs = zip(cameras, [sky, sky, sky, wall], strict=True)
+    assert agreed([votes_of(camera, mask, skies.UP) for camera, mask in pairs]) == [True, True, True, False]
+    apart = zip([cameras[0], skies.look(heading_deg=180.0)], [sky, wall], strict=True)
+    assert agreed([votes_of(camera, mask, skies.UP) for camera, mask in apart]) == [True, True]
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, -90.0])
@@ -122,21 +121,20 @@ def test_capture_without_orientation_finds_up_and_sky(turn_deg: float) -> None:
         for heading, wobble in ((-25.0, 1.0), (-10.0, -1.0), (0.0, 0.5), (12.0, 1.0), (24.0, -0.5))
     ]
     traced = [skies.trace(camera) for camera in cameras]
-    photos = [photo for photo, _ in traced]
     points = skies.points_on()
-    up = up_of(photos, points)
+    up = up_of(cameras, lambda index: traced[index][0], points)
     assert np.degrees(np.arccos(up @ skies.UP)) < 3.0
-    for mask, (_, truth) in zip(find_skies(photos, points), traced, strict=True):
-        assert skies.overlap(mask, truth) > 0.93
+    masks = find_skies(cameras, lambda index: traced[index][0], points)
+    assert all(skies.overlap(mask.unpacked(), truth) > 0.93 for mask, (_, truth) in zip(masks, traced, strict=True))
+    threaded = find_skies(cameras, lambda index: traced[index][0], points, threads=3)
+    assert all((one.bits == other.bits).all() for one, other in zip(masks, threaded, strict=True))
 
 
 def test_cameras_that_do_not_turn_count_as_held_upright() -> None:
     cameras = [skies.look(pitch_deg=0.0, x=x) for x in np.linspace(-3.0, 3.0, 6)]
-    rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])
-    centres = np.stack([camera.centre() for camera in cameras])
-    up = up_without_orientation(rotations, centres, skies.points_on(), np.zeros((6, 2))).up
-    np.testing.assert_allclose(up, skies.UP, atol=1e-6)
+    traced = skies.trace(cameras[0])[0]
+    np.testing.assert_allclose(up_of(cameras, lambda _: traced, skies.points_on()), skies.UP, atol=1e-6)
 
 
 def test_no_photos_have_no_sky() -> None:
-    assert find_skies([], np.zeros((0, 3))) == []
+    assert find_skies([], lambda _: skies.trace(skies.look())[0], np.zeros((0, 3))) == []

@@ -9,14 +9,15 @@ and other photos that look the same way see sky there, too (a sky is the same fr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.parallel import ordered_map
 from splatpipe.pipeline.scene.upright import up_without_orientation
 
 WORK_MEGAPIXELS = 0.1  # at which photos are looked at: noise and distant texture are averaged away, edges stay
@@ -58,25 +59,81 @@ class SkyPhoto:
     ignored: Bool[np.ndarray, "h w"] | None = None
 
 
-def find_skies(photos: Sequence[SkyPhoto], points: Float64[np.ndarray, "m 3"]) -> list[Bool[np.ndarray, "h w"]]:
-    """The sky in each photo of a capture, True where it is.
+@dataclass(frozen=True)
+class SkyMask:
+    """Where a photo shows the sky, an eighth of a byte a pixel.
+
+    Attributes:
+        bits: ``np.packbits`` of the mask.
+        shape: Its height and width, those of the ``SkyPhoto``.
+    """
+
+    bits: UInt8[np.ndarray, " n"]
+    shape: tuple[int, int]
+
+    @staticmethod
+    def packed(mask: Bool[np.ndarray, "h w"]) -> SkyMask:
+        """Pack a mask."""
+        return SkyMask(np.packbits(mask), (mask.shape[0], mask.shape[1]))
+
+    def unpacked(self) -> Bool[np.ndarray, "h w"]:
+        """The mask, True where the sky is."""
+        flat = np.unpackbits(self.bits, count=self.shape[0] * self.shape[1])
+        return flat.reshape(self.shape).astype(bool)
+
+    def emptied(self) -> SkyMask:
+        """One of the same size without sky."""
+        return SkyMask(np.zeros_like(self.bits), self.shape)
+
+    def any(self) -> bool:
+        """Whether there is sky at all."""
+        return bool(self.bits.any())
+
+
+@dataclass(frozen=True)
+class Votes:
+    """The cells of the grid of directions that a photo sees, and those of them that are sky to it."""
+
+    seen: Int64[np.ndarray, " s"]
+    sky: Int64[np.ndarray, " k"]
+
+
+def find_skies(
+    cameras: Sequence[Camera], photo: Callable[[int], SkyPhoto], points: Float64[np.ndarray, "m 3"], threads: int = 1
+) -> list[SkyMask]:
+    """The sky in each photo of a capture.
 
     Args:
-        photos: All with cameras in one world frame.
+        cameras: Of the photos, in one world frame, of any size.
+        photo: Loads one of them; called from several threads, and for some captures twice.
         points: Triangulated points in that frame; leave out those of few photos or a large error.
+        threads: That load and search.
     """
-    if not photos:
+    if not cameras:
         return []
-    up = up_of(photos, points)
-    masks = [find_sky(photo, points_in(photo.camera, points), up) for photo in photos]
-    return agreed([photo.camera for photo in photos], masks, up)
+    up = up_of(cameras, photo, points, threads)
+
+    def search(index: int) -> tuple[SkyMask, Votes]:
+        found = photo(index)
+        mask = find_sky(found, points_in(found.camera, points), up)
+        return SkyMask.packed(mask), votes_of(found.camera, mask, up)
+
+    searched = list(ordered_map(search, range(len(cameras)), threads))
+    kept = agreed([votes for _, votes in searched])
+    return [mask if keep else mask.emptied() for (mask, _), keep in zip(searched, kept, strict=True)]
 
 
-def up_of(photos: Sequence[SkyPhoto], points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " 3"]:
-    """Unit vector against gravity, from the cameras alone: datasets hold no EXIF orientation."""
-    rotations = np.stack([photo.camera.cam_from_world[:3, :3] for photo in photos])
-    centres = np.stack([photo.camera.centre() for photo in photos])
-    brighter = np.stack([_brighter(photo.pixels) for photo in photos])
+def up_of(
+    cameras: Sequence[Camera], photo: Callable[[int], SkyPhoto], points: Float64[np.ndarray, "m 3"], threads: int = 1
+) -> Float64[np.ndarray, " 3"]:
+    """Unit vector against gravity, from the cameras alone: datasets hold no EXIF orientation. Arguments as above."""
+    rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])
+    centres = np.stack([camera.centre() for camera in cameras])
+
+    def brighter() -> Float64[np.ndarray, "n 2"]:
+        light = ordered_map(lambda index: _brighter(photo(index).pixels), range(len(cameras)), threads)
+        return np.stack(list(light))
+
     return up_without_orientation(rotations, centres, points, brighter).up
 
 
@@ -112,10 +169,15 @@ def elevations_deg(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Float64[np.
     return np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
 
 
-def directions(camera: Camera) -> Float64[np.ndarray, "h w 3"]:
-    """Each pixel's ray in the world, 1 long along the camera's axis."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
+    """Rays of pixels in the world, 1 long along the camera's axis.
+
+    Args:
+        camera: The camera.
+        step: Only every so many pixels, from the first; the last one is the last pixel's or a little outside.
+    """
+    x = (step * np.arange(-((1 - camera.width) // step) + 1) + 0.5 - camera.cx) / camera.fx
+    y = (step * np.arange(-((1 - camera.height) // step) + 1) + 0.5 - camera.cy) / camera.fy
     rotation = camera.cam_from_world[:3, :3]
     return x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2]
 
@@ -130,39 +192,31 @@ def points_in(camera: Camera, points: Float64[np.ndarray, "m 3"]) -> Float64[np.
     return places[inside & (places < [camera.width, camera.height]).all(axis=1)]
 
 
-def agreed(
-    cameras: Sequence[Camera], masks: Sequence[Bool[np.ndarray, "h w"]], up: Float64[np.ndarray, " 3"]
-) -> list[Bool[np.ndarray, "h w"]]:
-    """The masks, emptied where the other photos that look the same way see something else there.
+def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarray, " 3"]) -> Votes:
+    """What a photo says about directions: a cell is sky where most of what the photo sees of it is."""
+    cell = direction_cells(camera, up)
+    cells = 2 * DIRECTION_ROWS * DIRECTION_ROWS
+    count = np.bincount(cell.ravel(), minlength=cells)
+    return Votes(np.flatnonzero(count), np.flatnonzero(2 * np.bincount(cell[mask], minlength=cells) > count))
 
-    Args:
-        cameras: Of the masks' sizes.
-        masks: Sky by each photo alone.
-        up: A unit vector.
-    """
-    cells = DIRECTION_ROWS * 2 * DIRECTION_ROWS
-    seen, sky = np.zeros(cells), np.zeros(cells)
-    own: list[tuple[np.ndarray, np.ndarray]] = []
-    for camera, mask in zip(cameras, masks, strict=True):
-        cell = direction_cells(camera, up)
-        count = np.bincount(cell.ravel(), minlength=cells)
-        in_mask = np.bincount(cell[mask], minlength=cells)
-        inside, of_sky = np.flatnonzero(count), np.flatnonzero(2 * in_mask > count)
-        own.append((inside, of_sky))
-        seen[inside] += 1.0
-        sky[of_sky] += 1.0
-    result = []
-    for mask, (_, of_sky) in zip(masks, own, strict=True):
-        witnesses, agreeing = seen[of_sky] - 1.0, sky[of_sky] - 1.0
+
+def agreed(votes: Sequence[Votes]) -> list[bool]:
+    """Whether each photo's sky is one; False where the others that look the same way see something else there."""
+    seen, sky = np.zeros((2, 2 * DIRECTION_ROWS * DIRECTION_ROWS))
+    for vote in votes:
+        seen[vote.seen] += 1.0
+        sky[vote.sky] += 1.0
+    kept = []
+    for vote in votes:
+        witnesses, agreeing = seen[vote.sky] - 1.0, sky[vote.sky] - 1.0
         asked = witnesses >= LEAST_WITNESSES
-        heard = 2 * int(asked.sum()) > len(of_sky)
-        denied = heard and float(agreeing[asked].sum()) < LEAST_AGREEMENT * float(witnesses[asked].sum())
-        result.append(np.zeros_like(mask) if denied else mask)
-    return result
+        heard = 2 * int(asked.sum()) > len(vote.sky)
+        kept.append(not heard or float(agreeing[asked].sum()) >= LEAST_AGREEMENT * float(witnesses[asked].sum()))
+    return kept
 
 
-def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> np.ndarray:
-    """The cell of the grid of directions that each pixel looks at, (h, w) integers."""
+def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Int64[np.ndarray, "h w"]:
+    """The cell of the grid of directions that each pixel looks at."""
     rays = directions(camera)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     east, north = horizontal_axes(up)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,7 +113,7 @@ def up_without_orientation(
     cam_from_world: Float64[np.ndarray, "n 3 3"],
     centres: Float64[np.ndarray, "n 3"],
     points: Float64[np.ndarray, "m 3"],
-    brighter: Float64[np.ndarray, "n 2"],
+    brighter: Callable[[], Float64[np.ndarray, "n 2"]],
 ) -> Upright:
     """Up for photos whose EXIF orientation is not known: held upright, or all turned by a quarter in the stored grid.
 
@@ -123,7 +124,8 @@ def up_without_orientation(
         cam_from_world: Rotations of the stored grids.
         centres: The cameras' positions in the model.
         points: The sparse cloud.
-        brighter: The way in which each picture gets brighter, right and down in its stored grid; of any length.
+        brighter: Gives the way in which each picture gets brighter, right and down in its stored grid, of any length;
+            asked for only where the photos are turned.
     """
     upright, turned = (
         camera_axes(cam_from_world, np.full(len(cam_from_world), orientation)) for orientation in UPRIGHT_AND_TURNED
@@ -134,7 +136,7 @@ def up_without_orientation(
     is_plane = other_width > LEAST_WIDTH and other_thickness < MOST_THICKNESS * other_width
     if not is_plane or (width > LEAST_WIDTH and thickness * other_width <= other_thickness * width):
         return up_from_cameras(upright, centres, points)
-    light = np.einsum("nij,ni->nj", cam_from_world[:, :2], brighter).sum(axis=0)
+    light = np.einsum("nij,ni->nj", cam_from_world[:, :2], brighter()).sum(axis=0)
     return Upright((float(np.sign(light @ normal)) or 1.0) * normal, "the vertical edges of pictures that are turned")
 
 
