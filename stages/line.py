@@ -152,6 +152,11 @@ class TrainConfig(StageConfig):
     """Learning rate of rotations."""
     sparse_adam: bool = True
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
+    sky: Literal["off", "model"] = "off"
+    """`model`: the sky, found in the photos, has a colour by direction of its own and no Gaussians; the deliverable
+    leaves it out. Where no photo shows any it stays off."""
+    sky_opacity_weight: NonNegativeFloat = 0.1
+    """Weight of the mean opacity before the sky in the loss."""
 
 
 class EvaluateConfig(StageConfig):
@@ -241,16 +246,16 @@ TRAIN = Stage(
     version=2,
     config=TrainConfig,
     reads=("undistort.dataset", "initialize.splat"),
-    parts={"model": "model.ply", "history": "history.json", "plan": "plan.json"},
+    parts={"model": "model.ply", "history": "history.json", "plan": "plan.json", "sky": "sky.npz"},
     entry="splatpipe.stages.train:run",
     borrows=("evaluate.every", "evaluate.views"),
     resumable=True,
 )
 EVALUATE = Stage(
     "evaluate",
-    version=2,
+    version=3,
     config=EvaluateConfig,
-    reads=("train.model", "train.plan", "undistort.dataset"),
+    reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
     parts={"metrics": "metrics.json", "views": "views"},
     entry="splatpipe.stages.evaluate:run",
 )

@@ -124,9 +124,9 @@ def test_capture_without_orientation_finds_up_and_sky(turn_deg: float) -> None:
     points = skies.points_on()
     up = up_of(cameras, lambda index: traced[index][0], points)
     assert np.degrees(np.arccos(up @ skies.UP)) < 3.0
-    masks = find_skies(cameras, lambda index: traced[index][0], points)
+    masks = find_skies(cameras, lambda index: traced[index][0], points, up)
     assert all(skies.overlap(mask.unpacked(), truth) > 0.93 for mask, (_, truth) in zip(masks, traced, strict=True))
-    threaded = find_skies(cameras, lambda index: traced[index][0], points, threads=3)
+    threaded = find_skies(cameras, lambda index: traced[index][0], points, up, threads=3)
     assert all((one.bits == other.bits).all() for one, other in zip(masks, threaded, strict=True))
 
 
@@ -137,4 +137,4 @@ def test_cameras_that_do_not_turn_count_as_held_upright() -> None:
 
 
 def test_no_photos_have_no_sky() -> None:
-    assert find_skies([], lambda _: skies.trace(skies.look())[0], np.zeros((0, 3))) == []
+    assert find_skies([], lambda _: skies.trace(skies.look())[0], np.zeros((0, 3)), skies.UP) == []

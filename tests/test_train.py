@@ -98,7 +98,7 @@ def test_another_folder_gives_the_same_bits_and_another_seed_does_not(
     assert digest(trained(scene, tmp_path / "here")) == digest(undisturbed)
     assert (tmp_path / "here/plan.json").read_bytes() == (undisturbed / "plan.json").read_bytes()
     assert digest(trained(scene, tmp_path / "seed", QUICK.model_copy(update={"seed": 1}))) != digest(undisturbed)
-    assert sorted(path.name for path in undisturbed.iterdir()) == ["history.json", "model.ply", "plan.json"]
+    assert sorted(path.name for path in undisturbed.iterdir()) == ["history.json", "model.ply", "plan.json", "sky.npz"]
 
 
 class Killed(BaseException):

@@ -99,19 +99,21 @@ class Votes:
 
 
 def find_skies(
-    cameras: Sequence[Camera], photo: Callable[[int], SkyPhoto], points: Float64[np.ndarray, "m 3"], threads: int = 1
+    cameras: Sequence[Camera],
+    photo: Callable[[int], SkyPhoto],
+    points: Float64[np.ndarray, "m 3"],
+    up: Float64[np.ndarray, " 3"],
+    threads: int = 1,
 ) -> list[SkyMask]:
     """The sky in each photo of a capture.
 
     Args:
         cameras: Of the photos, in one world frame, of any size.
-        photo: Loads one of them; called from several threads, and for some captures twice.
+        photo: Loads one of them; called from several threads.
         points: Triangulated points in that frame; leave out those of few photos or a large error.
+        up: Against gravity, of ``up_of``.
         threads: That load and search.
     """
-    if not cameras:
-        return []
-    up = up_of(cameras, photo, points, threads)
 
     def search(index: int) -> tuple[SkyMask, Votes]:
         found = photo(index)
@@ -126,7 +128,14 @@ def find_skies(
 def up_of(
     cameras: Sequence[Camera], photo: Callable[[int], SkyPhoto], points: Float64[np.ndarray, "m 3"], threads: int = 1
 ) -> Float64[np.ndarray, " 3"]:
-    """Unit vector against gravity, from the cameras alone: datasets hold no EXIF orientation. Arguments as above."""
+    """Unit vector against gravity, from the cameras alone: datasets hold no EXIF orientation.
+
+    Args:
+        cameras: At least one.
+        photo: As for ``find_skies``; called only where the photos seem to be turned.
+        points: As for ``find_skies``.
+        threads: That load.
+    """
     rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])
     centres = np.stack([camera.centre() for camera in cameras])
 

@@ -15,7 +15,8 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
-from splatpipe.pipeline.scene.dataset import View, load_views
+from splatpipe.pipeline.scene.dataset import View, load_views, split_views
+from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
@@ -32,6 +33,7 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
+from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
 
@@ -61,17 +63,20 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         return under_budgets(free, scene, train_step, report)
 
     with same_bits(inputs.machine.threads):
+        trained_on, _ = split_views([view.camera.name for view in views], every, names)
+        sky = begin_sky(config, [view for view in views if view.camera.name in set(trained_on)], inputs, report)
         plan = load_or_write_plan(out / "plan.json", make)
         if budgeted(plan):
             report.note(plan.described())
         levels = coarse_levels(plan.options, plan.last_iteration)
-        state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan.options)
+        state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan.options, sky)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
+    write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
     return {
         "gaussians": len(gaussians),
@@ -83,7 +88,16 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         "peak_memory_bytes": peak_memory_bytes(),
         "device": "cpu",
         "instruction_set": raster.isa_name(),
-    }
+    } | ({} if config.sky == "off" else {"sky_photos": 0 if sky is None else sky.photos})
+
+
+def begin_sky(config: TrainConfig, views: Sequence[View], inputs: Inputs, report: Reporter) -> SkyModel | None:
+    """The sky to be trained; None where it is off or none of the photos shows any, which is told."""
+    if config.sky == "off":
+        return None
+    sky = SkyModel.begin(views, inputs["undistort.dataset"], inputs.machine.threads)
+    report.note("no photo shows the sky, so there is no model of it" if sky is None else f"sky in {sky.photos} photos")
+    return sky
 
 
 def views_of(plan: Plan, views: Sequence[View]) -> list[View]:
@@ -124,11 +138,11 @@ def same_bits(threads: int) -> Iterator[None]:
         cv2.setNumThreads(before_cv2)
 
 
-def resume(path: Path, plan: Plan, report: Reporter) -> TrainState | None:
+def resume(path: Path, plan: Plan, report: Reporter, sky: SkyModel | None) -> TrainState | None:
     """The state that a killed run left, or None; a broken one is told and ignored."""
     try:
         checkpoint = load_checkpoint(path, plan.digest())
-        state = TrainState.restore(checkpoint, plan.options)
+        state = TrainState.restore(checkpoint, plan.options, sky)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:
@@ -237,11 +251,18 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     probe = state.probe() if observed else None
     rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    loss = measure(rendered.colour, photo.colour, options.ssim_weight, photo.mask)
+    colour, sky = rendered.colour, state.sky
+    if sky is not None:
+        colour = sky.composite(rendered, photo.camera, settings.background)
+    loss = measure(colour, photo.colour, options.ssim_weight, photo.mask)
+    if sky is not None:
+        loss = loss + sky.penalty(rendered.alpha, photo.camera, options.sky_opacity_weight)
     loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))
     with torch.no_grad():
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
+        if sky is not None:
+            sky.step(min(1.0, iteration / options.iterations))
         if probe is not None and probe.grad is not None:
             state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
             if options.prune_screen_px > 0.0:

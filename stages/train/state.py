@@ -25,12 +25,14 @@ from splatpipe.stages.train.densify import (
     room_at,
 )
 from splatpipe.stages.train.history import History
+from splatpipe.stages.train.sky import SkyModel
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
 LARGEST_SCALE = 1e2  # a sky is no farther than that
 
 _ADAM = "adam."
 _STATISTICS = "statistics."
+_SKY = "sky."
 
 
 @dataclass
@@ -44,6 +46,7 @@ class TrainState:
         history: What happened so far.
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
+        sky: Trained beside the Gaussians; None where there is none.
     """
 
     gaussians: Gaussians
@@ -52,14 +55,16 @@ class TrainState:
     history: History
     iteration: int = 0
     seconds: float = 0.0
+    sky: SkyModel | None = None
 
     @staticmethod
-    def begin(start: Gaussians, options: TrainConfig) -> TrainState:
+    def begin(start: Gaussians, options: TrainConfig, sky: SkyModel | None = None) -> TrainState:
         """The state before the first iteration.
 
         Args:
             start: The Gaussians to start with; evenly thinned where there are more than the cap allows.
             options: Resolved.
+            sky: As it begins.
         """
         if len(start) > options.max_gaussians:
             start = start.select(torch.arange(options.max_gaussians) * len(start) // options.max_gaussians)
@@ -70,7 +75,7 @@ class TrainState:
         model = start.clone()
         model.sh = sh
         gaussians = model.requires_grad_()
-        return TrainState(gaussians, Adam(gaussians.tensors()), DensityStatistics(len(start)), History())
+        return TrainState(gaussians, Adam(gaussians.tensors()), DensityStatistics(len(start)), History(), sky=sky)
 
     def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
         """Step the parameters against their gradients, which are dropped.
@@ -152,13 +157,20 @@ class TrainState:
         tensors = dict(self.gaussians.detach().tensors())
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
         tensors |= {_STATISTICS + name: tensor for name, tensor in self.statistics.to_arrays().items()}
+        if self.sky is not None:
+            tensors |= {_SKY + name: tensor for name, tensor in self.sky.to_arrays().items()}
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
         facts["instruction_set"] = instruction_set
         return Checkpoint({name: tensor.numpy() for name, tensor in tensors.items()}, facts)
 
     @staticmethod
-    def restore(checkpoint: Checkpoint, options: TrainConfig) -> TrainState:
+    def restore(checkpoint: Checkpoint, options: TrainConfig, sky: SkyModel | None = None) -> TrainState:
         """The inverse of ``checkpoint``.
+
+        Args:
+            checkpoint: As it was written.
+            options: Resolved.
+            sky: As it began; takes the checkpoint's colours.
 
         Raises:
             BrokenCheckpointError: if something is missing or does not fit.
@@ -175,9 +187,11 @@ class TrainState:
                 getattr(statistics, name).copy_(tensor)
             history = History(**checkpoint.facts["history"])
             counts = (int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"]))
+            if sky is not None:  # last: what fails before leaves it as it began
+                sky.load(_under(_SKY, tensors))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
-        return TrainState(gaussians, adam, statistics, history, *counts)
+        return TrainState(gaussians, adam, statistics, history, *counts, sky)
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
