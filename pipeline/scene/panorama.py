@@ -126,7 +126,7 @@ def read_panorama(path: Path) -> Panorama | None:
     try:
         if path.stat().st_size > LARGEST_FILE_BYTES:
             raise ValueError("too large")
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             up, colours = archive["up"], archive["colours"]
         if colours.shape == (0, 3):
             return None

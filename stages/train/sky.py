@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64, Shaped
 from torch import Tensor
 
 from splatpipe.pipeline.raster import Render
@@ -33,7 +33,7 @@ SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
 SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills what no photo shows
 FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # of the colours, a step, from the start to the end of the schedule
 EPSILON = 1e-8  # Adam's: cells that hardly any pixel pulls at stay where they are
-FILL_ROUNDS = 4 * COLUMNS  # of averaging neighbours: the unseen half of the sphere is smooth by then
+FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: what is unseen above the horizon is smooth by then
 LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour is the mean of
 
 _COLOURS = "colours"
@@ -196,5 +196,5 @@ def filled(total: Float64[np.ndarray, "cells 4"]) -> Float32[np.ndarray, "cells 
     return grid.reshape(-1, 3).astype(np.float32)
 
 
-def _sums(cells: Int64[np.ndarray, "n 4"], values: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, " cells"]:
+def _sums(cells: Int64[np.ndarray, "n 4"], values: Shaped[np.ndarray, "n 4"]) -> Float64[np.ndarray, " cells"]:
     return np.bincount(cells.ravel(), values.ravel(), minlength=ROWS * COLUMNS)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
+import tiny_scene
 
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.sky import SkyPhoto, directions
@@ -95,3 +97,20 @@ def points_on(blocks: Sequence[Block] = HOUSES) -> np.ndarray:
 def overlap(found: np.ndarray, truth: np.ndarray) -> float:
     """Intersection over union."""
     return float((found & truth).sum() / max(1, (found | truth).sum()))
+
+
+HEADINGS = (-24.0, -15.0, -6.0, 4.0, 13.0, 22.0)
+
+
+def write_dataset(folder: Path, pitch_deg: float = 5.0) -> Path:
+    """A dataset of photos of the blocks, as `undistort` leaves it; the ground's points are seen by every camera."""
+    cameras = [
+        replace(look(heading, pitch_deg, x=0.1 * heading), name=f"{i}.png") for i, heading in enumerate(HEADINGS)
+    ]
+    for camera in cameras:
+        path = folder / "images" / camera.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), trace(camera)[0].pixels[:, :, ::-1])
+    points = points_on()
+    tiny_scene.write_model(folder / "sparse/0", cameras, points, np.full((len(points), 3), 120, np.uint8))
+    return folder
