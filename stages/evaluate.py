@@ -51,6 +51,8 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
             hint="Set evaluate.every or evaluate.views to hold some out.",
         )
     raster.set_threads(inputs.machine.threads)
+    if sky is not None:
+        torch.set_num_threads(1)  # the sky's matrix products may round differently on more
     stems = flat_stems([view.camera.name for view in chosen])
     per_view = []
     for done, (view, stem) in enumerate(zip(chosen, stems, strict=True), start=1):

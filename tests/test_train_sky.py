@@ -2,6 +2,7 @@
 
 import hashlib
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -32,6 +33,15 @@ import tiny_scene
 
 QUICK = TrainConfig(iterations=40, sky="model", sh_degree=1, densify_from=10, densify_every=10, densify_until=30)
 CELLS = ROWS * COLUMNS
+
+
+@pytest.fixture(autouse=True)
+def one_torch_thread() -> Iterator[None]:
+    """As in training: many threads on small tensors cost more than they bring."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -96,20 +106,20 @@ def empty_render(camera: Camera) -> Render:
 
 
 def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() -> None:
-    camera = skies.look(pitch_deg=30.0)
-    mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
-    mask[:120] = True
+    camera = skies.look(pitch_deg=30.0).scaled(80, 60)
+    mask = np.zeros((60, 80), bool)
+    mask[:30] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
-    photo = torch.full((skies.HEIGHT, skies.WIDTH, 3), 0.1)
-    photo[:120] = torch.tensor([0.3, 0.5, 0.7])
+    photo = torch.full((60, 80, 3), 0.1)
+    photo[:30] = torch.tensor([0.3, 0.5, 0.7])
     for number in range(120):
         composite = sky.composite(empty_render(camera), camera, (0.0, 0.0, 0.0))
         ((composite - photo).abs().mean() + sky.penalty(torch.zeros(photo.shape[:2]), camera, 1.0)).backward()
         sky.step(number / 120)
     with torch.no_grad():
         seen = sky.panorama.behind(camera, (0.0, 0.0, 0.0))
-    assert float((seen - photo)[:100].abs().mean()) < 0.02
-    assert float(seen[-40:].mean()) > 0.4  # the dark wall below did not get into it
+    assert float((seen - photo)[:24].abs().mean()) < 0.02
+    assert float(seen[-10:].mean()) > 0.4  # the dark wall below did not get into it
 
 
 def test_penalty_is_the_mean_opacity_before_the_sky() -> None:
@@ -139,7 +149,7 @@ def opacity_in_sky(scene: Path, model: Path) -> float:
 
 
 def test_training_clears_the_sky_of_gaussians_and_held_out_photos_gain(scene: Path, tmp_path: Path) -> None:
-    config = QUICK.model_copy(update={"iterations": 150, "densify_until": 100})
+    config = QUICK.model_copy(update={"iterations": 100, "densify": False})
     quality = {}
     for sky in ("off", "model"):
         out = tmp_path / sky

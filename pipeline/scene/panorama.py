@@ -78,8 +78,9 @@ def between_nodes(values: Float[Tensor, "rows columns 3"], camera: Camera) -> Fl
         torch.from_numpy(_between(size, count)).to(values.dtype)
         for size, count in ((camera.height, values.shape[0]), (camera.width, values.shape[1]))
     )
-    rows = (down @ values.reshape(values.shape[0], -1)).reshape(camera.height, values.shape[1], 3)
-    return right @ rows
+    across = right @ values.transpose(0, 1).reshape(values.shape[1], -1)  # two plain products: a fifth of batched ones
+    lines = across.reshape(camera.width, -1, 3).transpose(0, 1).reshape(values.shape[0], -1)
+    return (down @ lines).reshape(camera.height, camera.width, 3)
 
 
 def cover(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"]) -> Float32[np.ndarray, "*shape"]:
