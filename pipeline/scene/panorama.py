@@ -88,7 +88,7 @@ def cover(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"]) 
     sine = rays @ up / np.linalg.norm(rays, axis=-1)
     elevation = np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
     share = (elevation - NOTHING_UP_TO_DEG) / (FULL_FROM_DEG - NOTHING_UP_TO_DEG)
-    return np.clip(share, 0.0, 1.0).astype(np.float32)
+    return np.asarray(np.clip(share, 0.0, 1.0).astype(np.float32))
 
 
 def cells_of(

@@ -175,7 +175,7 @@ def elevations_deg(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Float64[np.
     """Angle of each pixel's ray over the horizon, degrees."""
     rays = directions(camera)
     sine = rays @ up / np.linalg.norm(rays, axis=2)
-    return np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
+    return np.asarray(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
 
 
 def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
@@ -188,7 +188,7 @@ def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
     x = (step * np.arange(-((1 - camera.width) // step) + 1) + 0.5 - camera.cx) / camera.fx
     y = (step * np.arange(-((1 - camera.height) // step) + 1) + 0.5 - camera.cy) / camera.fy
     rotation = camera.cam_from_world[:3, :3]
-    return x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2]
+    return np.asarray(x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2])
 
 
 def points_in(camera: Camera, points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n 2"]:
@@ -198,7 +198,7 @@ def points_in(camera: Camera, points: Float64[np.ndarray, "m 3"]) -> Float64[np.
         return np.zeros((0, 2))
     places = camera.project(in_front)
     inside = np.isfinite(places).all(axis=1) & (places >= 0.0).all(axis=1)
-    return places[inside & (places < [camera.width, camera.height]).all(axis=1)]
+    return np.asarray(places[inside & (places < [camera.width, camera.height]).all(axis=1)])
 
 
 def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarray, " 3"]) -> Votes:
@@ -233,7 +233,7 @@ def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Int64[np.n
     height = np.arcsin(np.clip(rays @ up, -1.0, 1.0)) / math.pi + 0.5
     columns = 2 * DIRECTION_ROWS
     row = np.minimum((height * DIRECTION_ROWS).astype(np.int64), DIRECTION_ROWS - 1)
-    return row * columns + (azimuth * columns).astype(np.int64) % columns
+    return np.asarray(row * columns + (azimuth * columns).astype(np.int64) % columns)
 
 
 def horizontal_axes(up: Float64[np.ndarray, " 3"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
@@ -269,7 +269,7 @@ def _near_points(points_px: Float64[np.ndarray, "n 2"], shape: tuple[int, int]) 
     columns, rows = points_px.astype(np.int64).T
     hit[rows, columns] = 1
     size = 2 * POINT_CLEARANCE_PX + 1
-    return cv2.dilate(hit, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
+    return np.asarray(cv2.dilate(hit, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0)
 
 
 def _top(elevation: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

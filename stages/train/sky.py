@@ -193,7 +193,7 @@ def filled(total: Float64[np.ndarray, "cells 4"]) -> Float32[np.ndarray, "cells 
         padded = np.pad(grid, ((1, 1), (0, 0), (0, 0)), mode="edge")
         around = padded[:-2] + padded[2:] + np.roll(grid, 1, axis=1) + np.roll(grid, -1, axis=1)
         grid = np.where(known, grid, 0.25 * around)
-    return grid.reshape(-1, 3).astype(np.float32)
+    return np.asarray(grid.reshape(-1, 3).astype(np.float32))
 
 
 def _sums(cells: Int64[np.ndarray, "n 4"], values: Shaped[np.ndarray, "n 4"]) -> Float64[np.ndarray, " cells"]:
