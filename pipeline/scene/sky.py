@@ -22,7 +22,8 @@ from splatpipe.pipeline.scene.upright import up_without_orientation
 
 WORK_MEGAPIXELS = 0.1  # at which photos are looked at: noise and distant texture are averaged away, edges stay
 SMOOTH_SLOPE = 0.03  # change of a channel over a pixel, of 1: haze and soft clouds are below, edges and leaves above
-BLUE_SLACK = 0.03  # by which a bluish sky's blue may stay below its red and green
+BLUE_STEP = 0.03  # by which a bluish sky's blue is at least above its red and at most below its green
+CLEARLY_BLUE = 0.1  # blue over red, from which on it is no grey that shade or haze made bluish
 LEAST_BLUE_LIGHT = 0.3  # of the blue of a sky, of 1
 LEAST_GREY_LIGHT = 0.75  # of the darkest channel of a grey one: clouds, haze, overexposed
 GREY_OUTSHINES = 0.7  # share of the rest of the picture: walls in the sun stand beside shade
@@ -36,6 +37,7 @@ POINT_CLEARANCE_PX = 3  # around a triangulated point nothing is sky
 CORE_PX = 5  # from a region's edge on, points are no longer those of the roof under it
 MOST_SPREAD = 0.2  # of a region's core near points, over the share of the rest: spires, outliers, birds, clouds
 LEAST_SHARE = 0.002  # of the picture: smaller patches are not worth the risk
+LEAST_CONTACT = 0.5  # of a region's width at the top over the root of its area: a sky is open, a road or a wall narrow
 GROW_STEPS = 3  # pixels by which the slope's window keeps regions from edges
 GROW_COLOUR = 0.06  # most distance, in any channel, from the mean of the sky close by
 GROW_WINDOW = 7
@@ -260,7 +262,7 @@ def _slopes(colour: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
 
 def _sky_coloured(colour: Float32[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     red, green, blue = colour[:, :, 0], colour[:, :, 1], colour[:, :, 2]
-    bluish = (blue > np.maximum(red, green) - BLUE_SLACK) & (blue > LEAST_BLUE_LIGHT)
+    bluish = (blue > red + BLUE_STEP) & (blue > green - BLUE_STEP) & (blue > LEAST_BLUE_LIGHT)
     return np.asarray(bluish | (colour.min(axis=2) > LEAST_GREY_LIGHT))
 
 
@@ -285,11 +287,12 @@ def _top(elevation: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _regions(candidates: Bool[np.ndarray, "h w"], top: Bool[np.ndarray, "h w"]) -> list[Bool[np.ndarray, "h w"]]:
-    """Connected regions that reach the top and are not tiny."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(candidates.astype(np.uint8), connectivity=4)
-    reaching = np.unique(labels[top & candidates])
-    least = LEAST_SHARE * candidates.size
-    return [labels == label for label in reaching if stats[label, cv2.CC_STAT_AREA] >= least]
+    """Connected regions that are open to the top and not tiny."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates.astype(np.uint8), connectivity=4)
+    contact = np.bincount(labels[top & candidates], minlength=count)
+    area = stats[:, cv2.CC_STAT_AREA]
+    wide = (contact >= LEAST_CONTACT * np.sqrt(area)) & (area >= LEAST_SHARE * candidates.size)
+    return [labels == label for label in range(1, count) if wide[label]]
 
 
 def _is_sky(
@@ -312,7 +315,7 @@ def _is_sky(
     if not seen.any() or not rest.any():
         return bool(rest.any())  # nothing but what a mask left out beside something seen
     red, green, blue = np.median(colour[seen], axis=0)
-    least = BLUE_OUTSHINES if blue > max(red, green) + BLUE_SLACK else GREY_OUTSHINES
+    least = BLUE_OUTSHINES if blue > red + CLEARLY_BLUE and blue > green else GREY_OUTSHINES
     light = np.median(colour[seen].mean(axis=1))
     return bool((colour[rest].mean(axis=1) < light).mean() > least)
 
