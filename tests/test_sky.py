@@ -138,3 +138,12 @@ def test_cameras_that_do_not_turn_count_as_held_upright() -> None:
 
 def test_no_photos_have_no_sky() -> None:
     assert find_skies([], lambda _: skies.trace(skies.look())[0], np.zeros((0, 3)), skies.UP) == []
+
+
+def test_bright_strip_that_is_narrow_at_the_top_is_not_sky() -> None:
+    tower = skies.Block(-30.0, 30.0, 8.0, 30.0)
+    photo, _ = skies.trace(skies.look(), (tower,))
+    photo.pixels[:200, 100:125] = (228, 230, 232)  # a white column on a dark wall, no point on either
+    assert not found(photo, np.zeros((0, 3))).any()
+    photo.pixels[:60] = (228, 230, 232)  # as wide as the picture, it might be one: only points tell
+    assert found(photo, np.zeros((0, 3)))[:50].all()
