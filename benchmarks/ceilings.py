@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import subprocess
@@ -16,6 +17,7 @@ FLAGS = {"avx512": ["-mavx512f", "-mprefer-vector-width=512", "-DLANES=16"], "av
 PLAIN = ["-DLANES=4"]  # SSE2 and NEON: four floats
 
 
+@functools.cache
 def measure_ceilings(threads: int) -> dict[str, float | str]:
     """Compile the small program for the best instruction set of this CPU, and run it.
 

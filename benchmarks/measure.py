@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 import torch
 from ceilings import measure_ceilings
-from rich.console import Console
-from rich.table import Table
+from rasterizing import contributing_pairs, raster_alone
+from tables import Row, console, print_table
 
 from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.runner import versions
@@ -34,18 +34,15 @@ from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import IMAGES, MODEL, View, load_model, load_views, mask_path
-from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize
 from splatpipe.stages.line import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.draws import permutation
-from splatpipe.stages.train.plan import Plan, make_plan, sh_degree_at
+from splatpipe.stages.train.plan import make_plan
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream
-
-Row = dict[str, Any]
 
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
 PARTS = ("forward", "loss", "backward", "adam")
@@ -160,7 +157,7 @@ def time_case(case: Case) -> Row:
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
     with loop.same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
-        state = TrainState.begin(start, plan.options)
+        state = TrainState.begin(start, plan)
         for photo in islice(photos, warmup):
             loop.train_step(state, plan, photo)
 
@@ -176,43 +173,27 @@ def time_case(case: Case) -> Row:
             with timed_parts(parts):
                 trained_on = parts.timed("iteration", iteration)()
             assert trained_on == camera.name
-    return {
-        "gaussians": len(state.gaussians),
-        "megapixels": round(1e-6 * pixels / case.repeats, 6),
-        "threads": case.threads,
-        "sh_degree": state.gaussians.sh_degree,
-        "peak_bytes": peak_memory_bytes() - before,
-        "pairs": round(statistics.fmean(pairs)),
-        "pairs_per_pixel": sum(pairs) / pixels,
-        "gpairs_per_s_per_core": 1e-9 * sum(pairs) / sum(parts.cpu_s["forward"] + parts.cpu_s["backward"]),
-    } | parts.row()
+        alone = raster_alone(state, plan, [camera_of(views, case.seed, 1 + i) for i in range(case.repeats)])
+    return (
+        {
+            "gaussians": len(state.gaussians),
+            "megapixels": round(1e-6 * pixels / case.repeats, 6),
+            "threads": case.threads,
+            "sh_degree": state.gaussians.sh_degree,
+            "peak_bytes": peak_memory_bytes() - before,
+            "pairs": round(statistics.fmean(pairs)),
+            "pairs_per_pixel": sum(pairs) / pixels,
+            "gpairs_per_s_per_core": 1e-9 * sum(pairs) / sum(parts.cpu_s["forward"] + parts.cpu_s["backward"]),
+        }
+        | alone
+        | parts.row()
+    )
 
 
 def camera_of(views: Sequence[View], seed: int, iteration: int) -> Camera:
     """Which view's turn it is in an iteration (from 1)."""
     epoch, place = divmod(iteration - 1, len(views))
     return views[int(permutation(seed, epoch, len(views))[place])].camera
-
-
-def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iteration: int) -> int:
-    """Pixel-Gaussian pairs that training's render in an iteration blends: alpha ≥ 1/255, before the pixel's end.
-
-    Args:
-        gaussians: As they are before the iteration.
-        camera: The iteration's.
-        plan: The training's.
-        iteration: From 1.
-    """
-    options = plan.options
-    n, h, w = len(gaussians), camera.height, camera.width
-    frame = _native.Frame()
-    frame.forward(
-        tuple(tensor.detach().contiguous() for tensor in gaussians.tensors().values()),
-        (np.ascontiguousarray(camera.cam_from_world, np.float64), (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
-        (sh_degree_at(options, iteration), options.antialias, plan.near, loop.background(options, iteration)),
-        (torch.empty(h, w, 3), torch.empty(h, w), None, None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
-    )
-    return int(frame.contributing_pairs())
 
 
 def restart_peak() -> int:
@@ -363,29 +344,18 @@ def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str
         name: Of the benchmark.
         facts: Of the machine and the run.
         rows: The figures.
-        columns: Heading of each column, and the format of its value: ``key:format``; times with ``ms``, bytes ``MB``.
+        columns: As ``print_table`` takes them.
         path: Of the JSON; None for none.
     """
-    console = Console(width=180 if not sys.stdout.isatty() else None)
-    table = Table(title=name)
-    for heading in columns:
-        table.add_column(heading, justify="right")
-    for row in rows:
-        table.add_row(*(_cell(row, spec) for spec in columns.values()))
-    console.print(table)
+    print_table(name, rows, columns)
+    write_figures(name, facts, rows, path)
+
+
+def write_figures(name: str, facts: Row, rows: Sequence[Row], path: Path | None) -> None:
+    """Print the facts that are one value, and write all of them and the rows where there is a path."""
     for fact, value in facts.items():
         if isinstance(value, str | int | float):
-            console.print(f"{fact}: {value}", highlight=False)
+            console().print(f"{fact}: {value}", highlight=False)
     if path is not None:
         text = json.dumps({"benchmark": name, "machine": facts, "rows": list(rows)}, indent=1, allow_nan=False)
         path.write_text(text + "\n", encoding="utf-8")
-
-
-def _cell(row: Row, spec: str) -> str:
-    key, _, how = spec.partition(":")
-    value = row.get(key)
-    if value is None:
-        return "-"
-    if how == "ms":
-        return f"{1e3 * value:.2f}"
-    return f"{1e-6 * value:.0f}" if how == "MB" else format(value, how)

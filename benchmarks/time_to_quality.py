@@ -22,7 +22,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.evaluate import as_trained, measure, render_pixels
-from splatpipe.stages.line import EvaluateConfig, LineConfig, TrainConfig
+from splatpipe.stages.line import LineConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
 from splatpipe.stages.train.state import TrainState
@@ -68,24 +68,24 @@ class Clocks:
         return self.cpu_s + time.process_time() - self._since[1]
 
 
-def follow(dataset: Path, config: TrainConfig, arguments: argparse.Namespace) -> Iterator[Row]:
+def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> Iterator[Row]:
     """Train, and measure the held-out views now and then and at the end.
 
     Args:
         dataset: As ``measure.prepare`` leaves it.
-        config: Of the training.
+        config: Of the line.
         arguments: The command line.
     """
     before = restart_peak()
     clocks, due, peak = Clocks(), arguments.every, 0
     views = load_views(dataset)
     start = read_splat(dataset / "init.ply")
-    plan = make_plan(config, views, EvaluateConfig().every, arguments.held_out, len(start))
+    plan = make_plan(config.train, views, config.evaluate.every, arguments.held_out, len(start))
     names = set(plan.train_views)
     levels = coarse_levels(plan.options)
     with loop.same_bits(arguments.threads):
         clocks.start()
-        state = TrainState.begin(start, plan.options)
+        state = TrainState.begin(start, plan)
         trained_on = [view for view in views if view.camera.name in names]
         with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
@@ -130,7 +130,7 @@ def passed(rows: list[Row], marks: list[float]) -> Iterator[Row]:
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--held-out", default="", help="photos to hold out, separated by commas; or every 8th")
+    options.add_argument("--held-out", default="", help="photos to hold out, separated by commas; else evaluate.every")
     size = options.add_mutually_exclusive_group()
     size.add_argument("--megapixels", type=float, help="size that photos are reduced to")
     size.add_argument("--scale", type=float, default=1.0, help="factor on their sides instead")
@@ -140,17 +140,23 @@ def main() -> None:
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--every", type=float, default=5.0, help="CPU seconds between measurements")
     options.add_argument("--marks", type=float, nargs="*", default=[], help="PSNR whose time is asked for, dB")
-    options.add_argument("--set", nargs="*", default=[], metavar="train.NAME=VALUE", help="other options of training")
+    options.add_argument(
+        "--set", nargs="*", default=[], metavar="SECTION.OPTION=VALUE", help="of initialize, train, evaluate"
+    )
     arguments = parse(options)
     facts = machine(arguments.threads)
     asked = {"iterations": arguments.iterations, "seed": arguments.seed, "max_gaussians": arguments.max_gaussians}
-    config = resolve(LineConfig, [{"train": asked}, *(parse_set(each, LineConfig) for each in arguments.set)]).train
+    config = resolve(LineConfig, [{"train": asked}, *(parse_set(each, LineConfig) for each in arguments.set)])
     with scratch() as folder:
         wanted = arguments.megapixels
         factor = arguments.scale if wanted is None else size_factor(arguments.data, wanted)
-        dataset = prepare(arguments.data, arguments.points, factor, folder / "dataset")
+        dataset = prepare(arguments.data, arguments.points, factor, folder / "dataset", start=config.initialize)
         rows = list(follow(dataset, config, arguments))
-    facts |= {"data": arguments.data.name, "held_out": arguments.held_out, "train": config.model_dump(mode="json")}
+    facts |= {
+        "data": arguments.data.name,
+        "held_out": arguments.held_out,
+        "train": config.train.model_dump(mode="json"),
+    }
     facts["marks"] = list(passed(rows, arguments.marks))
     report("time_to_quality", facts, rows, COLUMNS, arguments.json)
     for mark in facts["marks"]:

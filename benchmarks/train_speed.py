@@ -1,7 +1,9 @@
 """How long an iteration of training takes, by part: ``train_speed.py --data DATASET --threads N --json FILE``.
 
 Training's own code, the number of Gaussians fixed, all photos in turn; each point set of the dataset (`sparse`,
-`sparse_100k`) in each size, every case in a process of its own. Medians over the iterations, and the shortest.
+`sparse_100k`) in each size, every case in a process of its own. Medians over the iterations, and
+the shortest; `alone` is the rasterizer's forward and backward pass after them, over the same photos, with nothing of
+training between.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ COLUMNS = {
     "rest": "rest_wall_s:ms",
     "pairs/px": "pairs_per_pixel:.1f",
     "Gpair/s/core": "gpairs_per_s_per_core:.3f",
+    "alone ms": "alone_wall_s:ms",
+    "alone Gpair/s/core": "alone_gpairs_per_s_per_core:.3f",
     "FLOP/pair": "flop_slots_per_pair:.0f",
     "peak MB": "peak_bytes:MB",
 }

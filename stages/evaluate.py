@@ -1,4 +1,4 @@
-"""evaluate: the held-out photos, rendered and measured; everything that is measured is kept as 8-bit PNG."""
+"""evaluate: the held-out photos, rendered and measured (what is, is kept as 8-bit PNG), and what floats in the air."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from splatpipe.pipeline.scene import metrics
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_views, split_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_view
+from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.scene.panorama import Panorama, laid_over, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages.floaters import measure_floaters
 from splatpipe.stages.line import EvaluateConfig
 
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
@@ -60,11 +61,14 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
         per_view.append(evaluate_view(reduced, (gaussians, sky), options, folder / stem))
         report.progress(done, len(chosen), "measuring held-out photos", "photos")
     means = mean_measures(per_view)
-    result = {"test_views": len(per_view), "mean": means, "per_view": per_view}
+    cameras = [reduced_camera(view.camera, megapixels) for view in views]
+    floaters = measure_floaters(gaussians, cameras, inputs["undistort.dataset"], options)
+    result = {"test_views": len(per_view), "mean": means, "floaters": floaters, "per_view": per_view}
     text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False)
     (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
     summary: dict[str, Any] = {"test_views": len(per_view)}
-    return summary | {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
+    summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
+    return summary | {"free_space_opacity": floaters["free_space_opacity"]}
 
 
 def as_trained(plan: Path, gaussians: Gaussians) -> tuple[raster.RenderOptions, float | None]:

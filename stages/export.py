@@ -193,6 +193,7 @@ def collect_metrics(inputs: Inputs, plan: Facts, points: Points, registered: int
         "peak_memory_bytes": train.get("peak_memory_bytes"),
         "test_views": measured["test_views"],
         **measured["mean"],
+        "floaters": measured["floaters"],
         "per_view": measured["per_view"],
         "seed": plan["options"]["seed"],
         "device": train.get("device"),

@@ -101,6 +101,13 @@ class TrainConfig(StageConfig):
     """Share of 1 - SSIM in the loss; the rest is L1."""
     loss: Literal["native", "kornia"] = "native"
     """Who computes the loss and its gradient: our kernels, or kornia's SSIM under torch, some 50 times slower."""
+    exposure: Literal["off", "affine"] = "off"
+    """What exposure and white balance did to each photo: not modelled, or as an affine map of its colours that is
+    trained along. The splat keeps the photos' mean appearance."""
+    exposure_decay: NonNegativeFloat = 1e-3
+    """How strongly the maps are drawn to the identity: this times their deviation joins the loss's gradient."""
+    lr_exposure: PositiveFloat = 1e-3
+    """Learning rate of the maps at the start; a tenth of it at the end."""
     antialias: bool = False
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
     background: Literal["black", "white", "random"] = "black"
@@ -243,17 +250,23 @@ INITIALIZE = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=2,
+    version=3,
     config=TrainConfig,
     reads=("undistort.dataset", "initialize.splat"),
-    parts={"model": "model.ply", "history": "history.json", "plan": "plan.json", "sky": "sky.npz"},
+    parts={
+        "model": "model.ply",
+        "history": "history.json",
+        "plan": "plan.json",
+        "exposures": "exposures.json",
+        "sky": "sky.npz",
+    },
     entry="splatpipe.stages.train:run",
     borrows=("evaluate.every", "evaluate.views"),
     resumable=True,
 )
 EVALUATE = Stage(
     "evaluate",
-    version=3,
+    version=4,
     config=EvaluateConfig,
     reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
     parts={"metrics": "metrics.json", "views": "views"},

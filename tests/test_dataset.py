@@ -8,7 +8,7 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import image_path, load_points, load_views, mask_path, split_views
+from splatpipe.pipeline.scene.dataset import image_path, load_points, load_tracks, load_views, mask_path, split_views
 
 
 def a_camera() -> Camera:
@@ -70,6 +70,27 @@ def test_points_have_colours_and_track_lengths(tmp_path: Path) -> None:
     assert points.xyz.tolist() == [[0.1, 0.2, 0.3]]
     assert points.rgb.tolist() == [[1, 2, 3]]
     assert points.track_lengths.tolist() == [2]
+
+
+def test_tracks_are_rows_of_the_points_each_once(tmp_path: Path) -> None:
+    """Ids with a gap, a photo that sees a point twice, and one that sees none."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=40, height=30, params=[50.0, 51.0, 19.0, 16.0])
+    model.add_camera_with_trivial_rig(camera)
+    for number, name in enumerate(("b.jpg", "a.jpg", "c.jpg"), start=1):
+        image = pycolmap.Image(name, np.full((3, 2), 5.0), 1, number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    tracks = [[(1, 0), (2, 0)], [(1, 1), (2, 1)], [(2, 2), (1, 2), (1, 0)]]
+    for index, elements in enumerate(tracks):
+        if index == 2:
+            model.delete_point3D(1)
+        track = pycolmap.Track([pycolmap.TrackElement(*element) for element in elements])
+        model.add_point3D(np.array([float(index), 0.0, 1.0]), track, np.zeros(3, np.uint8))
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(tmp_path / "sparse" / "0")
+    assert load_points(tmp_path).xyz[:, 0].tolist() == [1.0, 2.0]
+    found = {name: rows.tolist() for name, rows in load_tracks(tmp_path).items()}
+    assert found == {"a.jpg": [0, 1], "b.jpg": [0, 1], "c.jpg": []}
 
 
 def test_a_missing_broken_or_distorted_model_is_a_failed_stage(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ from splatpipe.stages.train.stream import TrainingPhoto
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
+PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "sky.npz"]
+TECHNIQUES: dict[str, object] = {"exposure": "affine"}  # of which each has a state of its own
 QUICK = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15)
 
 
@@ -98,7 +100,7 @@ def test_another_folder_gives_the_same_bits_and_another_seed_does_not(
     assert digest(trained(scene, tmp_path / "here")) == digest(undisturbed)
     assert (tmp_path / "here/plan.json").read_bytes() == (undisturbed / "plan.json").read_bytes()
     assert digest(trained(scene, tmp_path / "seed", QUICK.model_copy(update={"seed": 1}))) != digest(undisturbed)
-    assert sorted(path.name for path in undisturbed.iterdir()) == ["history.json", "model.ply", "plan.json", "sky.npz"]
+    assert sorted(path.name for path in undisturbed.iterdir()) == PARTS
 
 
 class Killed(BaseException):
@@ -135,6 +137,19 @@ def test_killed_training_goes_on_and_ends_with_the_same_bits(
     train.run(QUICK, make_inputs(scene, threads=2), tmp_path, recorder)
     assert not recorder.warnings
     assert digest(tmp_path) == digest(undisturbed)
+
+
+def test_killed_training_with_every_technique_ends_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
+    config = QUICK.model_copy(update=TECHNIQUES)
+    whole = trained(scene, tmp_path / "whole", config)
+    for name, value in TECHNIQUES.items():
+        assert getattr(TrainConfig(), name) != value
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        die_at(patch, 34, killed)
+        trained(scene, tmp_path / "killed", config)
+    assert digest(trained(scene, tmp_path / "killed", config, threads=2)) == digest(whole)
+    for part in PARTS:
+        assert (tmp_path / "killed" / part).read_bytes() == (whole / part).read_bytes()
 
 
 def test_interrupt_saves_a_checkpoint_and_is_passed_on(scene: Path, undisturbed: Path, tmp_path: Path) -> None:

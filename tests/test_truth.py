@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+import torch
 import trimesh
 from jaxtyping import Float64
 
 from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.pipeline.raster import RenderOptions, render
-from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.dataset import load_points, load_tracks, load_views
+from splatpipe.pipeline.scene.free_space import free_space, near_or_free
+from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import read_splat
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -170,3 +173,31 @@ def test_rendered_depth_is_the_true_depth(
         true = first_hits(centre(pose), directions, surface)
         errors.append(np.abs(seen - true)[seen > 0] / true[seen > 0])
     assert np.median(np.concatenate(errors)) < 0.02
+
+
+def test_no_true_surface_is_called_free_and_most_of_the_air_is(
+    out: Path, poses: Poses, aligned: Aligned, surface: Float64[np.ndarray, "m 3 3"]
+) -> None:
+    """Tiny Gaussians on what the photos' rays hit, and at 0.2 to 0.8 of the way there."""
+    dataset = next((out / "stages").glob("undistort-*")) / "dataset"
+    cameras = [view.camera for view in load_views(dataset)]
+    tracks = load_tracks(dataset)
+    space = free_space(cameras, load_points(dataset).xyz, [tracks[camera.name] for camera in cameras])
+    generator = np.random.default_rng(2)
+    called: dict[str, list[np.ndarray]] = {"surface": [], "air": []}
+    for camera in cameras[::5]:
+        rows, columns = np.mgrid[4 : camera.height : 9, 4 : camera.width : 9]
+        x, y = (columns.ravel() + 0.5 - camera.cx) / camera.fx, (rows.ravel() + 0.5 - camera.cy) / camera.fy
+        rays = np.stack([x, y, np.ones(rows.size)], axis=1)
+        pose = poses[camera.name]
+        depth = first_hits(centre(pose), rays @ pose[:3, :3], surface) / aligned[0]
+        rays, depth = rays[np.isfinite(depth)], depth[np.isfinite(depth)]
+        for name, share in (("surface", np.ones(len(depth))), ("air", generator.uniform(0.2, 0.8, len(depth)))):
+            in_camera = (share * depth)[:, None] * rays
+            places = (in_camera - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
+            model = Gaussians.empty(len(places), 0)
+            model.means = torch.from_numpy(places.astype(np.float32))
+            model.log_scales[:] = -20.0
+            called[name].append(near_or_free(model, space).numpy())
+    assert np.concatenate(called["surface"]).mean() < 0.003
+    assert np.concatenate(called["air"]).mean() > 0.5

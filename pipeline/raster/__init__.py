@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.raster import _native
-from splatpipe.pipeline.raster.autograd import render_native
+from splatpipe.pipeline.raster.autograd import GradientBuffers, render_native
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions, check
 from splatpipe.pipeline.raster.isa import isa_name, isa_names, use_isa_of_environment
 from splatpipe.pipeline.raster.reference import render_reference
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians
 
-__all__ = ["Render", "RenderOptions", "isa_name", "isa_names", "render", "set_threads"]
+__all__ = ["GradientBuffers", "Render", "RenderOptions", "isa_name", "isa_names", "render", "set_threads"]
 
 Backend = Literal["auto", "reference", "native"]
 
@@ -27,6 +27,7 @@ def render(
     *,
     backend: Backend = "auto",
     means2d_probe: Tensor | None = None,
+    buffers: GradientBuffers | None = None,
 ) -> Render:
     """Render Gaussians as a camera sees them; differentiable with respect to every raw parameter.
 
@@ -40,6 +41,7 @@ def render(
         backend: ``native`` wants float32 on the CPU; ``auto`` takes it where it can.
         means2d_probe: Zeros (n, 2) whose gradient becomes dL/d(centre on screen), pixels, for density control; with
             `options.magnitudes` the sum of its absolute values over the pixels.
+        buffers: Where the native backend's backward pass writes its gradients; fresh memory without.
 
     Returns:
         Colour, alpha and depth of every pixel, and which Gaussians are visible.
@@ -53,7 +55,7 @@ def render(
     native_fits = means.device.type == "cpu" and means.dtype == torch.float32
     if backend == "reference" or (backend == "auto" and not native_fits):
         return render_reference(gaussians, camera, options, means2d_probe)
-    return render_native(gaussians, camera, options, means2d_probe)
+    return render_native(gaussians, camera, options, means2d_probe, buffers)
 
 
 def set_threads(threads: int) -> None:

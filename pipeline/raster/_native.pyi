@@ -82,6 +82,14 @@ def photo_loss(render: Tensor, photo: Tensor, mask: Tensor | None, ssim_weight: 
     `mask` is uint8 (h, w), zero does not count.
     """
 
+def affine_colour(affine: Tensor, picture: Tensor, out: Tensor) -> None:
+    """The colours of a float32 (h, w, 3) picture through a (3, 4) affine map, to `out`."""
+
+def affine_colour_backward(
+    affine: Tensor, picture: Tensor, upstream: Tensor, gradient: Tensor, by_affine: Tensor
+) -> None:
+    """Gradients by the picture and by the map, written to the last two, from the one by the result."""
+
 def adam_step(
     values: Sequence[Tensor],
     gradients: Sequence[Tensor],

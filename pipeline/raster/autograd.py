@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,8 +18,30 @@ from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians
 
 
+class GradientBuffers:
+    """Memory for a model's gradients that every backward pass writes anew.
+
+    The system hands out large memory page by page, cleared: with a million Gaussians that is a quarter of the backward
+    pass. The gradients of one pass are gone with the next one, so they must have been used by then, not added up.
+    """
+
+    def __init__(self) -> None:
+        self._buffers: tuple[Tensor, ...] = ()
+
+    def like(self, parameters: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Tensors of the parameters' shapes, not initialised; in the memory of the last ones, where those fit."""
+        if [buffer.shape for buffer in self._buffers] != [tensor.shape for tensor in parameters]:
+            self._buffers = ()
+            self._buffers = tuple(torch.empty_like(tensor) for tensor in parameters)
+        return tuple(buffer.detach() for buffer in self._buffers)
+
+
 def render_native(
-    gaussians: Gaussians, camera: Camera, options: RenderOptions, means2d_probe: Float[Tensor, "n 2"] | None = None
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RenderOptions,
+    means2d_probe: Float[Tensor, "n 2"] | None = None,
+    buffers: GradientBuffers | None = None,
 ) -> Render:
     """Render with the native kernels; arguments as of ``render``.
 
@@ -30,7 +53,7 @@ def render_native(
     for name, tensor in gaussians.tensors().items():
         if tensor.device.type != "cpu" or tensor.dtype != torch.float32:
             raise ValueError(f"the native rasterizer takes float32 on the CPU, not {name} of {tensor.dtype}")
-    return Render(*_Rasterize.apply(camera, options, means2d_probe, *parameters))  # type: ignore[no-untyped-call]
+    return Render(*_Rasterize.apply(camera, options, buffers, means2d_probe, *parameters))  # type: ignore[no-untyped-call]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -38,7 +61,12 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, camera: Camera, options: RenderOptions, _means2d_probe: Tensor | None, *parameters: Tensor
+        ctx: Any,
+        camera: Camera,
+        options: RenderOptions,
+        buffers: GradientBuffers | None,
+        _means2d_probe: Tensor | None,
+        *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         parameters = tuple(tensor.detach().contiguous() for tensor in parameters)
         n, h, w = len(parameters[0]), camera.height, camera.width
@@ -64,6 +92,7 @@ class _Rasterize(torch.autograd.Function):
         if any(ctx.needs_input_grad):
             ctx.frame = frame
             ctx.magnitudes = options.magnitudes
+            ctx.buffers = buffers or GradientBuffers()
             ctx.save_for_backward(*parameters)
         return colour, alpha, depth_sum, median_depth, visible, radii
 
@@ -74,15 +103,15 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         pictures = tuple(None if grad is None else grad.contiguous() for grad in (colour, alpha, depth_sum))
         parameters = ctx.saved_tensors
-        gradients = tuple(torch.empty_like(tensor) for tensor in parameters)
+        gradients = ctx.buffers.like(parameters)
         means2d = torch.empty(len(parameters[0]), 2)
         try:
             ctx.frame.backward(parameters, pictures, gradients, means2d, ctx.magnitudes)
         except MemoryError as error:
             _refuse(error, len(parameters[0]))
-        wanted = ctx.needs_input_grad[2:]
+        wanted = ctx.needs_input_grad[3:]
         asked = (grad if needs else None for grad, needs in zip((means2d, *gradients), wanted, strict=True))
-        return (None, None, *asked)
+        return (None, None, None, *asked)
 
 
 def _refuse(error: Exception, gaussians: int) -> NoReturn:

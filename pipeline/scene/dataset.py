@@ -135,6 +135,24 @@ def load_points(dataset: Path) -> Points:
     )
 
 
+def load_tracks(dataset: Path) -> dict[str, Int64[np.ndarray, " _"]]:
+    """Which sparse points each photo observes: rows of ``load_points`` by the photo's name, ascending, each once.
+
+    Args:
+        dataset: The folder that `undistort` left.
+
+    Raises:
+        StageError: if the model is broken.
+    """
+    model = load_model(dataset)
+    numbers = np.array(sorted(model.points3D), np.int64)
+    tracks = {}
+    for image in model.images.values():
+        observed = [point.point3D_id for point in image.points2D if point.has_point3D()]
+        tracks[image.name] = np.searchsorted(numbers, np.unique(np.array(observed, np.int64)))
+    return tracks
+
+
 def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str], list[str]]:
     """Divide photos into those to train on and those held out for evaluation.
 

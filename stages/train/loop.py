@@ -22,6 +22,7 @@ from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.draws import BACKGROUND, uniform
+from splatpipe.stages.train.exposure import exposures_json
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
@@ -45,7 +46,7 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `model.ply`, `history.json` and `plan.json`; go on from a checkpoint where a killed run left one.
+    """Write the model, its history, plan and exposures; go on from a checkpoint where a killed run left one.
 
     Raises:
         SplatpipeError: if nothing is left to train on.
@@ -69,7 +70,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         if budgeted(plan):
             report.note(plan.described())
         levels = coarse_levels(plan.options, plan.last_iteration)
-        state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan.options, sky)
+        state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
@@ -78,6 +79,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
+    (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
     return {
         "gaussians": len(gaussians),
         "iterations": state.iteration,
@@ -142,7 +144,7 @@ def resume(path: Path, plan: Plan, report: Reporter, sky: SkyModel | None) -> Tr
     """The state that a killed run left, or None; a broken one is told and ignored."""
     try:
         checkpoint = load_checkpoint(path, plan.digest())
-        state = TrainState.restore(checkpoint, plan.options, sky)
+        state = TrainState.restore(checkpoint, plan, sky)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:
@@ -240,33 +242,43 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
-    settings = raster.RenderOptions(
-        sh_degree=sh_degree_at(options, iteration),
-        background=background(options, iteration),
-        antialias=options.antialias,
-        near=plan.near,
-        depth=False,
-        magnitudes=observed,
-    )
+    settings = render_options(plan, iteration, observed)
     probe = state.probe() if observed else None
-    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe)
+    rendered = raster.render(state.gaussians, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    colour, sky = rendered.colour, state.sky
+    shown, sky = rendered.colour, state.sky
     if sky is not None:
-        colour = sky.composite(rendered, photo.camera, settings.background)
-    loss = measure(colour, photo.colour, options.ssim_weight, photo.mask)
+        shown = sky.composite(rendered, photo.camera, settings.background)
+    if state.exposure is not None:
+        shown = state.exposure.shown(shown, photo.camera.name)
+    loss = measure(shown, photo.colour, options.ssim_weight, photo.mask)
     if sky is not None:
         loss = loss + sky.penalty(rendered.alpha, photo.camera, options.sky_opacity_weight)
     loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(loss.detach()))
     with torch.no_grad():
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
+        if state.exposure is not None:
+            state.exposure.step(photo.camera.name, iteration, options)
         if sky is not None:
             sky.step(min(1.0, iteration / options.iterations))
         if probe is not None and probe.grad is not None:
             state.statistics.observe(probe.grad, rendered.visible, photo.camera.width, photo.camera.height)
             if options.prune_screen_px > 0.0:
                 state.statistics.observe_radii(rendered.radii)
+
+
+def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:
+    """How an iteration renders; with ``magnitudes`` of the screen gradient where density control looks on."""
+    options = plan.options
+    return raster.RenderOptions(
+        sh_degree=sh_degree_at(options, iteration),
+        background=background(options, iteration),
+        antialias=options.antialias,
+        near=plan.near,
+        depth=False,
+        magnitudes=magnitudes,
+    )
 
 
 def background(options: TrainConfig, iteration: int) -> tuple[float, float, float]:

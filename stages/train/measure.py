@@ -119,7 +119,7 @@ def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
 
 
 def _pilot_state(start: Gaussians, trial: Plan) -> TrainState:
-    state = TrainState.begin(start, trial.options)
+    state = TrainState.begin(start, trial)
     state.iteration = PILOT_ITERATION
     return state
 

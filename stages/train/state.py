@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatpipe.pipeline.raster import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
@@ -24,7 +25,9 @@ from splatpipe.stages.train.densify import (
     reset_opacity,
     room_at,
 )
+from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.history import History
+from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.sky import SkyModel
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
@@ -33,6 +36,7 @@ LARGEST_SCALE = 1e2  # a sky is no farther than that
 _ADAM = "adam."
 _STATISTICS = "statistics."
 _SKY = "sky."
+_EXPOSURE = "exposure."
 
 
 @dataclass
@@ -46,6 +50,8 @@ class TrainState:
         history: What happened so far.
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
+        buffers: Memory of the gradients.
+        exposure: The photos' colours, where they are modelled.
         sky: Trained beside the Gaussians; None where there is none.
     """
 
@@ -55,17 +61,20 @@ class TrainState:
     history: History
     iteration: int = 0
     seconds: float = 0.0
+    buffers: GradientBuffers = field(default_factory=GradientBuffers)
+    exposure: Exposure | None = None
     sky: SkyModel | None = None
 
     @staticmethod
-    def begin(start: Gaussians, options: TrainConfig, sky: SkyModel | None = None) -> TrainState:
+    def begin(start: Gaussians, plan: Plan, sky: SkyModel | None = None) -> TrainState:
         """The state before the first iteration.
 
         Args:
             start: The Gaussians to start with; evenly thinned where there are more than the cap allows.
-            options: Resolved.
+            plan: The training's.
             sky: As it begins.
         """
+        options = plan.options
         if len(start) > options.max_gaussians:
             start = start.select(torch.arange(options.max_gaussians) * len(start) // options.max_gaussians)
         columns = coefficient_count(options.sh_degree)
@@ -75,7 +84,8 @@ class TrainState:
         model = start.clone()
         model.sh = sh
         gaussians = model.requires_grad_()
-        return TrainState(gaussians, Adam(gaussians.tensors()), DensityStatistics(len(start)), History(), sky=sky)
+        adam, statistics = Adam(gaussians.tensors()), DensityStatistics(len(start))
+        return TrainState(gaussians, adam, statistics, History(), exposure=new_exposure(plan), sky=sky)
 
     def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
         """Step the parameters against their gradients, which are dropped.
@@ -125,6 +135,7 @@ class TrainState:
 
     def _densify(self, options: TrainConfig, extent: float, limit: int, iteration: int) -> None:
         """Prune, then grow to at most ``limit`` Gaussians."""
+        self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
         gaussians, statistics = self.gaussians.detach(), self.statistics
         gone = prune_mask(gaussians, options, extent, iteration, statistics.max_radius_px)
         pruned = int(gone.sum())
@@ -159,17 +170,19 @@ class TrainState:
         tensors |= {_STATISTICS + name: tensor for name, tensor in self.statistics.to_arrays().items()}
         if self.sky is not None:
             tensors |= {_SKY + name: tensor for name, tensor in self.sky.to_arrays().items()}
+        if self.exposure is not None:
+            tensors |= {_EXPOSURE + name: tensor for name, tensor in self.exposure.arrays().items()}
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
         facts["instruction_set"] = instruction_set
         return Checkpoint({name: tensor.numpy() for name, tensor in tensors.items()}, facts)
 
     @staticmethod
-    def restore(checkpoint: Checkpoint, options: TrainConfig, sky: SkyModel | None = None) -> TrainState:
+    def restore(checkpoint: Checkpoint, plan: Plan, sky: SkyModel | None = None) -> TrainState:
         """The inverse of ``checkpoint``.
 
         Args:
             checkpoint: As it was written.
-            options: Resolved.
+            plan: The training's.
             sky: As it began; takes the checkpoint's colours.
 
         Raises:
@@ -178,20 +191,28 @@ class TrainState:
         try:
             tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
             gaussians = Gaussians.from_tensors({name: tensors[name] for name in PARAMETERS}).requires_grad_()
-            if gaussians.sh.shape[1] != coefficient_count(options.sh_degree):
+            if gaussians.sh.shape[1] != coefficient_count(plan.options.sh_degree):
                 raise ValueError("another degree of spherical harmonics")
             adam = Adam(gaussians.tensors())
             adam.load_state_dict(_under(_ADAM, tensors))
             statistics = DensityStatistics(len(gaussians))
             for name, tensor in _under(_STATISTICS, tensors).items():
                 getattr(statistics, name).copy_(tensor)
+            exposure = new_exposure(plan)
+            if exposure is not None:
+                exposure.load(_under(_EXPOSURE, tensors))
             history = History(**checkpoint.facts["history"])
             counts = (int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"]))
             if sky is not None:  # last: what fails before leaves it as it began
                 sky.load(_under(_SKY, tensors))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
-        return TrainState(gaussians, adam, statistics, history, *counts, sky)
+        return TrainState(gaussians, adam, statistics, history, *counts, exposure=exposure, sky=sky)
+
+
+def new_exposure(plan: Plan) -> Exposure | None:
+    """The exposures' model before the first iteration, if the plan has one."""
+    return Exposure(plan.train_views) if plan.options.exposure != "off" else None
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -60,4 +60,5 @@ void test_threads();
 void test_raster();
 void test_gradients();
 void test_loss();
+void test_colour();
 void test_adam();

@@ -50,6 +50,7 @@ int main() {
     test_raster();
     test_gradients();
     test_loss();
+    test_colour();
     test_adam();
     std::printf("%d passed, %d failed\n", passed, failed);
     return failed ? 1 : 0;

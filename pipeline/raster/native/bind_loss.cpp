@@ -1,4 +1,4 @@
-// Python faces of the loss and the optimiser: checks around their drivers.
+// Python faces of the loss, what is between it and the rasterizer, and the optimiser: checks around their drivers.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -12,6 +12,8 @@
 
 #include "adam.h"
 #include "adam_step.h"
+#include "affine_colour.h"
+#include "colour.h"
 #include "loss.h"
 #include "photo_loss.h"
 
@@ -47,6 +49,28 @@ double photo_loss(const Image& render, const Image& photo, const std::optional<M
     return splat::photo_loss(images, ssim_weight);
 }
 
+using Affine = nb::ndarray<const float, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+using MutableAffine = nb::ndarray<float, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+
+void affine_colour(const Affine& map, const Image& in, const MutableImage& out) {
+    require(in.shape(0) == out.shape(0) && in.shape(1) == out.shape(1), "pictures differ in size");
+    nb::gil_scoped_release release;
+    splat::affine_colour(map.data(), in.data(), static_cast<std::int64_t>(in.size() / 3), out.data());
+}
+
+void affine_colour_backward(const Affine& map, const Image& in, const Image& upstream, const MutableImage& gradient,
+                            const MutableAffine& map_gradient) {
+    require(in.shape(0) == upstream.shape(0) && in.shape(1) == upstream.shape(1), "pictures differ in size");
+    require(in.shape(0) == gradient.shape(0) && in.shape(1) == gradient.shape(1), "pictures differ in size");
+    double sums[splat::kAffine];
+    {
+        nb::gil_scoped_release release;
+        splat::affine_colour_backward(map.data(), in.data(), upstream.data(), static_cast<std::int64_t>(in.size() / 3),
+                                      gradient.data(), sums);
+    }
+    for (int k = 0; k < splat::kAffine; ++k) map_gradient.data()[k] = static_cast<float>(sums[k]);
+}
+
 std::int64_t adam_step(const std::vector<Rows>& values, const std::vector<ConstRows>& gradients,
                        const std::vector<Rows>& means, const std::vector<Rows>& squares,
                        const std::vector<Rates>& rates, const std::optional<RowMask>& visible,
@@ -79,6 +103,11 @@ void bind_loss(nb::module_& m) {
     m.def("photo_loss", &photo_loss, "render"_a.noconvert(), "photo"_a.noconvert(), "mask"_a.noconvert().none(),
           "ssim_weight"_a, "gradient"_a.noconvert(),
           "(1 - w) L1 + w (1 - SSIM) of two (h, w, 3) images; its gradient by the render goes to `gradient`.");
+    m.def("affine_colour", &affine_colour, "affine"_a.noconvert(), "picture"_a.noconvert(), "out"_a.noconvert(),
+          "The colours of an (h, w, 3) picture through a (3, 4) affine map, to `out`.");
+    m.def("affine_colour_backward", &affine_colour_backward, "affine"_a.noconvert(), "picture"_a.noconvert(),
+          "upstream"_a.noconvert(), "gradient"_a.noconvert(), "by_affine"_a.noconvert(),
+          "Gradients by the picture and by the map, from the one by the result.");
     m.def(
         "adam_step",
         [](const std::vector<Rows>& values, const std::vector<ConstRows>& gradients, const std::vector<Rows>& means,

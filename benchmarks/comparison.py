@@ -1,0 +1,107 @@
+"""Variants against a base over captures and seeds: means, and paired differences with their standard error."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+
+from tables import Row
+
+BASE = "base"
+
+# Heading, the figure's key (`*`: whatever follows), and how it is written. One that no run has is shown as "-".
+MEASURES = {
+    "PSNR dB": ("psnr", ".2f"),
+    "PSNR cc": ("psnr_cc", ".2f"),
+    "SSIM": ("ssim", ".4f"),
+    "best − end": ("below_best", ".2f"),
+    "free space": ("floaters.free_space*", ".4f"),
+    "depth": ("floaters.depth*", ".4f"),
+    "loss": ("loss", ".4f"),
+    "Gaussians": ("gaussians", ",.0f"),
+    "train s": ("train_seconds", ".1f"),
+    "CPU s": ("cpu_s", ".1f"),
+}
+
+
+def key_of(pattern: str, rows: Iterable[Row]) -> str:
+    """The key that rows have for a figure: the pattern itself, or the first in name order that begins as it does."""
+    if not pattern.endswith("*"):
+        return pattern
+    return min((key for row in rows for key in row if key.startswith(pattern[:-1])), default=pattern)
+
+
+def means(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
+    """A capture's table: each variant's mean over the seeds, ± half of the range, written out.
+
+    Args:
+        rows: Of one capture.
+        variants: In the order wanted; those without a row are in it, too.
+    """
+    table = []
+    for variant in variants:
+        mine = [row for row in rows if row["variant"] == variant]
+        line: Row = {"variant": variant, "runs": len(mine)}
+        for heading, (pattern, how) in MEASURES.items():
+            values = _values(mine, key_of(pattern, rows))
+            if values:
+                line[heading] = format(statistics.fmean(values), how)
+            if len(values) > 1:
+                line[heading] += f" ± {format(0.5 * (max(values) - min(values)), how)}"
+        table.append(line)
+    return table
+
+
+def differences(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
+    """Each variant's differences to the base with the same capture and seed, a figure at a time.
+
+    Args:
+        rows: Of all runs.
+        variants: Besides the base.
+
+    Returns:
+        A row a variant with, under each figure's key, ``mean`` (over captures, of their means over seeds), ``error``
+        (standard error over the pairs; None where there are fewer than two) and ``pairs``.
+    """
+    base = {(row["capture"], row["seed"]): row for row in rows if row["variant"] == BASE}
+    found = []
+    for variant in variants:
+        line: Row = {"variant": variant}
+        for pattern, _ in MEASURES.values():
+            key = key_of(pattern, rows)
+            by_capture: dict[str, list[float]] = {}
+            for row in rows:
+                other = base.get((row["capture"], row["seed"]), {})
+                if row["variant"] == variant and row.get(key) is not None and other.get(key) is not None:
+                    by_capture.setdefault(row["capture"], []).append(row[key] - other[key])
+            if by_capture:
+                line[key] = _paired(by_capture)
+        found.append(line)
+    return found
+
+
+def _paired(by_capture: Mapping[str, Sequence[float]]) -> Row:
+    pairs = [value for values in by_capture.values() for value in values]
+    error = statistics.stdev(pairs) / math.sqrt(len(pairs)) if len(pairs) > 1 else None
+    mean = statistics.fmean(statistics.fmean(values) for values in by_capture.values())
+    return {"mean": mean, "error": error, "pairs": len(pairs)}
+
+
+def written(found: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
+    """Differences as text, a heading at a time: `+0.31 ± 0.05`."""
+    table = []
+    for line in found:
+        text: Row = {"variant": line["variant"]}
+        for heading, (pattern, how) in MEASURES.items():
+            paired = line.get(key_of(pattern, rows))
+            if paired is not None:
+                text["pairs"] = max(paired["pairs"], text.get("pairs", 0))
+                text[heading] = format(paired["mean"], f"+{how}")
+                text[heading] += "" if paired["error"] is None else f" ± {format(paired['error'], how)}"
+        table.append(text)
+    return table
+
+
+def _values(rows: Iterable[Row], key: str) -> list[float]:
+    return [row[key] for row in rows if row.get(key) is not None]

@@ -1,0 +1,72 @@
+"""The rasterizer by itself, as training's iterations use it: the pairs that it blends and its speed."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from splatpipe.pipeline import raster
+from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.stages.train import loop
+from splatpipe.stages.train.plan import Plan, sh_degree_at
+from splatpipe.stages.train.state import TrainState
+
+WARMUP = 3  # renders that do not count
+
+
+def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> dict[str, Any]:
+    """Forward and backward pass of the rasterizer one after the other, with nothing of training between them.
+
+    Args:
+        state: Its Gaussians are rendered and stay as they are.
+        plan: The training's.
+        cameras: To be rendered, in turn.
+
+    Returns:
+        Median wall seconds of a view, and pairs a second and core (CPU seconds of all threads, over all views).
+    """
+    options = loop.render_options(plan, max(1, state.iteration), False)
+    pairs, wall, cpu = 0, [], 0.0
+    for index, camera in enumerate([*cameras[:WARMUP], *cameras]):
+        generator = torch.Generator().manual_seed(index)
+        upstream = torch.randn(camera.height, camera.width, 3, generator=generator) / (camera.width * camera.height)
+        began, began_cpu = time.perf_counter(), time.process_time()
+        rendered = raster.render(state.gaussians, camera, options, buffers=state.buffers)
+        rendered.colour.backward(upstream)  # type: ignore[no-untyped-call]
+        took, took_cpu = time.perf_counter() - began, time.process_time() - began_cpu
+        for tensor in state.gaussians.tensors().values():
+            tensor.grad = None
+        if index < WARMUP:
+            continue
+        wall.append(took)
+        cpu += took_cpu
+        pairs += contributing_pairs(state.gaussians, camera, plan, state.iteration)
+    return {"alone_wall_s": statistics.median(wall), "alone_gpairs_per_s_per_core": 1e-9 * pairs / cpu}
+
+
+def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iteration: int) -> int:
+    """Pixel-Gaussian pairs that training's render in an iteration blends: alpha ≥ 1/255, before the pixel's end.
+
+    Args:
+        gaussians: As they are before the iteration.
+        camera: The iteration's.
+        plan: The training's.
+        iteration: From 1.
+    """
+    options = plan.options
+    n, h, w = len(gaussians), camera.height, camera.width
+    frame = _native.Frame()
+    frame.forward(
+        tuple(tensor.detach().contiguous() for tensor in gaussians.tensors().values()),
+        (np.ascontiguousarray(camera.cam_from_world, np.float64), (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
+        (sh_degree_at(options, iteration), options.antialias, plan.near, loop.background(options, iteration)),
+        (torch.empty(h, w, 3), torch.empty(h, w), None, None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
+    )
+    return int(frame.contributing_pairs())

@@ -1,0 +1,126 @@
+"""Variants of the line's configuration: named options on top of a base, checked before anything runs."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from comparison import BASE
+
+from splatpipe.pipeline.engine.config import load_file, load_preset, parse_set, resolve, with_seed
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.stages.line import LineConfig
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}")  # also a folder's
+PRESET = "standard"  # what `splatpipe run` takes without --preset
+# What all variants have in common: the dataset that they train on, and what they are measured against.
+SHARED = ("features.", "matches.", "sparse.", "undistort.max_megapixels", "evaluate.every", "evaluate.views")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A technique.
+
+    Attributes:
+        name: Of it.
+        sets: ``SECTION.OPTION=VALUE``, on top of the base's.
+        what: It does, in a line.
+    """
+
+    name: str
+    sets: tuple[str, ...] = ()
+    what: str = ""
+
+
+def choose(file: Path, extra: Sequence[str], only: Sequence[str] | None, base: Sequence[str]) -> list[Variant]:
+    """The base and the variants asked for, their options checked by the line's own configuration.
+
+    Args:
+        file: TOML with variants.
+        extra: More of them, each ``NAME=SECTION.OPTION=VALUE …``.
+        only: Names; None for all.
+        base: Options that all have.
+
+    Raises:
+        UsageError: names the variant and what is wrong with it.
+    """
+    found = {variant.name: variant for variant in read(file)}
+    for text in extra:
+        name, _, sets = text.partition("=")
+        found[name] = checked_name(Variant(name, split(sets), "--variant"))
+    if only is not None:
+        if unknown := sorted({*only} - {*found, BASE}):
+            raise UsageError(f"There is no variant {', '.join(unknown)}.", hint=f"There are: {', '.join(found)}.")
+        found = {name: variant for name, variant in found.items() if name in only}
+    chosen = [Variant(BASE, (), "the base alone"), *found.values()]
+    for variant in chosen:
+        try:
+            check(variant, [*base, *variant.sets])
+        except UsageError as error:
+            raise UsageError(f"Variant {variant.name}: {error.message}", error.hint) from error
+    return chosen
+
+
+def read(path: Path) -> list[Variant]:
+    """Variants from a TOML file: a table each, with ``set`` and ``what``.
+
+    Raises:
+        UsageError: if it is not one.
+    """
+    found = []
+    for name, table in load_file(path).items():
+        sets = table.get("set") if isinstance(table, dict) else None
+        if not isinstance(sets, list) or not all(isinstance(each, str) for each in sets) or {*table} - {"set", "what"}:
+            raise UsageError(
+                f"{path}: the variant {name} is not understood.",
+                hint=f'Write it as [{name}], and below it set = ["train.antialias=true"] and what = "a line".',
+            )
+        found.append(checked_name(Variant(name, tuple(sets), str(table.get("what", "")))))
+    return found
+
+
+def checked_name(variant: Variant) -> Variant:
+    """The variant.
+
+    Raises:
+        UsageError: if its name cannot be a folder's, or is the base's.
+    """
+    if variant.name == BASE or not NAME.fullmatch(variant.name):
+        raise UsageError(
+            f'"{variant.name}" cannot be a variant\'s name.', hint=f"Use letters, digits and _.+-; {BASE} is taken."
+        )
+    return variant
+
+
+def check(variant: Variant, sets: Sequence[str]) -> None:
+    """Refuse options that the line does not know, and those that would change nothing or not only the variant.
+
+    Raises:
+        UsageError: says which.
+    """
+    if config_of(sets, 1).train.seed != 1:
+        raise UsageError("train.seed is not a variant's.", hint="Say how many with --seeds.")
+    for each in variant.sets:
+        if each.partition("=")[0].strip().startswith(SHARED):
+            raise UsageError(f"{each} would not act on this variant alone.", hint="Give it to all with --base.")
+
+
+def split(text: str) -> tuple[str, ...]:
+    """Assignments separated by blanks; quotes keep blanks.
+
+    Raises:
+        UsageError: if a quote is not closed.
+    """
+    try:
+        return tuple(shlex.split(text))
+    except ValueError as error:
+        raise UsageError(f"Cannot understand {text!r}: {error}.", hint='Write "train.NAME=VALUE …".') from error
+
+
+def config_of(sets: Sequence[str], seed: int) -> LineConfig:
+    """The whole configuration of a run, as ``splatpipe run`` resolves it."""
+    assigned = [parse_set(each, LineConfig) for each in sets]
+    return resolve(LineConfig, [load_preset(PRESET), with_seed(LineConfig, seed), *assigned])

@@ -1,0 +1,55 @@
+"""Small models that are trained beside the Gaussians and belong to the photos, not to the building."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from splatpipe.pipeline.raster.optim import Adam, Rate
+
+_MOMENTS = "adam."
+
+
+class SideModel:
+    """Named tensors, leaves of autograd, that share their rows, with their moments.
+
+    Attributes:
+        tensors: (n, ...) each; changed in place.
+        adam: Their optimiser.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        self.tensors = {name: tensor.detach().clone().requires_grad_() for name, tensor in tensors.items()}
+        self.adam = Adam(self.tensors)
+
+    def descend(self, rates: Mapping[str, Rate], rows: Bool[Tensor, " n"] | None = None) -> None:
+        """Step the tensors against their gradients, which are dropped.
+
+        Args:
+            rates: Learning rate of each.
+            rows: Rows that take part; None: all.
+        """
+        if all(tensor.grad is not None for tensor in self.tensors.values()):
+            self.adam.step(self.tensors, rates, rows)
+        for tensor in self.tensors.values():
+            tensor.grad = None
+
+    def arrays(self) -> dict[str, Tensor]:
+        """All that changes, by name, for a checkpoint; not copied."""
+        moments = {_MOMENTS + name: tensor for name, tensor in self.adam.state_dict().items()}
+        return {name: tensor.detach() for name, tensor in self.tensors.items()} | moments
+
+    def load(self, arrays: Mapping[str, Tensor]) -> None:
+        """The inverse of ``arrays``.
+
+        Raises:
+            KeyError, ValueError, RuntimeError: if something is missing or has another shape.
+        """
+        for name, tensor in self.tensors.items():
+            if arrays[name].shape != tensor.shape:
+                raise ValueError(f"{name} is {tuple(arrays[name].shape)}, not {tuple(tensor.shape)}")
+            tensor.detach().copy_(arrays[name])
+        moments = {name.removeprefix(_MOMENTS): array for name, array in arrays.items() if name.startswith(_MOMENTS)}
+        self.adam.load_state_dict(moments)

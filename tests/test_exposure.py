@@ -1,0 +1,99 @@
+"""The photos' exposures: learned where they differ, and neutral on average."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline import raster
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages import initialize, train
+from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.train.exposure import Exposure
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+GAINS = np.linspace(0.7, 1.0, tiny_scene.CAMERAS)  # of the photos in the arc's order: every other one is turned round
+GAINS[::2] = GAINS[::2][::-1]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `dataset`, whose photos are exposed differently, and `init.ply`."""
+    folder = tmp_path_factory.mktemp("scene")
+    tiny_scene.write_dataset(folder / "dataset")
+    for view, gain in zip(load_views(folder / "dataset"), GAINS, strict=True):
+        photo = cv2.imread(str(view.image_path)).astype(np.float32)
+        cv2.imwrite(str(view.image_path), np.round(photo * gain).astype(np.uint8))
+    parts = {"undistort.dataset": folder / "dataset"}
+    initialize.run(InitializeConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    return folder
+
+
+def trained(scene: Path, out: Path, exposure: str) -> Path:
+    out.mkdir()
+    parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
+    settings = {"evaluate.every": 0, "evaluate.views": ""}
+    config = TrainConfig(iterations=400, densify_gradient=1e-3, exposure=exposure, lr_exposure=1e-2)
+    train.run(config, Inputs(parts, scene, settings, Machine("cpu", 2)), out, tiny_scene.Recorder())
+    return out
+
+
+def neutral_error(scene: Path, model: Path) -> float:
+    """RMS difference of the model's renders, as they are, from the true ones at the mean exposure."""
+    gaussians, truth = read_splat(model), tiny_scene.true_model()
+    options = raster.RenderOptions(sh_degree=3)
+    errors = []
+    for view in load_views(scene / "dataset"):
+        with torch.no_grad():
+            ours = raster.render(gaussians, view.camera, options).colour
+            true = raster.render(truth, view.camera, options).colour * float(GAINS.mean())
+        errors.append(float((ours - true).square().mean()))
+    return float(np.sqrt(np.mean(errors)))
+
+
+def test_maps_are_the_photos_gains_and_the_splat_is_neutral(scene: Path, tmp_path: Path) -> None:
+    modelled, plain = trained(scene, tmp_path / "on", "affine"), trained(scene, tmp_path / "off", "off")
+    found = json.loads((modelled / "exposures.json").read_text())
+    assert found["model"] == "affine"
+    assert sorted(found["views"]) == [view.camera.name for view in load_views(scene / "dataset")]
+    maps = np.array([found["views"][name] for name in sorted(found["views"])])
+    assert np.abs(maps.mean(axis=0) - np.eye(3, 4)).max() < 1e-6
+    grey = maps[:, :, :3].sum(axis=2).mean(axis=1) + 2.0 * maps[:, :, 3].mean(axis=1)  # of a grey of 0.5, relative
+    assert np.corrcoef(grey, GAINS)[0, 1] > 0.95
+    assert neutral_error(scene, modelled / "model.ply") < 0.8 * neutral_error(scene, plain / "model.ply")
+    assert json.loads((plain / "exposures.json").read_text()) == {"model": "off", "views": {}}
+
+
+def test_a_step_changes_one_photo_and_keeps_the_mean() -> None:
+    exposure = Exposure(["b", "a", "c"])
+    options = TrainConfig(iterations=10)
+    picture = torch.full((8, 8, 3), 0.5)
+    exposure.shown(picture, "b").sum().backward()
+    exposure.step("b", 1, options)
+    maps = {name: torch.tensor(rows) for name, rows in exposure.maps().items()}
+    assert torch.allclose(sum(maps.values()) / 3.0, torch.eye(3, 4), atol=1e-6)
+    assert torch.equal(maps["a"], maps["c"])
+    assert bool((maps["b"] < maps["a"]).all())
+
+
+def test_maps_are_drawn_to_the_identity() -> None:
+    exposure = Exposure(["a", "b"])
+    options = TrainConfig(iterations=1000, exposure_decay=1.0, lr_exposure=0.01)
+    with torch.no_grad():
+        exposure.tensors["deviations"][0] += 0.2
+        exposure.tensors["deviations"][1] -= 0.2
+    for iteration in range(1, 201):
+        name = "ab"[iteration % 2]
+        (exposure.shown(torch.zeros(8, 8, 3), name).sum() * 0.0).backward()
+        exposure.step(name, iteration, options)
+    assert float(exposure.tensors["deviations"].detach().abs().max()) < 0.02

@@ -1,0 +1,114 @@
+"""The floaters' figures of a model whose truth is known, with and without something hanging before a camera."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline.raster import RenderOptions
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.stages.floaters import measure_floaters
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+WALL = 6.0
+OPTIONS = RenderOptions(sh_degree=0, background=(1.0, 1.0, 1.0), depth=False)
+
+
+def cameras() -> list[Camera]:
+    """Four in a row, looking along z."""
+    found = []
+    for number in range(4):
+        pose = np.eye(4)
+        pose[0, 3] = 0.4 * (1.5 - number)
+        found.append(Camera(f"photo_{number}.png", 144, 108, 130.0, 130.0, 72.0, 54.0, pose))
+    return found
+
+
+def places() -> np.ndarray:
+    x, y = np.meshgrid(np.arange(-4.0, 4.05, 0.1), np.arange(-3.2, 3.25, 0.1))
+    return np.stack((x.ravel(), y.ravel(), np.full(x.size, WALL)), axis=1)
+
+
+def wall(opacity: float = 0.9) -> Gaussians:
+    """A Gaussian at each point, so wide that nothing is seen through the wall."""
+    return blob(places(), 0.12, opacity)
+
+
+def blob(where: np.ndarray, size: float, opacity: float) -> Gaussians:
+    found = Gaussians.empty(len(where), 0)
+    found.means = torch.from_numpy(where.astype(np.float32))
+    found.log_scales[:] = float(np.log(size))
+    found.log_scales[:, 2] = float(np.log(0.01))
+    found.opacity_logits[:] = float(np.log(opacity / (1.0 - opacity)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The points that lie in all four pictures, seen in each."""
+    folder = tmp_path_factory.mktemp("floaters")
+    xyz = places()
+    pixels = [view.project(xyz) for view in cameras()]
+    inside = np.all([((seen > 0.0) & (seen < [144.0, 108.0])).all(axis=1) for seen in pixels], axis=0)
+    xyz = xyz[inside]
+    tiny_scene.write_model(folder / "sparse/0", cameras(), xyz, np.full((len(xyz), 3), 128, np.uint8))
+    return folder
+
+
+def test_true_model_has_no_floaters_and_its_views_agree(dataset: Path) -> None:
+    figures = measure_floaters(wall(), cameras(), dataset, OPTIONS)
+    assert (figures["free_space_opacity"], figures["free_space_gaussians"], figures["free_space_rendered"]) == (0, 0, 0)
+    apart = figures["depth_disagreement"]
+    assert apart["median"] < 1e-4 and apart["share_above_5_percent"] == 0.0
+    assert apart["pairs"] >= 2 and apart["pixels"] > 1000
+    json.dumps(figures, allow_nan=False)
+
+
+def test_planted_floater_is_found_with_the_light_that_it_stops(dataset: Path) -> None:
+    floater = blob(np.array([[0.0, 0.0, 2.0]]), 0.08, 0.98)
+    model = Gaussians.concat([wall(), floater])
+    figures = measure_floaters(model, cameras(), dataset, OPTIONS)
+    assert figures["free_space_gaussians"] == 1
+    assert figures["free_space_opacity"] == pytest.approx(0.98 / (0.98 + 0.9 * len(places())), abs=1e-6)
+    assert figures["depth_disagreement"]["share_above_5_percent"] == 0.0  # all see it in the same place
+    # Light that an isotropic Gaussian stops: 2 π σ² × opacity, σ² in pixels and with the screen filter's 0.3.
+    stopped = 2.0 * np.pi * ((0.08 * 130.0 / 2.0) ** 2 + 0.3) * 0.98
+    assert figures["free_space_rendered"] == pytest.approx(stopped / (144 * 108), rel=0.05)
+
+
+def test_haze_that_is_a_surface_for_one_view_alone_is_a_disagreement(dataset: Path) -> None:
+    """Two veils, one behind the other for the first camera: only there they stop more than half of the light."""
+    x = float(cameras()[0].centre()[0])
+    veils = [blob(np.array([[x, 0.0, z]]), 8.0 * z / 130.0, 0.45) for z in (1.5, 3.0)]
+    figures = measure_floaters(Gaussians.concat([wall(), *veils]), cameras(), dataset, OPTIONS)
+    alone = measure_floaters(Gaussians.concat([wall(), veils[0]]), cameras(), dataset, OPTIONS)
+    assert (figures["free_space_gaussians"], alone["free_space_gaussians"]) == (2, 1)
+    apart = figures["depth_disagreement"]
+    # (1 - 0.45 g)² is below a half within 0.93 σ: π (0.93 · 8)² pixels, a sixteenth of them samples, in three pairs.
+    assert apart["share_above_5_percent"] * apart["pixels"] == pytest.approx(3 * 11, rel=0.4)
+    assert apart["median"] < 1e-4
+    assert alone["depth_disagreement"]["share_above_5_percent"] == 0.0
+
+
+def test_without_sparse_points_the_figures_are_not_known(tmp_path: Path) -> None:
+    tiny_scene.write_model(tmp_path / "sparse/0", cameras(), np.empty((0, 3)), np.empty((0, 3), np.uint8))
+    figures = measure_floaters(wall(), cameras(), tmp_path, OPTIONS)
+    assert figures == {
+        "free_space_opacity": None,
+        "free_space_gaussians": None,
+        "free_space_rendered": None,
+        "depth_disagreement": {"median": None, "share_above_5_percent": None, "pairs": 0, "pixels": 0},
+    }
+
+
+def test_figures_do_not_depend_on_the_size_beyond_half_a_megapixel(dataset: Path) -> None:
+    floater = blob(np.array([[0.0, 0.0, 2.0]]), 0.08, 0.98)
+    model = Gaussians.concat([wall(), floater])
+    large, limit = ([view.scaled(w, h) for view in cameras()] for w, h in ((1152, 864), (816, 612)))
+    assert measure_floaters(model, large, dataset, OPTIONS) == measure_floaters(model, limit, dataset, OPTIONS)
