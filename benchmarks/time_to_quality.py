@@ -112,8 +112,9 @@ def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
         path = Path(folder) / "plan.json"
         path.write_text(plan.to_json(), encoding="utf-8")
         options, _ = as_trained(path, gaussians)
+    model = (gaussians, None if state.sky is None else state.sky.panorama)
     measured = [
-        measure(render_pixels(gaussians, view.camera, options), load_colour(view), load_mask(view))
+        measure(render_pixels(model, view.camera, options), load_colour(view), load_mask(view))
         for view in load_views(dataset)
         if view.camera.name in set(plan.test_views)
     ]

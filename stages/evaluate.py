@@ -21,6 +21,7 @@ from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_views, split_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.scene.panorama import Panorama, laid_over, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.floaters import measure_floaters
 from splatpipe.stages.line import EvaluateConfig
@@ -28,6 +29,7 @@ from splatpipe.stages.line import EvaluateConfig
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
 EQUAL_DB = 100.0  # stands for the infinite PSNR of pictures that are equal: JSON has no infinity
 MASKED_GREY = 128
+Model = tuple[Gaussians, Panorama | None]
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
@@ -41,6 +43,7 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     chosen = [view for view in views if view.camera.name in set(held_out)]
     gaussians = read_splat(inputs["train.model"])
     options, megapixels = as_trained(inputs["train.plan"], gaussians)
+    sky = read_panorama(inputs["train.sky"])
     folder = out / "views"
     folder.mkdir(parents=True, exist_ok=True)
     if not chosen:
@@ -49,11 +52,13 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
             hint="Set evaluate.every or evaluate.views to hold some out.",
         )
     raster.set_threads(inputs.machine.threads)
+    if sky is not None:
+        torch.set_num_threads(1)  # the sky's matrix products may round differently on more
     stems = flat_stems([view.camera.name for view in chosen])
     per_view = []
     for done, (view, stem) in enumerate(zip(chosen, stems, strict=True), start=1):
         reduced = reduced_view(view, megapixels)
-        per_view.append(evaluate_view(reduced, gaussians, options, folder / stem))
+        per_view.append(evaluate_view(reduced, (gaussians, sky), options, folder / stem))
         report.progress(done, len(chosen), "measuring held-out photos", "photos")
     means = mean_measures(per_view)
     cameras = [reduced_camera(view.camera, megapixels) for view in views]
@@ -87,21 +92,26 @@ def as_trained(plan: Path, gaussians: Gaussians) -> tuple[raster.RenderOptions, 
         raise StageError("Training's plan.json cannot be read.", hint="Run again with --rerun-from train.") from error
 
 
-def render_pixels(gaussians: Gaussians, camera: Camera, options: raster.RenderOptions) -> Pixels:
-    """Render a camera's view to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
+def render_pixels(model: Model, camera: Camera, options: raster.RenderOptions) -> Pixels:
+    """Render a camera's view, with the sky if there is one, to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
+    gaussians, sky = model
     with torch.no_grad():
-        colour = raster.render(gaussians, camera, options).colour
+        rendered = raster.render(gaussians, camera, options)
+        colour = rendered.colour
+        if sky is not None:
+            behind = sky.behind(camera, options.background)
+            colour = laid_over(colour, rendered.alpha, options.background, behind)
         return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 
 def evaluate_view(
-    view: tuple[Camera, Pixels, Mask | None], gaussians: Gaussians, options: raster.RenderOptions, stem: Path
+    view: tuple[Camera, Pixels, Mask | None], model: Model, options: raster.RenderOptions, stem: Path
 ) -> dict[str, Any]:
     """Render and measure one view, and keep its pictures.
 
     Args:
         view: The held-out photo at the size of training: camera, photo and mask.
-        gaussians: The model.
+        model: The Gaussians, and the sky behind them.
         options: How it is rendered.
         stem: Path of the pictures without their endings.
 
@@ -109,7 +119,7 @@ def evaluate_view(
         Its name, the pictures' common stem, its size, and a figure a measure.
     """
     camera, photo, mask = view
-    render = render_pixels(gaussians, camera, options)
+    render = render_pixels(model, camera, options)
     _write_png(stem, "photo", photo)
     _write_png(stem, "render", render)
     _write_png(stem, "error", error_picture(render, photo, mask))

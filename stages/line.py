@@ -135,7 +135,7 @@ class TrainConfig(StageConfig):
     opacity_decay: Literal["auto"] | NonNegativeFloat = "auto"
     """Weight of the mean opacity in the loss: what no photo holds fades. Auto: 0.01 for `mcmc`, else 0."""
     scale_decay: Literal["auto"] | NonNegativeFloat = "auto"
-    """Weight of the mean size (three axes, over the extent): what no photo holds shrinks. Auto: 0.01 for `mcmc`, else 0."""
+    """Weight of the mean size (three axes, over the extent): what no photo holds shrinks. Auto: as above."""
     split_extent: PositiveFloat = 0.01
     """Those larger than this share of the scene's extent are split, smaller ones cloned."""
     split_shrink: Annotated[float, Field(ge=1.0, le=10.0)] = 1.6
@@ -177,6 +177,11 @@ class TrainConfig(StageConfig):
     """No axis of a Gaussian is longer than this many times its middle one (at least 1): no needles. 0: no limit."""
     dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian: 0.2)."""
+    sky: Literal["off", "model"] = "off"
+    """`model`: the sky, found in the photos, has a colour by direction of its own and no Gaussians; the deliverable
+    leaves it out. Where no photo shows any it stays off."""
+    sky_opacity_weight: NonNegativeFloat = 0.1
+    """Weight of the mean opacity before the sky in the loss."""
 
 
 class EvaluateConfig(StageConfig):
@@ -271,6 +276,7 @@ TRAIN = Stage(
         "history": "history.json",
         "plan": "plan.json",
         "exposures": "exposures.json",
+        "sky": "sky.npz",
     },
     entry="splatpipe.stages.train:run",
     borrows=("evaluate.every", "evaluate.views"),
@@ -278,9 +284,9 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=3,
+    version=4,
     config=EvaluateConfig,
-    reads=("train.model", "train.plan", "undistort.dataset"),
+    reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
     parts={"metrics": "metrics.json", "views": "views"},
     entry="splatpipe.stages.evaluate:run",
 )

@@ -126,6 +126,7 @@ def test_time_to_quality_trains_and_measures_what_the_line_does(dataset: Path, t
 
     parts = {"undistort.dataset": dataset, "initialize.splat": tmp_path / "init.ply"}
     parts |= {"train.model": tmp_path / "model.ply", "train.plan": tmp_path / "plan.json"}
+    parts["train.sky"] = tmp_path / "sky.npz"
     settings = {"evaluate.every": 0, "evaluate.views": held_out}
     inputs = Inputs(parts, tmp_path, settings, Machine("cpu", 1))
     recorder = tiny_scene.Recorder()

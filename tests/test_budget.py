@@ -300,7 +300,8 @@ def test_photos_are_trained_on_and_measured_at_the_planned_size(
     trained(scene, out, plan, monkeypatch)
     widths = {point["width"] for point in json.loads((out / "history.json").read_text())["curve"]}
     assert len(widths) == 1 and widths.pop() < tiny_scene.WIDTH
-    parts = {"train.model": out / "model.ply", "train.plan": out / "plan.json", "undistort.dataset": scene / "dataset"}
+    parts = {"train.model": out / "model.ply", "train.plan": out / "plan.json", "train.sky": out / "sky.npz"}
+    parts["undistort.dataset"] = scene / "dataset"
     evaluate.run(EvaluateConfig(every=4), Inputs(parts, scene), out, tiny_scene.Recorder())
     for view in json.loads((out / "metrics.json").read_text())["per_view"]:
         assert view["width"] * view["height"] <= 2000 and view["psnr"] > 10.0

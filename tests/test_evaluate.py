@@ -14,6 +14,7 @@ import torch
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import write_splat
 from splatpipe.stages import evaluate
 from splatpipe.stages.line import EvaluateConfig, TrainConfig
@@ -35,7 +36,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     write_splat(folder / "model.ply", model)
     plan = make_plan(TrainConfig(), load_views(dataset), 4, "", len(model))
     (folder / "plan.json").write_text(plan.to_json())
-    parts = {"model": folder / "model.ply", "plan": folder / "plan.json"}
+    write_panorama(folder / "sky.npz", None)
+    parts = {"model": folder / "model.ply", "plan": folder / "plan.json", "sky": folder / "sky.npz"}
     parts = {f"train.{name}": path for name, path in parts.items()} | {"undistort.dataset": dataset}
     return Inputs(parts, folder)
 

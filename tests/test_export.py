@@ -17,6 +17,7 @@ from splatpipe.pipeline.scene import metrics
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_points, load_views
 from splatpipe.pipeline.scene.frames import load_frame
+from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import read_splat, write_splat
 from splatpipe.stages import evaluate, export
 from splatpipe.stages.line import EvaluateConfig, ExportConfig, TrainConfig
@@ -84,10 +85,12 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     parts = {
         "train.model": folder / "model.ply",
         "train.plan": folder / "plan.json",
+        "train.sky": folder / "sky.npz",
         "undistort.dataset": dataset,
         "georef.model": dataset / "sparse/0",
         "georef.frame": write_frame(folder / "frame.json"),
     }
+    write_panorama(folder / "sky.npz", None)
     evaluate.run(EvaluateConfig(every=4), Inputs(parts, folder), folder, tiny_scene.Recorder())
     train = {"train_seconds": 12.5, "peak_memory_bytes": 10**9, "device": "cpu"}
     parts |= {"evaluate.metrics": folder / "metrics.json"}

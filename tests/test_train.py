@@ -30,8 +30,16 @@ from splatpipe.stages.train.stream import TrainingPhoto
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-PARTS = ["exposures.json", "history.json", "model.ply", "plan.json"]
-TECHNIQUES: dict[str, object] = {"exposure": "affine"}  # of which each has a state of its own
+PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "sky.npz"]
+TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
+    "exposure": "affine",
+    "filter_3d": True,
+    "antialias": True,
+    "depth_weight": 0.1,
+    "sh_limit": True,
+    "dropout": 0.2,
+    "max_anisotropy": 5.0,
+}
 QUICK = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15)
 
 

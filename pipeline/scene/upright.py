@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ TOP_OF_ORIENTATION = {
     7: (1.0, 0.0),
     8: (1.0, 0.0),
 }
+UPRIGHT_AND_TURNED = (1, 6)  # EXIF orientations that stand for the two ways of holding a camera
 ALIKE = 0.9  # length of the mean of unit vectors within some 25°
 STEADY = 0.997  # within some 4°: a gimbal, which points down better than the ground is level
 SCATTERED = 0.5  # of vectors that rather cancel
@@ -105,6 +107,37 @@ def up_from_cameras(
     if alike_up > SCATTERED:
         return Upright(_unit(mean_up), "the upper edges of the pictures")
     return Upright(_unit(mean_up - mean_forward), "the pictures' upper edges and viewing directions")
+
+
+def up_without_orientation(
+    cam_from_world: Float64[np.ndarray, "n 3 3"],
+    centres: Float64[np.ndarray, "n 3"],
+    points: Float64[np.ndarray, "m 3"],
+    brighter: Callable[[], Float64[np.ndarray, "n 2"]],
+) -> Upright:
+    """Up for photos whose EXIF orientation is not known: held upright, or all turned by a quarter in the stored grid.
+
+    The way of holding them is the one that lays the horizontal axes better into a plane. Of the two quarter turns it is
+    the one whose pictures are brighter at their top. Where neither makes a plane, they count as upright.
+
+    Args:
+        cam_from_world: Rotations of the stored grids.
+        centres: The cameras' positions in the model.
+        points: The sparse cloud.
+        brighter: Gives the way in which each picture gets brighter, right and down in its stored grid, of any length;
+            asked for only where the photos are turned.
+    """
+    upright, turned = (
+        camera_axes(cam_from_world, np.full(len(cam_from_world), orientation)) for orientation in UPRIGHT_AND_TURNED
+    )
+    (_, thickness, width), (normal, other_thickness, other_width) = (
+        _plane_normal(axes.right) for axes in (upright, turned)
+    )
+    is_plane = other_width > LEAST_WIDTH and other_thickness < MOST_THICKNESS * other_width
+    if not is_plane or (width > LEAST_WIDTH and thickness * other_width <= other_thickness * width):
+        return up_from_cameras(upright, centres, points)
+    light = np.einsum("nij,ni->nj", cam_from_world[:, :2], brighter()).sum(axis=0)
+    return Upright((float(np.sign(light @ normal)) or 1.0) * normal, "the vertical edges of pictures that are turned")
 
 
 def enu_from_gimbal(

@@ -16,7 +16,8 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
-from splatpipe.pipeline.scene.dataset import View, load_views
+from splatpipe.pipeline.scene.dataset import View, load_views, split_views
+from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
@@ -69,11 +70,13 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         return under_budgets(free, scene, train_step, report)
 
     with same_bits(inputs.machine.threads):
+        trained_on, _ = split_views([view.camera.name for view in views], every, names)
+        sky = begin_sky(config, [view for view in views if view.camera.name in set(trained_on)], inputs, report)
         plan = load_or_write_plan(out / "plan.json", make)
         if budgeted(plan):
             report.note(plan.described())
         levels = coarse_levels(plan.options, plan.last_iteration)
-        state = resume(out / CHECKPOINT, plan, report) or TrainState.begin(start, plan)
+        state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
         state.sampling = sampling_of(plan, views_of(plan, views))
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
@@ -81,6 +84,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             optimise(state, plan, photos, out / CHECKPOINT, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
+    write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
     return {
@@ -93,7 +97,16 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         "peak_memory_bytes": peak_memory_bytes(),
         "device": "cpu",
         "instruction_set": raster.isa_name(),
-    }
+    } | ({} if config.sky == "off" else {"sky_photos": 0 if sky is None else sky.photos})
+
+
+def begin_sky(config: TrainConfig, views: Sequence[View], inputs: Inputs, report: Reporter) -> SkyModel | None:
+    """The sky to be trained; None where it is off or none of the photos shows any, which is told."""
+    if config.sky == "off":
+        return None
+    sky = SkyModel.begin(views, inputs["undistort.dataset"], inputs.machine.threads)
+    report.note("no photo shows the sky, so there is no model of it" if sky is None else f"sky in {sky.photos} photos")
+    return sky
 
 
 def views_of(plan: Plan, views: Sequence[View]) -> list[View]:
@@ -134,11 +147,11 @@ def same_bits(threads: int) -> Iterator[None]:
         cv2.setNumThreads(before_cv2)
 
 
-def resume(path: Path, plan: Plan, report: Reporter) -> TrainState | None:
+def resume(path: Path, plan: Plan, report: Reporter, sky: SkyModel | None) -> TrainState | None:
     """The state that a killed run left, or None; a broken one is told and ignored."""
     try:
         checkpoint = load_checkpoint(path, plan.digest())
-        state = TrainState.restore(checkpoint, plan)
+        state = TrainState.restore(checkpoint, plan, sky)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:

@@ -215,7 +215,7 @@ class TrainState:
         return model
 
     def _parts(self) -> dict[str, Stateful]:
-        """What has tensors of its own beside the Gaussians and their moments, by the name that a checkpoint gives it."""
+        """What has tensors of its own beside the Gaussians and their moments, by its name in a checkpoint."""
         parts: dict[str, Stateful | None] = {
             "density": self.density,
             "exposure": self.exposure,

@@ -1,0 +1,200 @@
+"""The sky in training: a panorama of its own behind the Gaussians, and no Gaussians where photos show it.
+
+A colour by direction alone behind the scene, and a loss on the opacity of rays into the sky, are those of Rematas et
+al., "Urban Radiance Fields", CVPR 2022; beside Gaussians, as an explicit map of directions, of Yan et al., "Street
+Gaussians", ECCV 2024. Here the sky is found without a network (``pipeline.scene.sky``), the map has cells of some
+degrees and starts at what the photos show, and only pixels known to be sky train it: a wall that the Gaussians do not
+cover yet is not painted into the sky.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64, Shaped
+from torch import Tensor
+
+from splatpipe.pipeline.raster import Render
+from splatpipe.pipeline.raster.optim import Adam
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import View, load_points
+from splatpipe.pipeline.scene.images import reduced_view
+from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over, panorama_of
+from splatpipe.pipeline.scene.sky import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
+
+LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
+MOST_ERROR_PX = 2.0
+SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
+SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills what no photo shows
+FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # of the colours, a step, from the start to the end of the schedule
+EPSILON = 1e-8  # Adam's: cells that hardly any pixel pulls at stay where they are
+FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: what is unseen above the horizon is smooth by then
+LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour is the mean of
+
+_COLOURS = "colours"
+_ADAM = "adam."
+
+
+class SkyModel:
+    """The panorama that is trained, and the sky's masks.
+
+    Attributes:
+        panorama: Its colours are a leaf of autograd.
+        photos: In how many photos there is sky.
+    """
+
+    def __init__(
+        self, up: Float64[np.ndarray, " 3"], colours: Float32[np.ndarray, "cells 3"], masks: Mapping[str, SkyMask]
+    ) -> None:
+        """Begin with some colours.
+
+        Args:
+            up: Against gravity.
+            colours: Of the panorama's cells.
+            masks: By the photos' names; those without sky may be left out.
+        """
+        self.panorama = Panorama(up, torch.from_numpy(colours.copy()).requires_grad_())
+        self._masks = {name: mask for name, mask in masks.items() if mask.any()}
+        self._adam = Adam({_COLOURS: self.panorama.colours}, epsilon=EPSILON)
+
+    @property
+    def photos(self) -> int:
+        """In how many photos there is sky."""
+        return len(self._masks)
+
+    @staticmethod
+    def begin(views: Sequence[View], dataset: Path, threads: int) -> SkyModel | None:
+        """Find the sky in photos and start with the colours that it has there; None where none of them shows any.
+
+        Args:
+            views: To be trained on.
+            dataset: That they are of, for its sparse points.
+            threads: That read photos.
+
+        Raises:
+            StageError: if a photo is missing or broken.
+        """
+        points = load_points(dataset)
+        believed = points.xyz[(points.track_lengths >= LEAST_TRACK) & (points.errors_px <= MOST_ERROR_PX)]
+        cameras = [view.camera for view in views]
+
+        def photo(index: int) -> SkyPhoto:
+            camera, pixels, mask = reduced_view(views[index], WORK_MEGAPIXELS)
+            return SkyPhoto(camera, pixels, None if mask is None else ~mask)
+
+        up = up_of(cameras, photo, believed, threads)
+        masks = find_skies(cameras, photo, believed, up, threads)
+        shown = [index for index, mask in enumerate(masks) if mask.any()]
+        if not shown:
+            return None
+        colours = first_colours(((photo(index), masks[index].unpacked()) for index in shown), up)
+        return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
+
+    def composite(
+        self, rendered: Render, camera: Camera, background: tuple[float, float, float]
+    ) -> Float[Tensor, "h w 3"]:
+        """The render with the sky behind it; what is no sky in the camera's photo does not train the sky.
+
+        Args:
+            rendered: Over ``background``.
+            camera: A training photo's.
+            background: Stays behind everything below the horizon.
+        """
+        behind = self.panorama.behind(camera, background)
+        mask = self.mask(camera)
+        behind = behind.detach() if mask is None else torch.where(mask[:, :, None], behind, behind.detach())
+        return laid_over(rendered.colour, rendered.alpha, background, behind)
+
+    def penalty(self, alpha: Float[Tensor, "h w"], camera: Camera, opacity_weight: float) -> Float[Tensor, ""]:
+        """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness."""
+        loss = SMOOTHNESS * roughness(self.panorama.colours)
+        mask = self.mask(camera)
+        return loss if mask is None else loss + opacity_weight * torch.where(mask, alpha, 0.0).mean()
+
+    def mask(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
+        """Where a photo surely shows the sky, at the size of ``camera``; None where it shows none."""
+        found = self._masks.get(camera.name)
+        if found is None:
+            return None
+        share = found.unpacked().astype(np.float32)
+        if share.shape != (camera.height, camera.width):
+            shrinks = camera.height < share.shape[0]
+            way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+            share = np.asarray(cv2.resize(share, (camera.width, camera.height), interpolation=way), np.float32)
+        return torch.from_numpy(share > SURE)
+
+    def step(self, share: float) -> None:
+        """Step the colours against their gradient, which is dropped.
+
+        Args:
+            share: Of the schedule that is done, 0..1.
+        """
+        colours = self.panorama.colours
+        rate = math.exp(math.log(FIRST_RATE) * (1.0 - share) + math.log(LAST_RATE) * share)
+        self._adam.step({_COLOURS: colours}, {_COLOURS: rate})
+        colours.grad = None
+        colours.detach().clamp_(0.0, 1.0)
+
+    def to_arrays(self) -> dict[str, Tensor]:
+        """What changes in training, for a checkpoint; not copied."""
+        moments = {_ADAM + name: tensor for name, tensor in self._adam.state_dict().items()}
+        return {_COLOURS: self.panorama.colours.detach(), **moments}
+
+    def load(self, arrays: Mapping[str, Tensor]) -> None:
+        """The inverse of ``to_arrays``.
+
+        Raises:
+            KeyError, ValueError: if the arrays are not a sky's; it is as it was, then.
+        """
+        colours = panorama_of(self.panorama.up, arrays[_COLOURS].numpy()).colours
+        self._adam.load_state_dict({name.removeprefix(_ADAM): tensor for name, tensor in arrays.items()})
+        self.panorama.colours = colours.clone().requires_grad_()
+
+
+def roughness(colours: Float[Tensor, "cells 3"]) -> Float[Tensor, ""]:
+    """Mean squared difference between neighbouring cells, all around and up and down."""
+    grid = colours.reshape(ROWS, COLUMNS, 3)
+    along, up = grid - grid.roll(1, dims=1), grid[1:] - grid[:-1]
+    return 0.5 * (along.square().mean() + up.square().mean())
+
+
+def first_colours(
+    skies: Iterable[tuple[SkyPhoto, Bool[np.ndarray, "h w"]]], up: Float64[np.ndarray, " 3"]
+) -> Float32[np.ndarray, "cells 3"]:
+    """Each cell's mean colour over the photos' skies; the others' filled smoothly from their neighbours.
+
+    Args:
+        skies: Photos and their masks; what the user's masks leave out has no colour.
+        up: The panorama's pole.
+    """
+    total = np.zeros((ROWS * COLUMNS, 4))
+    for photo, mask in skies:
+        shown = mask if photo.ignored is None else mask & ~photo.ignored
+        cells, weights = cells_of(directions(photo.camera)[shown], up)
+        colour = photo.pixels[shown] / 255.0
+        for channel in range(3):
+            total[:, channel] += _sums(cells, weights * colour[:, channel, None])
+        total[:, 3] += _sums(cells, weights)
+    return filled(total)
+
+
+def filled(total: Float64[np.ndarray, "cells 4"]) -> Float32[np.ndarray, "cells 3"]:
+    """Colours from sums of colour and weight; cells of little weight become the mean of their neighbours."""
+    known = (total[:, 3] >= LEAST_EVIDENCE).reshape(ROWS, COLUMNS, 1)
+    whole = total[:, :3].sum(axis=0) / max(total[:, 3].sum(), 1e-12)
+    mean = (total[:, :3] / np.maximum(total[:, 3:], 1e-12)).reshape(ROWS, COLUMNS, 3)
+    grid = np.where(known, mean, whole)
+    for _ in range(FILL_ROUNDS):
+        padded = np.pad(grid, ((1, 1), (0, 0), (0, 0)), mode="edge")
+        around = padded[:-2] + padded[2:] + np.roll(grid, 1, axis=1) + np.roll(grid, -1, axis=1)
+        grid = np.where(known, grid, 0.25 * around)
+    return np.asarray(grid.reshape(-1, 3).astype(np.float32))
+
+
+def _sums(cells: Int64[np.ndarray, "n 4"], values: Shaped[np.ndarray, "n 4"]) -> Float64[np.ndarray, " cells"]:
+    return np.bincount(cells.ravel(), values.ravel(), minlength=ROWS * COLUMNS)
