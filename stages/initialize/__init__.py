@@ -54,7 +54,7 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     xyz, rgb = points.xyz[chosen], points.rgb[chosen]
     summary = {}
     if config.dense == "sweep":
-        more = _sweep(views, config, inputs, report)
+        more = _sweep(views, config, inputs, out, report)
         xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
         summary = {"points": int(chosen.size), "dense_points": len(more)}
     sizes = point_sizes(xyz, centres, config.max_angle, report)
@@ -62,12 +62,13 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
 
 
-def _sweep(views: list[View], config: InitializeConfig, inputs: Inputs, report: Reporter) -> DensePoints:
+def _sweep(views: list[View], config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> DensePoints:
     """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
     names = [view.camera.name for view in views]
     kept, _ = split_views(names, inputs.settings["evaluate.every"], inputs.settings["evaluate.views"])
     used = [view for view in views if view.camera.name in set(kept)]
-    return dense_points(inputs["undistort.dataset"], used, config.dense_points, inputs.machine.threads, report)
+    dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
+    return dense_points(dataset, used, config.dense_points, out, threads, report)
 
 
 def choose_points(points: Points, usable: npt.NDArray[np.int64], limit: int) -> npt.NDArray[np.int64]:

@@ -17,8 +17,8 @@ from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.images import reduced_camera, reduced_view
 from splatpipe.pipeline.scene.parallel import ordered_map
-from splatpipe.stages.initialize.neighbours import Tracks, inverse_depths, load_tracks, neighbours
 from splatpipe.stages.initialize.likeness import Picture
+from splatpipe.stages.initialize.neighbours import Tracks, inverse_depths, load_tracks, neighbours
 from splatpipe.stages.initialize.sweep import Depths, sweep
 
 MEGAPIXELS = 0.1  # of a photo in the sweep; its planes see it at half the size
@@ -26,7 +26,7 @@ SWEPT = 4  # neighbours a photo is compared with
 ASKED = 8  # neighbours whose depths have to agree
 AGREEING = 2  # so many at least
 TOLERANCE = 0.01  # of the depth, within which two photos agree
-CELLS = 64  # of a photo's width; one with a sparse point in it gets no other
+CELLS = 128  # of a photo's width; one with a sparse point in it gets no other
 GROWTH = 2.0 ** (1.0 / 3.0)  # of the voxels, until the points are few enough
 
 
@@ -73,13 +73,16 @@ class _Capture:
     folder: Path
 
 
-def dense_points(dataset: Path, views: Sequence[View], most: int, threads: int, report: Reporter) -> DensePoints:
+def dense_points(
+    dataset: Path, views: Sequence[View], most: int, folder: Path, threads: int, report: Reporter
+) -> DensePoints:
     """Points on surfaces where the sparse model has few; the same for any number of threads.
 
     Args:
         dataset: The folder that `undistort` left.
         views: Photos to use, in name order; none that are held out.
         most: At most so many points, spread evenly.
+        folder: Where there is room for a megabyte a photo meanwhile.
         threads: Photos at a time.
         report: Told of progress.
 
@@ -92,8 +95,8 @@ def dense_points(dataset: Path, views: Sequence[View], most: int, threads: int, 
     threads_before = cv2.getNumThreads()
     cv2.setNumThreads(1)  # photos are the unit of parallel work
     try:
-        with tempfile.TemporaryDirectory(prefix="sweep-") as folder:
-            capture = _Capture(views, cameras, tracks, near, Path(folder))
+        with tempfile.TemporaryDirectory(prefix="sweep-", dir=folder) as kept:
+            capture = _Capture(views, cameras, tracks, near, Path(kept))
             numbers = range(len(views))
             for done, _ in enumerate(ordered_map(partial(_keep_depths, capture), numbers, threads), start=1):
                 report.progress(done, len(views), "sweeping planes", "photos")
@@ -224,7 +227,6 @@ def _one_each(
     points: Float64[np.ndarray, "n 3"], sparse: Float64[np.ndarray, "m 3"], size: float
 ) -> Int64[np.ndarray, " k"]:
     """Rows of the first point in each voxel that has none of ``sparse`` in it."""
-    origin = np.median(points, axis=0)
-    voxels = np.floor((np.concatenate([sparse, points]) - origin) / size)
+    voxels = np.floor(np.concatenate([sparse, points]) / size)
     _, first = np.unique(voxels, axis=0, return_index=True)
     return np.asarray(np.sort(first[first >= len(sparse)]) - len(sparse), np.int64)

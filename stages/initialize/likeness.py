@@ -12,7 +12,8 @@ from splatpipe.pipeline.scene.camera import Camera
 
 WINDOW = 7  # pixels a side
 NOISE = 1.5 / 255.0  # of a photo's grey values: contrast below it is not taken for likeness
-TEXTURE = 3.0 / 255.0  # standard deviation in a window below which a pixel has no depth
+TEXTURE = 3.0 / 255.0  # standard deviation in a window below which a pixel has no depth...
+AT_HAND = 3  # ...nor where contrast is all further off than in a window of this side: sky beside a roof, say
 CENTRE_PX = 0.5  # of the first pixel; OpenCV's is at 0
 
 
@@ -46,7 +47,8 @@ class Likeness:
         self._grey = photo.grey
         self._mean = _mean(photo.grey)
         variance = _mean(np.square(photo.grey)) - np.square(self._mean)
-        self.textured = (variance > TEXTURE**2) & _whole(photo.counts)
+        at_hand = _mean(np.square(photo.grey), AT_HAND) - np.square(_mean(photo.grey, AT_HAND))
+        self.textured = (variance > TEXTURE**2) & (at_hand > NOISE**2) & _whole(photo.counts)
         self._deviation = np.sqrt(np.maximum(variance, 0.0) + np.float32(NOISE**2))
 
     def by_plane(self, other: Picture, inverse_depth: float) -> Float32[np.ndarray, "h w"] | None:
@@ -122,8 +124,8 @@ def corners(camera: Camera) -> Float64[np.ndarray, "3 4"]:
     return np.array([[0.0, w, 0.0, w], [0.0, 0.0, h, h], [1.0, 1.0, 1.0, 1.0]])
 
 
-def _mean(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    return np.asarray(cv2.blur(values, (WINDOW, WINDOW)))
+def _mean(values: Float32[np.ndarray, "h w"], window: int = WINDOW) -> Float32[np.ndarray, "h w"]:
+    return np.asarray(cv2.blur(values, (window, window)))
 
 
 def _whole(counts: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_model
 
-BEST_ANGLE_DEG = 10.0  # between two rays: at a tenth of a megapixel, less of it is imprecise and more of it looks unlike
+BEST_ANGLE_DEG = 10.0  # between two rays: less of it is imprecise, with more of it a place looks unlike
 NARROW_DEG = 4.0  # spread of the weight below the best angle
 WIDE_DEG = 10.0  # and above
 LEAST_SHARED = 8  # points; two photos with fewer overlap by chance or by an edge
@@ -31,7 +31,7 @@ class Tracks:
     """
 
     xyz: Float64[np.ndarray, "n 3"]
-    seen: tuple[Int64[np.ndarray, " k"], ...]
+    seen: tuple[Int64[np.ndarray, "_"], ...]
 
 
 def load_tracks(dataset: Path, names: Sequence[str]) -> Tracks:

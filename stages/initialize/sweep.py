@@ -77,9 +77,7 @@ def plane_depths(
     return np.linspace(*inverse_range, min(max(math.ceil(longest / STEP_PX), PLANES[0]), PLANES[1]))
 
 
-def _best_two(
-    photo: Picture, likenesses: Iterable[Float32[np.ndarray, "h w"] | None]
-) -> Float32[np.ndarray, "h w"]:
+def _best_two(photo: Picture, likenesses: Iterable[Float32[np.ndarray, "h w"] | None]) -> Float32[np.ndarray, "h w"]:
     """Mean of the two highest; one neighbour alone is worth half."""
     first, second = np.zeros((2, *photo.grey.shape), np.float32)
     for alike in likenesses:
@@ -125,7 +123,7 @@ def _smoothed(inverse: Float32[np.ndarray, "h w"], step: float) -> Float32[np.nd
     return np.where((inverse > 0.0) & (count >= SUPPORT), total / np.maximum(count, 1.0), 0.0).astype(np.float32)
 
 
-def _doubled(inverse: Float32[np.ndarray, "h w"], photo: Picture) -> Float32[np.ndarray, "h w"]:
+def _doubled(inverse: Float32[np.ndarray, "h w"], photo: Picture) -> Float32[np.ndarray, "full_h full_w"]:
     """The same at the photo's size."""
     size = (photo.camera.width, photo.camera.height)
     total = cv2.resize(inverse, size, interpolation=cv2.INTER_LINEAR)
@@ -133,9 +131,7 @@ def _doubled(inverse: Float32[np.ndarray, "h w"], photo: Picture) -> Float32[np.
     return np.where(weight > 0.5, total / np.maximum(weight, 0.5), 0.0).astype(np.float32)
 
 
-def _refined(
-    photo: Picture, others: Sequence[Picture], start: Float32[np.ndarray, "h w"], step: float
-) -> Depths:
+def _refined(photo: Picture, others: Sequence[Picture], start: Float32[np.ndarray, "h w"], step: float) -> Depths:
     """Depths of the best offsets from a start (0 where there is none), where they are good."""
     likeness = Likeness(photo)
     turned = [likeness.turned(other) for other in others]
@@ -144,10 +140,7 @@ def _refined(
         [
             _best_two(
                 photo,
-                (
-                    likeness.by_surface(other, start + offset, rays)
-                    for other, rays in zip(others, turned, strict=True)
-                ),
+                (likeness.by_surface(other, start + offset, rays) for other, rays in zip(others, turned, strict=True)),
             )
             for offset in offsets
         ]
