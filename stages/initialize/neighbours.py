@@ -31,7 +31,7 @@ class Tracks:
     """
 
     xyz: Float64[np.ndarray, "n 3"]
-    seen: tuple[Int64[np.ndarray, "_"], ...]
+    seen: tuple[Int64[np.ndarray, " _"], ...]
 
 
 def load_tracks(dataset: Path, names: Sequence[str]) -> Tracks:
@@ -47,7 +47,7 @@ def load_tracks(dataset: Path, names: Sequence[str]) -> Tracks:
     model = load_model(dataset)
     numbers = sorted(model.points3D)
     xyz = np.array([model.points3D[number].xyz for number in numbers], np.float64).reshape(-1, 3)
-    finite = np.isfinite(xyz).all(axis=1)
+    finite = np.asarray(np.isfinite(xyz).all(axis=1))
     row_of = {number: row for row, number in enumerate(numbers) if finite[row]}
     images = {image.name: image for image in model.images.values()}
     seen = []
