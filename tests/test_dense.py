@@ -250,3 +250,10 @@ def test_the_surest_point_of_a_voxel_without_a_sparse_one_stays() -> None:
     points = DensePoints(xyz, np.zeros((4, 3), np.uint8), np.array([1.0, 2.0, 1.0, 3.0]), np.full(4, 1.0))
     kept = thinned(points, np.array([[5.2, 0.1, 0.1]]), 10)
     np.testing.assert_array_equal(kept.xyz, xyz[[1, 3]])
+
+
+def test_a_cap_of_one_leaves_one_point_on_all_sides_of_the_origin() -> None:
+    xyz = np.random.default_rng(6).normal(size=(100, 3))
+    points = DensePoints(xyz, np.zeros((100, 3), np.uint8), np.arange(100.0), np.full(100, 0.1))
+    kept = thinned(points, np.zeros((0, 3)), 1)
+    np.testing.assert_array_equal(kept.xyz, xyz[99:])

@@ -100,9 +100,10 @@ def dense_points(
             numbers = range(len(views))
             for done, _ in enumerate(ordered_map(partial(_keep_depths, capture), numbers, threads), start=1):
                 report.progress(done, len(views), "sweeping planes", "photos")
-            found = [
-                points for points in ordered_map(partial(_agreed, capture), numbers, threads) if points is not None
-            ]
+            found = []
+            for done, points in enumerate(ordered_map(partial(_agreed, capture), numbers, threads), start=1):
+                found += [points] if points is not None else []
+                report.progress(done, len(views), "comparing depths", "photos")
     finally:
         cv2.setNumThreads(threads_before)
     return thinned(_joined(found), tracks.xyz, most)
@@ -227,6 +228,7 @@ def _one_each(
     points: Float64[np.ndarray, "n 3"], sparse: Float64[np.ndarray, "m 3"], size: float
 ) -> Int64[np.ndarray, " k"]:
     """Rows of the first point in each voxel that has none of ``sparse`` in it."""
-    voxels = np.floor(np.concatenate([sparse, points]) / size)
+    origin = points.min(axis=0)  # so that they share one voxel in the end
+    voxels = np.floor((np.concatenate([sparse, points]) - origin) / size)
     _, first = np.unique(voxels, axis=0, return_index=True)
     return np.asarray(np.sort(first[first >= len(sparse)]) - len(sparse), np.int64)

@@ -18,6 +18,7 @@ WIDE_DEG = 10.0  # and above
 LEAST_SHARED = 8  # points; two photos with fewer overlap by chance or by an edge
 LEAST_POINTS = 20  # a photo with fewer has no range of depths to trust
 PERCENTILES = (1.0, 99.0)  # of the depths: the few wrong points lie outside
+DEEPEST = 1000.0  # the far end over the near one at most, whatever the points say
 WIDER = 1.25  # the range of depths is taken that much wider at both ends: thin places have no points yet
 
 
@@ -110,5 +111,5 @@ def inverse_depths(tracks: Tracks, view: int, camera: Camera) -> tuple[float, fl
     depths = depths[depths > 0.0]
     if depths.size < LEAST_POINTS:
         return None
-    near, far = np.percentile(depths, PERCENTILES)
-    return 1.0 / (float(far) * WIDER), WIDER / float(near)
+    near, far = (float(depth) for depth in np.percentile(depths, PERCENTILES))
+    return 1.0 / (far * WIDER), WIDER / max(near, far / DEEPEST)
