@@ -78,7 +78,7 @@ class InitializeConfig(StageConfig):
     dense: Literal["off", "sweep"] = "off"
     """`sweep` adds points where the sparse ones are thin, by a plane sweep between neighbouring photos."""
     dense_points: PositiveInt = 50_000
-    """At most this many are added, evenly spread."""
+    """At most this many are added, evenly spread. Stay well below `train.max_gaussians`: a full start cannot grow."""
 
 
 class TrainConfig(StageConfig):
