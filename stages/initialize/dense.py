@@ -26,7 +26,7 @@ SWEPT = 4  # neighbours a photo is compared with
 ASKED = 8  # neighbours whose depths have to agree
 AGREEING = 2  # so many at least
 TOLERANCE = 0.01  # of the depth, within which two photos agree
-CELLS = 128  # of a photo's width; one with a sparse point in it gets no other
+CELLS = 64  # of a photo's width; one with a sparse point in it gets no other
 GROWTH = 2.0 ** (1.0 / 3.0)  # of the voxels, until the points are few enough
 
 
