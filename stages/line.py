@@ -75,6 +75,10 @@ class InitializeConfig(StageConfig):
     """Opacity at the start."""
     max_angle: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
     """Cap on a Gaussian's size for outliers, as a share of its distance to the nearest camera."""
+    dense: Literal["off", "sweep"] = "off"
+    """`sweep` adds points where the sparse ones are thin, by a plane sweep between neighbouring photos."""
+    dense_points: PositiveInt = 50_000
+    """At most this many are added, evenly spread. Stay well below `train.max_gaussians`: a full start cannot grow."""
 
 
 class TrainConfig(StageConfig):
@@ -265,6 +269,7 @@ INITIALIZE = Stage(
     reads=("undistort.dataset",),
     parts={"splat": "init.ply"},
     entry="splatpipe.stages.initialize:run",
+    borrows=("evaluate.every", "evaluate.views"),
 )
 TRAIN = Stage(
     "train",

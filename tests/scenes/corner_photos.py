@@ -70,11 +70,11 @@ def poses(count: int) -> list[np.ndarray]:
     return found
 
 
-def render(pose: np.ndarray, seed: int) -> np.ndarray:
-    """The (h, w, 3) photo that the true camera takes of the planes x = 0, y = 0 and z = 0."""
+def render(pose: np.ndarray, seed: int, lens: pycolmap.Camera | None = None) -> np.ndarray:
+    """The (h, w, 3) photo that the true camera (or another lens) takes of the planes x = 0, y = 0 and z = 0."""
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = np.ones((WIDTH * HEIGHT, 3))
-    rays[:, :2] = camera().cam_from_img(np.column_stack([x.ravel(), y.ravel()]))
+    rays[:, :2] = (lens or camera()).cam_from_img(np.column_stack([x.ravel(), y.ravel()]))
     rays = rays @ pose[:3, :3]
     centre = -pose[:3, :3].T @ pose[:3, 3]
     image = np.full((HEIGHT * WIDTH, 3), 128, np.float32)

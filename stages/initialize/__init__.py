@@ -11,10 +11,11 @@ import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.dataset import Points, load_points, load_views
+from splatpipe.pipeline.scene.dataset import Points, View, load_points, load_views, split_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import write_splat
 from splatpipe.pipeline.scene.sh import rgb_to_dc
+from splatpipe.stages.initialize.dense import DensePoints, dense_points
 from splatpipe.stages.line import InitializeConfig
 
 Doubles = npt.NDArray[np.float64]
@@ -48,11 +49,26 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
         report.warning(
             f"{usable.size - chosen.size} of {usable.size} sparse points are left out (initialize.max_gaussians)."
         )
-    centres = np.array([view.camera.centre() for view in load_views(inputs["undistort.dataset"])])
-    xyz = points.xyz[chosen]
+    views = load_views(inputs["undistort.dataset"])
+    centres = np.array([view.camera.centre() for view in views])
+    xyz, rgb = points.xyz[chosen], points.rgb[chosen]
+    summary = {}
+    if config.dense == "sweep":
+        more = _sweep(views, config, inputs, out, report)
+        xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
+        summary = {"points": int(chosen.size), "dense_points": len(more)}
     sizes = point_sizes(xyz, centres, config.max_angle, report)
-    write_splat(out / "init.ply", make_gaussians(xyz, points.rgb[chosen], sizes, config.opacity))
-    return {"gaussians": int(chosen.size), "median_size": float(np.median(sizes))}
+    write_splat(out / "init.ply", make_gaussians(xyz, rgb, sizes, config.opacity))
+    return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
+
+
+def _sweep(views: list[View], config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> DensePoints:
+    """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
+    names = [view.camera.name for view in views]
+    kept, _ = split_views(names, inputs.settings["evaluate.every"], inputs.settings["evaluate.views"])
+    used = [view for view in views if view.camera.name in set(kept)]
+    dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
+    return dense_points(dataset, used, config.dense_points, out, threads, report)
 
 
 def choose_points(points: Points, usable: npt.NDArray[np.int64], limit: int) -> npt.NDArray[np.int64]:
