@@ -14,7 +14,6 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.sh import rgb_to_dc
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.density import BLIND, Density, DensityStep, Look, Seen, make_density
-from splatpipe.stages.train.density.decay import add_decay
 from splatpipe.stages.train.density.error import error_share, photo_error
 from splatpipe.stages.train.density.mcmc import composite_integral, disturb, draw_parents, shared
 from splatpipe.stages.train.density.strategy import ScoredDensity
@@ -254,15 +253,3 @@ def test_noise_depends_on_the_iteration_and_the_row_alone() -> None:
     disturb(many, 1e-6, 0, 7)
     disturb(later, 1e-6, 0, 8)
     assert torch.equal(few.means, many.means[:5]) and not torch.equal(few.means, later.means)
-
-
-def test_decay_adds_the_gradients_of_mean_opacity_and_mean_scale() -> None:
-    options = TrainConfig(opacity_decay=0.02, scale_decay=0.03)
-    gaussians, truth = scene(6).requires_grad_(), scene(6).requires_grad_()
-    (truth.opacity_logits.sum() + truth.log_scales.square().sum()).backward()
-    gaussians.opacity_logits.grad = torch.ones(6)
-    gaussians.log_scales.grad = 2.0 * gaussians.log_scales.detach()
-    (0.02 * torch.sigmoid(truth.opacity_logits).mean() + 0.03 * torch.exp(truth.log_scales).mean()).backward()
-    add_decay(gaussians, resolve_schedule(options))
-    torch.testing.assert_close(gaussians.opacity_logits.grad, truth.opacity_logits.grad)
-    torch.testing.assert_close(gaussians.log_scales.grad, truth.log_scales.grad)

@@ -14,7 +14,7 @@ import torch
 from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import PointDepths, load_views
+from splatpipe.pipeline.scene.dataset import PointDepths, View, load_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.pipeline.scene.sh import coefficient_count
@@ -23,7 +23,7 @@ from splatpipe.stages.line import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.depth import depth_weight_at, point_weights, supervised, with_depth
 from splatpipe.stages.train.dropout import dropped, share_at
-from splatpipe.stages.train.plan import Plan
+from splatpipe.stages.train.plan import Plan, make_plan
 from splatpipe.stages.train.regularise import add_decay, limit_needles
 from splatpipe.stages.train.sh_limit import Coverage, allowed_degree, fan_rad
 from splatpipe.stages.train.state import TrainState
@@ -354,7 +354,9 @@ def test_only_what_a_photo_really_shows_is_counted_as_seen() -> None:
     for layer in layers:
         layer.opacity_logits += 8.0
     hidden.log_scales -= 1.0
-    state = TrainState.begin(Gaussians.concat([*layers, hidden]), TrainConfig(sh_limit=True, sh_degree=1))
+    views = [View(camera, Path(), None) for camera in tiny_scene.cameras()]
+    plan = make_plan(TrainConfig(sh_limit=True, sh_degree=1), views, 0, "", 1)
+    state = TrainState.begin(Gaussians.concat([*layers, hidden]), plan)
     rendered = raster.render(state.gaussians, FRONT, raster.RenderOptions(sh_degree=1))
     assert bool(rendered.visible[-1])
     rendered.colour.square().sum().backward()

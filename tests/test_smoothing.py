@@ -14,14 +14,14 @@ from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.raster.reference import rotation_from_quats
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.dataset import View, load_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, read_splat_header
 from splatpipe.stages import initialize, train
 from splatpipe.stages.line import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train import state as state_module
-from splatpipe.stages.train.plan import Plan, make_plan, resolve_schedule
+from splatpipe.stages.train.plan import Plan, make_plan
 from splatpipe.stages.train.smoothing import Sampling, raw_opacity_limits, sampling_of, smoothed
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import TrainingPhoto
@@ -193,9 +193,10 @@ def digest(out: Path) -> str:
 
 
 def test_without_the_option_the_raw_tensors_are_rendered() -> None:
-    options = resolve_schedule(TrainConfig())
-    state = TrainState.begin(tiny_scene.true_model(), options)
-    assert state.rendered_model(options) is state.gaussians
+    views = [View(camera, Path(), None) for camera in tiny_scene.cameras()]
+    plan = make_plan(TrainConfig(), views, 0, "", 1)
+    state = TrainState.begin(tiny_scene.true_model(), plan)
+    assert state.rendered_model(plan.options) is state.gaussians
     assert "filter_sigmas" not in state.checkpoint("any").arrays
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,6 +35,7 @@ _ADAM = "adam."
 _FILTER = "filter_sigmas"
 
 
+@runtime_checkable
 class Stateful(Protocol):
     """What a checkpoint keeps tensors of."""
 
