@@ -150,6 +150,8 @@ class TrainConfig(StageConfig):
     """Those larger than this share of the extent are removed after the first opacity reset; 0 for never."""
     prune_screen_px: NonNegativeFloat = 0.0
     """Those with a larger radius on screen are removed, too (published: 20); 0 for never: it eats aerial ground."""
+    prune_free_space: NonNegativeInt = 0
+    """Gaussians before the surface for at least so many photos, or right before a camera, are removed; 0 for never."""
     reset_every: LengthOrZero = "auto"
     """Iterations between opacity resets, 0 for none. Auto: 3000; below 10,000 iterations and for `mcmc` none."""
     reset_opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01

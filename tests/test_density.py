@@ -76,6 +76,9 @@ def test_published_score_is_the_norm_of_the_loss_by_the_place_on_screen() -> Non
     assert float(score[0]) == pytest.approx(expected, rel=1e-3)  # float32, and pixels that cross 1/255 on the way
 
 
+NONE_UNWANTED = torch.zeros(100, dtype=torch.bool)
+
+
 @pytest.mark.parametrize(("name", "magnitudes"), [("published", False), ("absolute", True)])
 def test_gradient_scores_are_those_of_the_reference(name: str, magnitudes: bool) -> None:
     gaussians, weights = scene(20), picture(2) - 0.5
@@ -136,7 +139,7 @@ def test_every_strategy_keeps_to_the_limit_and_its_statistics_survive(name: str)
     again = make_density(options, 50)
     again.load({key: tensor.clone() for key, tensor in density.to_arrays().items()})
     for limit in (50, 61):
-        step = DensityStep(options, 5.0, limit, 600, gaussians)
+        step = DensityStep(options, 5.0, limit, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
         growth, counts = density.control(gaussians, step)
         assert len(growth.source) == limit
         repeated, same = again.control(gaussians, step)
@@ -157,7 +160,9 @@ def test_relocation_moves_dead_and_broken_gaussians_and_no_others() -> None:
     gaussians = scene(40)
     gaussians.opacity_logits[3:7] = -6.0  # 0.0025
     gaussians.means[20, 1] = math.nan
-    growth, counts = make_density(MCMC, 40).control(gaussians, DensityStep(MCMC, 5.0, 45, 600, gaussians))
+    growth, counts = make_density(MCMC, 40).control(
+        gaussians, DensityStep(MCMC, 5.0, 45, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
+    )
     assert (counts["relocated"], counts["added"], counts["pruned"]) == (5, 5, 0)
     dead = [3, 4, 5, 6, 20]
     live = [row for row in range(40) if row not in dead]
@@ -174,7 +179,9 @@ def test_relocation_moves_dead_and_broken_gaussians_and_no_others() -> None:
 def test_relocation_leaves_a_model_of_dead_gaussians_alone() -> None:
     gaussians = scene(4)
     gaussians.opacity_logits[:] = -9.0
-    growth, counts = make_density(MCMC, 4).control(gaussians, DensityStep(MCMC, 5.0, 9, 600, gaussians))
+    growth, counts = make_density(MCMC, 4).control(
+        gaussians, DensityStep(MCMC, 5.0, 9, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
+    )
     assert growth.source.tolist() == [0, 1, 2, 3] and counts["relocated"] == counts["added"] == 0
 
 

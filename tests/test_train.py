@@ -39,6 +39,7 @@ TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "sh_limit": True,
     "dropout": 0.2,
     "max_anisotropy": 5.0,
+    "prune_free_space": 2,
 }
 QUICK = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15)
 

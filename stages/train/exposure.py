@@ -1,9 +1,9 @@
 """What exposure and white balance did to each photo, so that the splat need not explain it.
 
 An affine map of the colours for every training photo, trained beside the Gaussians, as in Kerbl et al., "A Hierarchical
-3D Gaussian Representation for Real-Time Rendering of Very Large Datasets" (SIGGRAPH 2024); affine models of a photo's
-colours go back to Martin-Brualla et al., "NeRF in the Wild" (CVPR 2021), and Rematas et al., "Urban Radiance Fields"
-(CVPR 2022). Over the photos the maps' mean is the identity: the splat alone has the neutral appearance.
+3D Gaussian Representation for Real-Time Rendering of Very Large Datasets" (SIGGRAPH 2024), and before in Rematas et
+al., "Urban Radiance Fields" (CVPR 2022). Over the photos the maps' mean is the identity: the splat alone has the
+neutral appearance.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
+from splatpipe.stages.train.clearing import free_space_of
 from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.density import BLIND, Seen
 from splatpipe.stages.train.depth import supervised, with_depth
@@ -78,6 +79,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         levels = coarse_levels(plan.options, plan.last_iteration)
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
         state.sampling = sampling_of(plan, views_of(plan, views))
+        state.free_space = free_space_of(views_of(plan, views), inputs["undistort.dataset"], plan.options)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)

@@ -14,10 +14,12 @@ from torch import Tensor
 from splatpipe.pipeline.raster import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.free_space import FreeSpace
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, Checkpoint
+from splatpipe.stages.train.clearing import unwanted
 from splatpipe.stages.train.densify import DensityEvent, is_density_step, is_opacity_reset, reset_opacity, room_at
 from splatpipe.stages.train.density import Density, DensityStep, make_density
 from splatpipe.stages.train.exposure import Exposure
@@ -59,6 +61,7 @@ class TrainState:
         sky: Trained beside the Gaussians; None where there is none.
         coverage: Directions that Gaussians were seen from; None without `sh_limit`.
         sampling: The training cameras, with `filter_3d`; not in the checkpoint.
+        free_space: What photos look through, with `prune_free_space`; not in the checkpoint.
         filter_sigmas: Of the 3D filter, a Gaussian each, world units; None before the first and after density control.
     """
 
@@ -73,6 +76,7 @@ class TrainState:
     sky: SkyModel | None = None
     coverage: Coverage | None = None
     sampling: Sampling | None = None
+    free_space: FreeSpace | None = None
     filter_sigmas: Float[Tensor, " n"] | None = None
 
     @staticmethod
@@ -196,7 +200,9 @@ class TrainState:
         """Give the model the rows that the strategy chooses, at most ``limit``."""
         self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
         gaussians = self.gaussians.detach()
-        step = DensityStep(options, extent, limit, iteration, self._filtered(gaussians))
+        rendered = self._filtered(gaussians)
+        gone = unwanted(rendered, self.free_space, options, iteration)
+        step = DensityStep(options, extent, limit, iteration, rendered, gone)
         growth, counts = self.density.control(gaussians, step)
         grown = gaussians.select(growth.source)
         grown.means, grown.log_scales, grown.opacity_logits = growth.means, growth.log_scales, growth.opacity_logits

@@ -55,7 +55,7 @@ class McmcDensity(Density):
         """Relocate the dead and add up to the limit."""
         options = step.options
         opacity = torch.sigmoid(step.rendered.opacity_logits.double())
-        dead = (opacity < options.prune_opacity) | ~gaussians.finite()
+        dead = (opacity < options.prune_opacity) | ~gaussians.finite() | step.unwanted
         live, moved = torch.nonzero(~dead).flatten(), torch.nonzero(dead).flatten()
         added = max(0, step.limit - len(gaussians))
         if len(live) == 0:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatpipe.pipeline.raster import Render
@@ -64,6 +64,7 @@ class DensityStep:
         limit: The most Gaussians that may be left.
         iteration: The one that ends.
         rendered: The model as it is rendered, for its opacities and sizes.
+        unwanted: (n,) Gaussians that have to go, whatever their size and opacity.
     """
 
     options: TrainConfig
@@ -71,6 +72,7 @@ class DensityStep:
     limit: int
     iteration: int
     rendered: Gaussians
+    unwanted: Bool[Tensor, " n"]
 
 
 class Density(ABC):
@@ -143,6 +145,8 @@ class ScoredDensity(Density):
         """Prune, then grow to at most the limit."""
         options, extent, iteration = step.options, step.extent, step.iteration
         gone = prune_mask(step.rendered, options, extent, iteration, self.statistics.max_radius_px)
+        if not bool((gone | step.unwanted).all()):  # a model is never emptied
+            gone |= step.unwanted
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, self.statistics.score())
         growth, counts = grow(gaussians, score, step.limit - len(gaussians) + pruned, options, extent, iteration)

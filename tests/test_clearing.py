@@ -1,0 +1,78 @@
+"""What hangs in free space: removed in training where it is asked for, at the steps that look."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.free_space import FreeSpace, near_or_free
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.clearing import STEPS_BETWEEN, free_space_of, unwanted
+from splatpipe.stages.train.plan import make_plan, resolve_schedule
+from splatpipe.stages.train.state import TrainState
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+OPTIONS = resolve_schedule(TrainConfig(prune_free_space=2))
+LOOKS = STEPS_BETWEEN * int(OPTIONS.densify_every)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wall of points at z = 1.5 alone, seen by all cameras."""
+    folder = tmp_path_factory.mktemp("wall")
+    tiny_scene.write_dataset(folder)
+    generator = np.random.default_rng(1)
+    xyz = np.column_stack([generator.uniform((-1.5, -1.2), (1.5, 1.2), (600, 2)), np.full(600, 1.5)])
+    for path in (folder / "sparse/0").iterdir():
+        path.unlink()
+    (folder / "sparse/0").rmdir()
+    tiny_scene.write_model(folder / "sparse/0", tiny_scene.cameras(), xyz, np.full((600, 3), 90, np.uint8))
+    return folder
+
+
+def haze_and_wall() -> Gaussians:
+    """Four Gaussians half-way to the wall, and four on it."""
+    gaussians = Gaussians.empty(8, 3)
+    gaussians.means = torch.tensor([[0.1 * i, 0.1 * i, -0.5 if i < 4 else 1.5] for i in range(8)])
+    gaussians.log_scales = torch.full((8, 3), -4.0)
+    gaussians.quats[:, 0] = 1.0
+    gaussians.opacity_logits = torch.full((8,), 1.0)
+    return gaussians
+
+
+@pytest.fixture(scope="module")
+def space(dataset: Path) -> FreeSpace:
+    found = free_space_of(load_views(dataset), dataset, OPTIONS)
+    assert found is not None
+    return found
+
+
+def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: FreeSpace) -> None:
+    gaussians = haze_and_wall()
+    assert unwanted(gaussians, space, OPTIONS, LOOKS).tolist() == [True] * 4 + [False] * 4
+    assert torch.equal(unwanted(gaussians, space, OPTIONS, LOOKS), near_or_free(gaussians, space, 2))
+    assert not unwanted(gaussians, space, OPTIONS, LOOKS + int(OPTIONS.densify_every)).any()
+    assert not unwanted(gaussians, None, OPTIONS, LOOKS).any()
+
+
+@pytest.mark.parametrize("density", ["published", "absolute", "error", "mcmc"])
+def test_every_strategy_takes_it_away(dataset: Path, space: FreeSpace, density: str) -> None:
+    config = TrainConfig.model_validate({"prune_free_space": 2, "density": density})
+    plan = make_plan(config, load_views(dataset), 0, "", 8)
+    state = TrainState.begin(haze_and_wall(), plan)
+    state.free_space = space
+    state.control_density(plan.options, plan.extent, 8, LOOKS)
+    assert len(state.gaussians) >= 4
+    assert not near_or_free(state.gaussians.detach(), space, 2).any()
+
+
+def test_nobody_asks_nothing_is_looked_at(dataset: Path) -> None:
+    assert free_space_of(load_views(dataset), dataset, resolve_schedule(TrainConfig())) is None
