@@ -101,7 +101,7 @@ def draw_parents(
 def shared(gaussians: Gaussians, copies: Int64[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
     """Opacity logits and log-scales of Gaussians that are there N times, so that they look as the one did.
 
-    Kheradmand et al., section 3.3: the opacity 1 - (1 - α)^(1/N), and a size by which the composite of the N has the
+    After Kheradmand et al.: the opacity 1 - (1 - α)^(1/N), and a size by which the composite of the N has the
     integral of the one along any line through the centre. The paper's double sum of binomials is the same integral,
     ∫ 1 - (1 - α_N e^(-u²))^N du, written out; as an integral it does not cancel for any N.
 
