@@ -4,7 +4,7 @@ Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 
 below `prune_opacity` onto live ones, drawn in proportion to opacity, and adds copies of such draws; the N that share a
 place get the opacity and the size that keep their sum as it was. Every iteration adds noise to the positions
 (stochastic gradient Langevin dynamics), shaped by the covariance and large only for nearly transparent Gaussians. Two
-decays (`opacity_decay`, `scale_decay`, see `decay.py`) let those die that the photos do not need.
+decays (`opacity_decay`, `scale_decay`, see `regularise.py`) let those die that the photos do not need.
 
 Otherwise than published, the number rises to the cap by our schedule instead of by 5 % a step, so that short runs reach
 it, and it is one draw for the dead and the new.
