@@ -251,7 +251,7 @@ def show(rows: Sequence[Row], failed: Sequence[Row], variants: Sequence[str]) ->
     found = differences(rows, variants[1:])
     if found:
         title = "difference to base, mean over the captures ± standard error over the pairs"
-        print_table(title, written(found, rows), {"variant": "variant:", "pairs": "pairs:"} | headings)
+        print_table(title, written(found), {"variant": "variant:", "pairs": "pairs:"} | headings)
     return found
 
 

@@ -10,26 +10,19 @@ from tables import Row
 
 BASE = "base"
 
-# Heading, the figure's key (`*`: whatever follows), and how it is written. One that no run has is shown as "-".
+# Heading, the figure's key, and how it is written. One that no run has is shown as "-".
 MEASURES = {
     "PSNR dB": ("psnr", ".2f"),
     "PSNR cc": ("psnr_cc", ".2f"),
     "SSIM": ("ssim", ".4f"),
     "best − end": ("below_best", ".2f"),
-    "free space": ("floaters.free_space*", ".4f"),
-    "depth": ("floaters.depth*", ".4f"),
+    "free space": ("floaters.free_space_opacity", ".6f"),
+    "depth off": ("floaters.depth_disagreement.median", ".5f"),
     "loss": ("loss", ".4f"),
     "Gaussians": ("gaussians", ",.0f"),
     "train s": ("train_seconds", ".1f"),
     "CPU s": ("cpu_s", ".1f"),
 }
-
-
-def key_of(pattern: str, rows: Iterable[Row]) -> str:
-    """The key that rows have for a figure: the pattern itself, or the first in name order that begins as it does."""
-    if not pattern.endswith("*"):
-        return pattern
-    return min((key for row in rows for key in row if key.startswith(pattern[:-1])), default=pattern)
 
 
 def means(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
@@ -43,8 +36,8 @@ def means(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
     for variant in variants:
         mine = [row for row in rows if row["variant"] == variant]
         line: Row = {"variant": variant, "runs": len(mine)}
-        for heading, (pattern, how) in MEASURES.items():
-            values = _values(mine, key_of(pattern, rows))
+        for heading, (key, how) in MEASURES.items():
+            values = _values(mine, key)
             if values:
                 line[heading] = format(statistics.fmean(values), how)
             if len(values) > 1:
@@ -68,8 +61,7 @@ def differences(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
     found = []
     for variant in variants:
         line: Row = {"variant": variant}
-        for pattern, _ in MEASURES.values():
-            key = key_of(pattern, rows)
+        for key, _ in MEASURES.values():
             by_capture: dict[str, list[float]] = {}
             for row in rows:
                 other = base.get((row["capture"], row["seed"]), {})
@@ -88,13 +80,13 @@ def _paired(by_capture: Mapping[str, Sequence[float]]) -> Row:
     return {"mean": mean, "error": error, "pairs": len(pairs)}
 
 
-def written(found: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
+def written(found: Sequence[Row]) -> list[Row]:
     """Differences as text, a heading at a time: `+0.31 ± 0.05`."""
     table = []
     for line in found:
         text: Row = {"variant": line["variant"]}
-        for heading, (pattern, how) in MEASURES.items():
-            paired = line.get(key_of(pattern, rows))
+        for heading, (key, how) in MEASURES.items():
+            paired = line.get(key)
             if paired is not None:
                 text["pairs"] = max(paired["pairs"], text.get("pairs", 0))
                 text[heading] = format(paired["mean"], f"+{how}")

@@ -156,7 +156,7 @@ def test_differences_are_paired_by_capture_and_seed() -> None:
     assert found["psnr"] == {"mean": 2.5, "error": pytest.approx(math.sqrt(6.5 / 2.0 / 3.0)), "pairs": 3}
     assert found["cpu_s"]["mean"] == pytest.approx(0.75)
     assert "floaters.depth_disagreement" not in found and "ssim" not in found  # nothing to compare with
-    (text,) = comparison.written([found], rows)
+    (text,) = comparison.written([found])
     assert text["PSNR dB"] == "+2.50 ± 1.04" and text["pairs"] == 3
     (only,) = comparison.differences(rows[2:3] + rows[6:], ["new"])
     assert only["psnr"] == {"mean": 4.0, "error": None, "pairs": 1}
@@ -190,7 +190,7 @@ def test_every_figure_of_a_run_is_kept_whatever_its_measures(tmp_path: Path) -> 
         "loss": None,
     }
     (shown,) = comparison.means([row("base", "a", 0, **found)], ["base"])
-    assert shown["free space"] == "0.2500" and "depth" not in shown and "loss" not in shown
+    assert shown["free space"] == "0.250000" and "depth off" not in shown and "loss" not in shown
 
 
 def test_results_survive_a_line_cut_off(tmp_path: Path) -> None:
