@@ -198,7 +198,8 @@ class EvaluateConfig(StageConfig):
 
 
 class ExportConfig(StageConfig):
-    """Export has no options yet."""
+    sky: bool = False
+    """Hand over the sky of `train.sky`, too: `sky.ply`, a dome of Gaussians around the splat, in its frame."""
 
 
 class LineConfig(StageConfig):
@@ -304,6 +305,7 @@ EXPORT = Stage(
     reads=(
         "train.model",
         "train.plan",
+        "train.sky",
         "georef.frame",
         "georef.model",
         "undistort.dataset",
@@ -316,9 +318,10 @@ EXPORT = Stage(
         "cameras": "cameras.json",
         "metrics": "metrics.json",
         "sparse": "sparse.glb",
+        "sky": "sky",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "cameras", "metrics", "sparse"),
+    deliverables=("splat", "cameras", "metrics", "sparse", "sky"),
 )
 
 LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)
