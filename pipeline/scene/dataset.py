@@ -145,18 +145,11 @@ def load_points(dataset: Path) -> Points:
     Raises:
         StageError: if the model is broken.
     """
-    model = load_model(dataset)
-    points = [model.points3D[number] for number in sorted(model.points3D)]
-    return Points(
-        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        track_lengths=np.array([point.track.length() for point in points], np.int64),
-        errors_px=np.array([point.error for point in points], np.float64),
-    )
+    return _points(load_model(dataset))
 
 
-def load_tracks(dataset: Path) -> dict[str, Int64[np.ndarray, " _"]]:
-    """Which sparse points each photo observes: rows of ``load_points`` by the photo's name, ascending, each once.
+def load_points_and_tracks(dataset: Path) -> tuple[Points, dict[str, Int64[np.ndarray, " _"]]]:
+    """The sparse points, and which of them each photo observes: rows by the photo's name, ascending, each once.
 
     Args:
         dataset: The folder that `undistort` left.
@@ -170,7 +163,17 @@ def load_tracks(dataset: Path) -> dict[str, Int64[np.ndarray, " _"]]:
     for image in model.images.values():
         observed = [point.point3D_id for point in image.points2D if point.has_point3D()]
         tracks[image.name] = np.searchsorted(numbers, np.unique(np.array(observed, np.int64)))
-    return tracks
+    return _points(model), tracks
+
+
+def _points(model: pycolmap.Reconstruction) -> Points:
+    points = [model.points3D[number] for number in sorted(model.points3D)]
+    return Points(
+        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        track_lengths=np.array([point.track.length() for point in points], np.int64),
+        errors_px=np.array([point.error for point in points], np.float64),
+    )
 
 
 def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str], list[str]]:
