@@ -1,6 +1,7 @@
 """The sky in training: found, learnt by direction, free of Gaussians, and the same bits however it was run."""
 
 import hashlib
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -89,6 +90,21 @@ def test_sky_begins_with_the_colours_that_the_photos_show(scene: Path) -> None:
     error = np.abs(seen - photo.pixels / 255.0)[truth]
     assert error.mean() < 0.02
     assert bool(torch.isfinite(sky.panorama.colours).all())
+
+
+def test_sky_that_the_user_drew_is_the_sky(scene: Path, tmp_path: Path) -> None:
+    shutil.copytree(scene / "dataset", tmp_path / "dataset")
+    name = load_views(scene / "dataset")[2].camera.name
+    drawn = np.zeros((skies.HEIGHT, skies.WIDTH), np.uint8)
+    drawn[:100, :200] = 255
+    (tmp_path / "dataset/sky_masks").mkdir()
+    cv2.imwrite(str(tmp_path / f"dataset/sky_masks/{name}.png"), drawn)
+    view = load_views(tmp_path / "dataset")[2]
+    sky = SkyModel.begin([view], tmp_path / "dataset", 1)
+    assert sky is not None
+    mask = sky.mask(view.camera)
+    assert mask is not None
+    np.testing.assert_array_equal(mask.numpy(), drawn > 0)
 
 
 def test_cells_that_no_photo_shows_lie_between_their_neighbours() -> None:

@@ -1,4 +1,4 @@
-"""The dataset that `undistort` leaves and training reads: `images/`, `masks/` where there are any, `sparse/0`."""
+"""The dataset that `undistort` leaves and training reads: `images/`, `masks/` and `sky_masks/` if any, `sparse/0`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from splatpipe.pipeline.scene.names import NameFinder
 
 IMAGES = "images"
 MASKS = "masks"
+SKY_MASKS = "sky_masks"
 MODEL = "sparse/0"
 NAMES_SHOWN = 5  # of a list in a message
 
@@ -47,12 +48,14 @@ class View:
         image_path: The undistorted photo, in the camera's grid.
         mask_path: Its mask (8-bit, 0 = ignored, same grid), or None.
         depths: Of its sparse points, where training is to keep to them.
+        sky_path: The mask of its sky (8-bit, 0 = something else, same grid), or None where nobody drew one.
     """
 
     camera: Camera
     image_path: Path
     mask_path: Path | None
     depths: PointDepths | None = None
+    sky_path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,9 @@ def image_path(dataset: Path, name: str) -> Path:
     return dataset / IMAGES / PurePosixPath(name)
 
 
-def mask_path(dataset: Path, name: str) -> Path:
+def mask_path(dataset: Path, name: str, folder: str = MASKS) -> Path:
     """Where its mask lies, if it has one: COLMAP's convention, the photo's whole name with `.png` after it."""
-    return dataset / MASKS / PurePosixPath(f"{name}.png")
+    return dataset / folder / PurePosixPath(f"{name}.png")
 
 
 def load_model(dataset: Path) -> pycolmap.Reconstruction:
@@ -119,7 +122,7 @@ def _view(dataset: Path, image: pycolmap.Image) -> View:
         raise StageError(f"The dataset's camera of {image.name} is {camera.model_name}, not PINHOLE.")
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
-    mask = mask_path(dataset, image.name)
+    mask, sky = (mask_path(dataset, image.name, folder) for folder in (MASKS, SKY_MASKS))
     return View(
         Camera(
             image.name,
@@ -133,6 +136,7 @@ def _view(dataset: Path, image: pycolmap.Image) -> View:
         ),
         image_path(dataset, image.name),
         mask if mask.is_file() else None,
+        sky_path=sky if sky.is_file() else None,
     )
 
 

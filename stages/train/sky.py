@@ -22,7 +22,7 @@ from torch import Tensor
 from splatpipe.pipeline.raster import Render
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View, load_points
-from splatpipe.pipeline.scene.images import reduced_view
+from splatpipe.pipeline.scene.images import reduced_sky, reduced_view
 from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over
 from splatpipe.pipeline.scene.sky import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
 from splatpipe.stages.train.side import SideModel
@@ -86,7 +86,8 @@ class SkyModel(SideModel):
 
         def photo(index: int) -> SkyPhoto:
             camera, pixels, mask = reduced_view(views[index], WORK_MEGAPIXELS)
-            return SkyPhoto(camera, pixels, None if mask is None else ~mask)
+            drawn = reduced_sky(views[index], WORK_MEGAPIXELS)
+            return SkyPhoto(camera, pixels, None if mask is None else ~mask, drawn)
 
         up = up_of(cameras, photo, believed, threads)
         masks = find_skies(cameras, photo, believed, up, threads)
