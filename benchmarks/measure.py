@@ -38,6 +38,7 @@ from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize
 from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.draws import permutation
 from splatpipe.stages.train.plan import make_plan
@@ -160,7 +161,7 @@ def time_case(case: Case) -> Row:
     if steps >= int(plan.options.densify_from):
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
-    with loop.same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
+    with same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
         state = TrainState.begin(start, plan)
         state.sampling = sampling_of(plan, views)
         for photo in islice(photos, warmup):

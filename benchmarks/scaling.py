@@ -45,6 +45,7 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import read_splat, read_splat_header, write_splat
 from splatpipe.stages import train
 from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.plan import Plan, make_plan
 
@@ -100,7 +101,7 @@ def write_start(dataset: Path, count: int, wanted: float, threads: int) -> Path:
     """Write the Gaussians of a case beside its dataset."""
     views = load_views(dataset)
     path = dataset / f"{count}.ply"
-    with loop.same_bits(threads):
+    with same_bits(threads):
         plan = make_plan(TrainConfig(), views, 0, "", count)
         made = scattered(read_splat(dataset / "init.ply"), count)
         write_splat(path, sized(made, [view.camera for view in views], plan, wanted))

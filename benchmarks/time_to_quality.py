@@ -23,6 +23,7 @@ from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.evaluate import as_trained, measure, render_pixels
 from splatpipe.stages.line import LineConfig, TrainConfig
+from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.clearing import free_space_of
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
@@ -85,7 +86,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     plan = make_plan(config.train, views, config.evaluate.every, arguments.held_out, len(start))
     names = set(plan.train_views)
     levels = coarse_levels(plan.options)
-    with loop.same_bits(arguments.threads):
+    with same_bits(arguments.threads):
         clocks.start()
         state = TrainState.begin(start, plan)
         trained_on = [view for view in views if view.camera.name in names]

@@ -54,8 +54,8 @@ class Ending:
     def _files(self, outcome: Outcome) -> list[Path]:
         from splatpipe.stages.line import LINE
 
-        parts = {entry.name: entry for entry in LINE if entry.name in outcome.artifacts}
-        files = [self._out / entry.parts[name] for entry in parts.values() for name in entry.deliverables]
+        made = [(stage, outcome.artifacts[stage.name]) for stage in LINE if stage.name in outcome.artifacts]
+        files = [self._out / name for stage, artifact in made for name in artifact.deliverables(stage)]
         return [path for path in files if path.is_file()]
 
     def _as_object(self, error: BaseException | None, seconds: float) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from splatpipe.pipeline.scene.panorama import Panorama, laid_over, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.floaters import measure_floaters
 from splatpipe.stages.line import EvaluateConfig
+from splatpipe.stages.threads import same_bits
 
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
 EQUAL_DB = 100.0  # stands for the infinite PSNR of pictures that are equal: JSON has no infinity
@@ -51,18 +52,18 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
             "No photo was held out, so nothing is measured.",
             hint="Set evaluate.every or evaluate.views to hold some out.",
         )
-    raster.set_threads(inputs.machine.threads)
-    if sky is not None:
-        torch.set_num_threads(1)  # the sky's matrix products may round differently on more
     stems = flat_stems([view.camera.name for view in chosen])
     per_view = []
     for done, (view, stem) in enumerate(zip(chosen, stems, strict=True), start=1):
         reduced = reduced_view(view, megapixels)
-        per_view.append(evaluate_view(reduced, (gaussians, sky), options, folder / stem))
+        with same_bits(inputs.machine.threads):
+            render = render_pixels((gaussians, sky), reduced[0], options)
+        per_view.append(evaluate_view(reduced, render, folder / stem))
         report.progress(done, len(chosen), "measuring held-out photos", "photos")
     means = mean_measures(per_view)
     cameras = [reduced_camera(view.camera, megapixels) for view in views]
-    floaters = measure_floaters(gaussians, cameras, inputs["undistort.dataset"], options)
+    with same_bits(inputs.machine.threads):
+        floaters = measure_floaters(gaussians, cameras, inputs["undistort.dataset"], options)
     result = {"test_views": len(per_view), "mean": means, "floaters": floaters, "per_view": per_view}
     text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False)
     (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
@@ -104,22 +105,18 @@ def render_pixels(model: Model, camera: Camera, options: raster.RenderOptions) -
         return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 
-def evaluate_view(
-    view: tuple[Camera, Pixels, Mask | None], model: Model, options: raster.RenderOptions, stem: Path
-) -> dict[str, Any]:
-    """Render and measure one view, and keep its pictures.
+def evaluate_view(view: tuple[Camera, Pixels, Mask | None], render: Pixels, stem: Path) -> dict[str, Any]:
+    """Measure one view, and keep its pictures.
 
     Args:
         view: The held-out photo at the size of training: camera, photo and mask.
-        model: The Gaussians, and the sky behind them.
-        options: How it is rendered.
+        render: What the model shows instead.
         stem: Path of the pictures without their endings.
 
     Returns:
         Its name, the pictures' common stem, its size, and a figure a measure.
     """
     camera, photo, mask = view
-    render = render_pixels(model, camera, options)
     _write_png(stem, "photo", photo)
     _write_png(stem, "render", render)
     _write_png(stem, "error", error_picture(render, photo, mask))

@@ -1,4 +1,4 @@
-"""export: the model, its cameras and the sparse points in the world frame, and the run's figures."""
+"""export: the model, its cameras, the sparse points and, if asked for, the sky in the world frame; and the figures."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import Points, load_points, load_views
+from splatpipe.pipeline.scene.dome import sky_dome
 from splatpipe.pipeline.scene.frames import Frame, load_frame
 from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import ExportConfig
 
@@ -34,10 +36,11 @@ GLTF_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy")
 
 
-def run(_config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `splat.ply`, `cameras.json`, `metrics.json` and `sparse.glb`.
+def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `splat.ply`, `cameras.json`, `metrics.json` and `sparse.glb`; `sky/sky.ply` where it is asked for.
 
-    The frame is georef's: local east, north, up in metres where there are positions, of arbitrary scale elsewhere.
+    The frame is georef's: local east, north, up in metres where there are positions, of arbitrary scale elsewhere. The
+    sky is a file of its own: within `splat.ply` it would be most of its bounding box, by which programs place and tile.
     """
     torch.set_num_threads(1)  # matrix products may round differently on more
     frame = load_frame(inputs["georef.frame"])
@@ -47,8 +50,17 @@ def run(_config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     cameras = [view.camera for view in load_views(dataset)]
 
     report.progress(0, 3, "moving the model into its frame", "files")
-    gaussians = in_world(read_splat(inputs["train.model"]), frame)
-    write_splat(out / "splat.ply", gaussians, ply_comments(frame, bool(plan["options"]["antialias"])))
+    model = read_splat(inputs["train.model"])
+    gaussians = in_world(model, frame)
+    comments = ply_comments(frame, bool(plan["options"]["antialias"]))
+    write_splat(out / "splat.ply", gaussians, comments)
+    sky = read_panorama(inputs["train.sky"]) if config.sky else None
+    (out / "sky").mkdir()
+    if sky is not None:
+        dome = sky_dome(sky, model.select(model.finite()), np.array([camera.centre() for camera in cameras]))
+        write_splat(out / "sky/sky.ply", in_world(dome, frame), comments)
+    elif config.sky:
+        report.warning("There is no sky to hand over.", hint="It takes train.sky=model, and photos that show the sky.")
     report.progress(1, 3, "writing the cameras and the points", "files")
     _write_json(out / "cameras.json", cameras_json(cameras, frame))
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))
@@ -56,7 +68,8 @@ def run(_config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     figures = collect_metrics(inputs, plan, points, len(cameras), len(gaussians))
     _write_json(out / "metrics.json", figures)
     report.progress(3, 3, "collecting the figures", "files")
-    return {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
+    summary = {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
+    return summary if sky is None else summary | {"sky_gaussians": len(dome)}
 
 
 def in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatpipe.pipeline import raster
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.consistency import depth_differences, disagreement, neighbouring_pairs
-from splatpipe.pipeline.scene.dataset import load_points, load_tracks
+from splatpipe.pipeline.scene.dataset import load_points_and_tracks
 from splatpipe.pipeline.scene.free_space import free_space, near_or_free, share_of_opacity
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.images import reduced_camera
@@ -38,9 +38,9 @@ def measure_floaters(
         dataset: Their dataset, with the sparse points.
         options: How the model is rendered.
     """
-    tracks = load_tracks(dataset)
+    points, tracks = load_points_and_tracks(dataset)
     seen = [tracks[camera.name] for camera in cameras]
-    space = free_space(cameras, load_points(dataset).xyz, seen)
+    space = free_space(cameras, points.xyz, seen)
     chosen = near_or_free(gaussians, space)
     pairs = neighbouring_pairs(seen)
     places = sorted({place for pair in pairs for place in pair})

@@ -21,7 +21,8 @@ LengthOrZero = Literal["auto"] | NonNegativeInt
 
 class IngestConfig(StageConfig):
     masks: bool = True
-    """Honour `masks/` beside or inside the photo folder (same name as the photo, black is ignored)."""
+    """Honour `masks/` (black is ignored) and `sky_masks/` (white is sky, for `train.sky`) beside or inside the photo
+    folder, of the same names as the photos."""
     min_size: PositiveInt = 320
     """Pictures whose longer side is shorter, in pixels, are left out: thumbnails and icons."""
     max_megapixels: Annotated[float, Field(gt=0.0, le=4000.0)] = 500.0
@@ -184,8 +185,8 @@ class TrainConfig(StageConfig):
     dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian: 0.2)."""
     sky: Literal["off", "model"] = "off"
-    """`model`: the sky, found in the photos, has a colour by direction of its own and no Gaussians; the deliverable
-    leaves it out. Where no photo shows any it stays off."""
+    """`model`: the sky, found in the photos or drawn in `sky_masks/`, has a colour by direction of its own and no
+    Gaussians; the deliverable leaves it out. Where no photo shows any it stays off."""
     sky_opacity_weight: NonNegativeFloat = 0.1
     """Weight of the mean opacity before the sky in the loss."""
 
@@ -198,7 +199,8 @@ class EvaluateConfig(StageConfig):
 
 
 class ExportConfig(StageConfig):
-    """Export has no options yet."""
+    sky: bool = False
+    """Hand over the sky of `train.sky`, too: `sky.ply`, a dome of Gaussians around the splat, in its frame."""
 
 
 class LineConfig(StageConfig):
@@ -304,6 +306,7 @@ EXPORT = Stage(
     reads=(
         "train.model",
         "train.plan",
+        "train.sky",
         "georef.frame",
         "georef.model",
         "undistort.dataset",
@@ -316,9 +319,10 @@ EXPORT = Stage(
         "cameras": "cameras.json",
         "metrics": "metrics.json",
         "sparse": "sparse.glb",
+        "sky": "sky",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "cameras", "metrics", "sparse"),
+    deliverables=("splat", "cameras", "metrics", "sparse", "sky"),
 )
 
 LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)

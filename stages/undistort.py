@@ -14,17 +14,17 @@ import pycolmap
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.camera import reduced_size
-from splatpipe.pipeline.scene.dataset import MODEL, image_path, mask_path, some
+from splatpipe.pipeline.scene.dataset import MASKS, MODEL, SKY_MASKS, image_path, mask_path, some
 from splatpipe.pipeline.scene.names import match_names
 from splatpipe.pipeline.scene.parallel import ordered_map
-from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, load_photo_list
+from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, decode_sky_mask, load_photo_list
 from splatpipe.pipeline.scene.sparse_model import write_model
 from splatpipe.stages.line import UndistortConfig
 from splatpipe.stages.resampling import resample
 
 SHAPE_TOLERANCE = 0.01  # between the shapes of a photo and of its camera in the model
 JPEG_QUALITY = 97  # with full chroma: far above what training reaches, and a third of a PNG's size and decoding time
-MASK_COUNTS = 254.5  # of 255: a pixel counts only if nothing of it is masked
+WHITE = 254.5  # of 255: a pixel counts only if nothing of it is masked, and is sky only if all of it is
 LEAST_VIEWS = 2
 
 
@@ -46,7 +46,7 @@ class Placed:
 
 
 def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write ``dataset/images``, ``dataset/masks`` where there are masks, and ``dataset/sparse/0`` with PINHOLE cameras.
+    """Write ``dataset/images``, ``masks`` and ``sky_masks`` where there are any, and ``sparse/0`` with PINHOLE cameras.
 
     Photos keep their names. No EXIF is written: an orientation tag would turn the pictures in other trainers.
 
@@ -171,10 +171,11 @@ def _write_view(view: Placed, inputs: Inputs, dataset: Path) -> None:
     part = inputs["ingest.photos"]
     pixels = resample(decode(view.photo, part, inputs.photos_dir), view.source, view.target)
     _write(image_path(dataset, view.photo.name), pixels[:, :, ::-1])
-    mask = decode_mask(view.photo, part)
-    if mask is not None:
-        counts = resample(mask, view.source, view.target) > MASK_COUNTS
-        _write(mask_path(dataset, view.photo.name), counts.astype(np.uint8) * 255)
+    for folder, decoded in ((MASKS, decode_mask), (SKY_MASKS, decode_sky_mask)):
+        mask = decoded(view.photo, part)
+        if mask is not None:
+            white = resample(mask, view.source, view.target) > WHITE
+            _write(mask_path(dataset, view.photo.name, folder), white.astype(np.uint8) * 255)
 
 
 def _write(path: Path, pixels: npt.NDArray[np.uint8]) -> None:

@@ -8,7 +8,14 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import image_path, load_points, load_tracks, load_views, mask_path, split_views
+from splatpipe.pipeline.scene.dataset import (
+    image_path,
+    load_points,
+    load_points_and_tracks,
+    load_views,
+    mask_path,
+    split_views,
+)
 
 
 def a_camera() -> Camera:
@@ -88,8 +95,9 @@ def test_tracks_are_rows_of_the_points_each_once(tmp_path: Path) -> None:
         model.add_point3D(np.array([float(index), 0.0, 1.0]), track, np.zeros(3, np.uint8))
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     model.write_binary(tmp_path / "sparse" / "0")
-    assert load_points(tmp_path).xyz[:, 0].tolist() == [1.0, 2.0]
-    found = {name: rows.tolist() for name, rows in load_tracks(tmp_path).items()}
+    points, tracks = load_points_and_tracks(tmp_path)
+    assert points.xyz[:, 0].tolist() == load_points(tmp_path).xyz[:, 0].tolist() == [1.0, 2.0]
+    found = {name: rows.tolist() for name, rows in tracks.items()}
     assert found == {"a.jpg": [0, 1], "b.jpg": [0, 1], "c.jpg": []}
 
 

@@ -86,6 +86,17 @@ def test_a_borrowed_setting_reruns_the_stage_that_borrows_it(numbers: Path, out:
     assert outcome.ran == ["count", "tell"]
 
 
+def test_what_is_delivered_only_with_an_option_is_taken_back_without_it(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out, tell={"loud": True}))
+    assert (out / "echo.txt").read_text() == "3 1 TRUE 21"
+    walk(request_of(numbers, out))
+    assert not (out / "echo.txt").exists() and (out / "telling.txt").is_file()
+    walk(request_of(numbers, out, tell={"loud": True}))
+    (out / "echo.txt").write_text("somebody's own")
+    walk(request_of(numbers, out))
+    assert (out / "echo.txt").read_text() == "somebody's own"
+
+
 def test_a_changed_photo_reruns_but_a_touched_or_copied_one_does_not(numbers: Path, out: Path, tmp_path: Path) -> None:
     walk(request_of(numbers, out))
     os.utime(numbers / "a.txt")

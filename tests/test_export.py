@@ -17,7 +17,7 @@ from splatpipe.pipeline.scene import metrics
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_points, load_views
 from splatpipe.pipeline.scene.frames import load_frame
-from splatpipe.pipeline.scene.panorama import write_panorama
+from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, panorama_of, write_panorama
 from splatpipe.pipeline.scene.ply import read_splat, write_splat
 from splatpipe.stages import evaluate, export
 from splatpipe.stages.line import EvaluateConfig, ExportConfig, TrainConfig
@@ -198,6 +198,31 @@ def test_scene_of_one_camera_and_no_points_is_still_written(inputs: Inputs) -> N
     camera = load_views(inputs["undistort.dataset"])[0].camera
     glb = export.sparse_glb(none, [camera], load_frame(inputs["georef.frame"]))
     assert glb[:4] == b"glTF"
+
+
+def test_sky_is_a_file_of_its_own_in_the_same_frame(inputs: Inputs, exported: Path, tmp_path: Path) -> None:
+    up = ROTATION[2]  # the world's +z in the model's frame
+    colours = np.tile(np.float32([0.2, 0.5, 0.9]), (ROWS * COLUMNS, 1))
+    write_panorama(tmp_path / "sky.npz", panorama_of(up, colours))
+    (tmp_path / "out").mkdir()
+    parts = {**inputs.parts, "train.sky": tmp_path / "sky.npz"}
+    again = Inputs(parts, tmp_path, summaries=inputs.summaries)
+    summary = export.run(ExportConfig(sky=True), again, tmp_path / "out", tiny_scene.Recorder())
+    vertex = PlyData.read(str(tmp_path / "out/sky/sky.ply"))["vertex"]
+    assert summary["sky_gaussians"] == len(vertex) > 1000
+    positions = [entry["position"] for entry in json.loads((exported / "cameras.json").read_text())]
+    rays = np.stack([vertex[axis] for axis in "xyz"], axis=1) - np.mean(positions, axis=0)
+    elevations = np.degrees(np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)))
+    assert -2.01 < elevations.min() < -1.5 and elevations.max() > 88.0
+    assert (tmp_path / "out/splat.ply").read_bytes() == (exported / "splat.ply").read_bytes()
+    assert not (exported / "sky/sky.ply").exists()
+
+
+def test_sky_that_was_not_trained_is_told(inputs: Inputs, tmp_path: Path) -> None:
+    recorder = tiny_scene.Recorder()
+    summary = export.run(ExportConfig(sky=True), inputs, tmp_path, recorder)
+    assert len(recorder.warnings) == 1 and "no sky" in recorder.warnings[0]
+    assert "sky_gaussians" not in summary and not (tmp_path / "sky/sky.ply").exists()
 
 
 def test_same_bits_for_the_same_inputs(inputs: Inputs, exported: Path, tmp_path: Path) -> None:

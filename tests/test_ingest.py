@@ -17,9 +17,10 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Summary
 from splatpipe.pipeline.scene.exif import Exif
-from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, load_photo_list, photo_root
+from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, decode_sky_mask, load_photo_list, photo_root
 from splatpipe.stages.ingest import run
 from splatpipe.stages.ingest.cameras import focal_prior
 from splatpipe.stages.line import IngestConfig
@@ -490,6 +491,40 @@ def test_masks_beside_images_are_found_without_a_model(folder: Path) -> None:
     assert_left_half(result.mask("a.jpg"))
     assert result.mask("images/a.jpg") is None  # it is the other's
     assert not any("mask" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("place", ["photos/sky_masks/a.png", "sky_masks/a.jpg.png"])
+def test_masks_of_the_sky_are_found_likewise_and_are_no_photos(folder: Path, place: str) -> None:
+    path = folder.parent / place
+    path.parent.mkdir()
+    half_black(WIDTH, HEIGHT).save(path)
+    result = ingest(folder)
+    assert sorted(result.photos) == ["a.jpg", "b.jpg"]
+    assert_left_half(decode_sky_mask(result.photos["a.jpg"], result.out / "photos"))
+    assert decode_sky_mask(result.photos["b.jpg"], result.out / "photos") is None
+    assert result.mask("a.jpg") is None
+    assert (result.summary["masks"], result.summary["sky_masks"]) == (0, 1)
+    assert ingest(folder, out="off", masks=False).summary["sky_masks"] == 0
+
+
+def test_photo_with_both_masks_keeps_them_apart_and_a_black_sky_is_meant(folder: Path) -> None:
+    for name in ("masks", "sky_masks"):
+        (folder / name).mkdir()
+    half_black(WIDTH, HEIGHT).save(folder / "masks" / "a.png")
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(folder / "sky_masks" / "a.png")
+    result = ingest(folder)
+    assert_left_half(result.mask("a.jpg"))
+    sky = decode_sky_mask(result.photos["a.jpg"], result.out / "photos")
+    assert sky is not None and not sky.any()
+    assert not any("mask" in warning for warning in result.warnings)
+
+
+def test_masks_beside_the_photos_belong_to_what_a_run_depends_on(folder: Path) -> None:
+    for name in ("masks", "sky_masks"):
+        (folder.parent / name).mkdir()
+        half_black(WIDTH, HEIGHT).save(folder.parent / name / "a.png")
+    files = open_source(folder, folder.parent / "out").part_files["source.photos"]
+    assert {"../masks/a.png", "../sky_masks/a.png", "a.jpg"} <= set(files)
 
 
 def test_masks_can_be_switched_off(folder: Path) -> None:

@@ -136,6 +136,18 @@ def test_cameras_that_do_not_turn_count_as_held_upright() -> None:
     np.testing.assert_allclose(up_of(cameras, lambda _: traced, skies.points_on()), skies.UP, atol=1e-6)
 
 
+def test_what_is_drawn_is_taken_whatever_points_and_others_say() -> None:
+    cameras = [skies.look(heading, x=0.1 * heading) for heading in (-6.0, -2.0, 2.0, 6.0)]
+    traced = [skies.trace(camera) for camera in cameras]
+    drawn = np.zeros(traced[0][1].shape, bool)
+    drawn[-40:, :60] = True
+    photos = [traced[0][0], replace(traced[1][0], drawn=drawn), *(photo for photo, _ in traced[2:])]
+    masks = find_skies(cameras, lambda index: photos[index], skies.points_on(), skies.UP)
+    np.testing.assert_array_equal(masks[1].unpacked(), drawn)
+    for index in (0, 2, 3):
+        assert skies.overlap(masks[index].unpacked(), traced[index][1]) > 0.95
+
+
 def test_no_photos_have_no_sky() -> None:
     assert find_skies([], lambda _: skies.trace(skies.look())[0], np.zeros((0, 3)), skies.UP) == []
 

@@ -1,8 +1,10 @@
 """The sky in training: found, learnt by direction, free of Gaussians, and the same bits however it was run."""
 
 import hashlib
+import shutil
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -33,6 +35,7 @@ import tiny_scene
 
 QUICK = TrainConfig(iterations=40, sky="model", sh_degree=1, densify_from=10, densify_every=10, densify_until=30)
 CELLS = ROWS * COLUMNS
+BLACK = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(autouse=True)
@@ -89,6 +92,21 @@ def test_sky_begins_with_the_colours_that_the_photos_show(scene: Path) -> None:
     assert bool(torch.isfinite(sky.panorama.colours).all())
 
 
+def test_sky_that_the_user_drew_is_the_sky(scene: Path, tmp_path: Path) -> None:
+    shutil.copytree(scene / "dataset", tmp_path / "dataset")
+    name = load_views(scene / "dataset")[2].camera.name
+    drawn = np.zeros((skies.HEIGHT, skies.WIDTH), np.uint8)
+    drawn[:100, :200] = 255
+    (tmp_path / "dataset/sky_masks").mkdir()
+    cv2.imwrite(str(tmp_path / f"dataset/sky_masks/{name}.png"), drawn)
+    view = load_views(tmp_path / "dataset")[2]
+    sky = SkyModel.begin([view], tmp_path / "dataset", 1)
+    assert sky is not None
+    mask = sky.mask(view.camera)
+    assert mask is not None
+    np.testing.assert_array_equal(mask.numpy(), drawn > 0)
+
+
 def test_cells_that_no_photo_shows_lie_between_their_neighbours() -> None:
     total = np.zeros((CELLS, 4))
     total[20 * COLUMNS : 21 * COLUMNS] = [8.0, 4.0, 2.0, 10.0]
@@ -113,13 +131,27 @@ def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() 
     photo = torch.full((60, 80, 3), 0.1)
     photo[:30] = torch.tensor([0.3, 0.5, 0.7])
     for number in range(120):
-        composite = sky.composite(empty_render(camera), camera, (0.0, 0.0, 0.0))
+        composite = sky.composite(empty_render(camera), camera, BLACK, (0.1, 0.1, 0.1))
         ((composite - photo).abs().mean() + sky.penalty(torch.zeros(photo.shape[:2]), camera, 1.0)).backward()
         sky.step(number / 120)
     with torch.no_grad():
         seen = sky.panorama.behind(camera, (0.0, 0.0, 0.0))
     assert float((seen - photo)[:24].abs().mean()) < 0.02
     assert float(seen[-10:].mean()) > 0.4  # the dark wall below did not get into it
+
+
+def test_away_from_the_sky_nothing_shines_through_but_the_colour_given() -> None:
+    camera = skies.look(pitch_deg=30.0)
+    mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
+    mask[:60] = True
+    sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
+    rendered = replace(empty_render(camera), alpha=torch.full(mask.shape, 0.75))
+    with torch.no_grad():
+        shown = sky.composite(rendered, camera, BLACK, (1.0, 0.0, 0.2))
+        unknown = sky.composite(rendered, replace(camera, name="without sky"), BLACK, (1.0, 0.0, 0.2))
+    torch.testing.assert_close(shown[:63], torch.full((63, skies.WIDTH, 3), 0.125))
+    torch.testing.assert_close(shown[64:120], torch.tensor([0.25, 0.0, 0.05]).expand_as(shown[64:120]))
+    torch.testing.assert_close(unknown[:120], torch.full((120, skies.WIDTH, 3), 0.125))  # nothing is known of it
 
 
 def test_penalty_is_the_mean_opacity_before_the_sky() -> None:

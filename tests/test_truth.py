@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.pipeline.raster import RenderOptions, render
-from splatpipe.pipeline.scene.dataset import load_points, load_tracks, load_views
+from splatpipe.pipeline.scene.dataset import load_points_and_tracks, load_views
 from splatpipe.pipeline.scene.free_space import free_space, near_or_free
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import read_splat
@@ -181,8 +181,8 @@ def test_no_true_surface_is_called_free_and_most_of_the_air_is(
     """Tiny Gaussians on what the photos' rays hit, and at 0.2 to 0.8 of the way there."""
     dataset = next((out / "stages").glob("undistort-*")) / "dataset"
     cameras = [view.camera for view in load_views(dataset)]
-    tracks = load_tracks(dataset)
-    space = free_space(cameras, load_points(dataset).xyz, [tracks[camera.name] for camera in cameras])
+    points, tracks = load_points_and_tracks(dataset)
+    space = free_space(cameras, points.xyz, [tracks[camera.name] for camera in cameras])
     generator = np.random.default_rng(2)
     called: dict[str, list[np.ndarray]] = {"surface": [], "air": []}
     for camera in cameras[::5]:

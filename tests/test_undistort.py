@@ -2,6 +2,7 @@
 
 import hashlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from PIL import Image
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.scene.dataset import load_points, load_views
+from splatpipe.pipeline.scene.photos import PhotoList, load_photo_list, save_photo_list
 from splatpipe.stages import resampling, undistort
 from splatpipe.stages.line import UndistortConfig
 from splatpipe.stages.undistort import pinhole_camera
@@ -171,6 +173,24 @@ def test_masks_go_along_and_count_only_whole_pixels(tmp_path: Path) -> None:
     true = resampling._project(source, target, np.column_stack([x.ravel(), y.ravel()]))[:, 0].reshape(small.shape)
     assert not small[true < 300].any()
     assert small[true > 304].all()
+
+
+def test_masks_of_the_sky_go_along_likewise(tmp_path: Path) -> None:
+    source = make_camera("SIMPLE_RADIAL")
+    photo = blobs(source)
+    mask = np.full(photo.shape[:2], 255, np.uint8)
+    mask[200:] = 0
+    inputs = corner_photos.write_capture(tmp_path / "in", {"a.png": photo, "b.png": photo}, {"a.png": mask})
+    write_model(tmp_path / "model", source, ["a.png", "b.png"])
+    run(inputs, tmp_path / "model", tmp_path / "masked")
+    part = inputs["ingest.photos"]
+    skies = tuple(replace(entry, mask=None, sky_mask=entry.mask) for entry in load_photo_list(part).photos)
+    save_photo_list(PhotoList(skies), part)
+    run(inputs, tmp_path / "model", tmp_path / "out")
+    views = load_views(tmp_path / "out" / "dataset")
+    assert [view.mask_path for view in views] == [None, None] and views[1].sky_path is None
+    assert views[0].sky_path == tmp_path / "out/dataset/sky_masks/a.png.png"
+    assert views[0].sky_path.read_bytes() == (tmp_path / "masked/dataset/masks/a.png.png").read_bytes()
 
 
 def test_what_is_written_carries_no_exif_and_keeps_its_name(tmp_path: Path) -> None:

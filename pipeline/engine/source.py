@@ -11,6 +11,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.stage import Reporter
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
+MASK_FOLDERS = ("masks", "sky_masks")
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,12 @@ class Source:
     @property
     def part_files(self) -> dict[str, dict[str, Path]]:
         """The external parts and their files by name: ``source.photos``, and ``sparse.model`` where there is one."""
-        roots = [self.folder] if self.model is None else [self.folder / "images", self.folder / "masks"]
+        roots = [self.folder]
+        if self.model is not None:
+            roots = [self.folder / name for name in ("images", *MASK_FOLDERS)]
+        beside = [self.folder.parent / name for name in MASK_FOLDERS]
+        roots += [root for root in beside if root.is_dir() and root != self.folder]
         photos = {os.path.relpath(path, self.folder): path for root in roots for path in walk_files(root)}
-        beside = self.folder.parent / "masks"
-        if beside.is_dir() and beside != self.folder:
-            photos |= {os.path.relpath(path, self.folder): path for path in walk_files(beside)}
         if len(photos) > MAX_SOURCE_FILES:
             raise SplatpipeError(
                 f"{self.folder} holds {len(photos):,} files.",

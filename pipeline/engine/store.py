@@ -55,6 +55,15 @@ class Artifact:
             for name, part in self.manifest["parts"].items()
         }
 
+    def deliverables(self, stage: Stage) -> dict[Path, Path]:
+        """The files of its stage's deliverables by their paths relative to OUT; of a folder part, what is in it."""
+        files: dict[Path, Path] = {}
+        for name in stage.deliverables:
+            root = self.folder / stage.parts[name]
+            found = [root] if root.is_file() else sorted(path for path in root.rglob("*") if path.is_file())
+            files |= {file.relative_to(root.parent if file == root else root): file for file in found}
+        return files
+
 
 @dataclass(frozen=True)
 class StageInputs:
@@ -194,25 +203,31 @@ class Store:
             shutil.rmtree(folder)
         return len(stale), freed
 
-    def deliver(self, artifact: Artifact, stage: Stage) -> list[Path]:
-        """Copy an artifact's deliverables into OUT, each replaced in one step; unchanged ones are left alone."""
-        delivered = []
-        for name in stage.deliverables:
-            root = artifact.folder / stage.parts[name]
-            files = [root] if root.is_file() else [path for path in sorted(root.rglob("*")) if path.is_file()]
-            for file in files:
-                target = self.out / (file.name if file == root else file.relative_to(root))
-                _copy_if_changed(file, target)
-                delivered.append(target)
-        return delivered
+    def deliver(self, artifact: Artifact, stage: Stage) -> None:
+        """Copy an artifact's deliverables into OUT, each replaced in one step; unchanged ones are left alone.
+
+        Copies of an earlier artifact's that this one does not have are taken back.
+        """
+        wanted = artifact.deliverables(stage)
+        for name, file in wanted.items():
+            _copy_if_changed(file, self.out / name)
+        for earlier in self.artifacts(stage.name):
+            for name, file in earlier.deliverables(stage).items():
+                if name not in wanted and _is_copy(file, self.out / name):
+                    (self.out / name).unlink()
+
+
+def _is_copy(source: Path, target: Path) -> bool:
+    """Whether ``_copy_if_changed`` made it, and nobody has changed it since."""
+    before = source.stat()
+    return target.is_file() and (target.stat().st_size, target.stat().st_mtime_ns) == (
+        before.st_size,
+        before.st_mtime_ns,
+    )
 
 
 def _copy_if_changed(source: Path, target: Path) -> None:
-    before = source.stat()
-    if target.is_file() and (target.stat().st_size, target.stat().st_mtime_ns) == (
-        before.st_size,
-        before.st_mtime_ns,
-    ):
+    if _is_copy(source, target):
         return
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.new")

@@ -1,4 +1,4 @@
-"""The dataset that `undistort` leaves and training reads: `images/`, `masks/` where there are any, `sparse/0`."""
+"""The dataset that `undistort` leaves and training reads: `images/`, `masks/` and `sky_masks/` if any, `sparse/0`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from splatpipe.pipeline.scene.names import NameFinder
 
 IMAGES = "images"
 MASKS = "masks"
+SKY_MASKS = "sky_masks"
 MODEL = "sparse/0"
 NAMES_SHOWN = 5  # of a list in a message
 
@@ -47,12 +48,14 @@ class View:
         image_path: The undistorted photo, in the camera's grid.
         mask_path: Its mask (8-bit, 0 = ignored, same grid), or None.
         depths: Of its sparse points, where training is to keep to them.
+        sky_path: The mask of its sky (8-bit, 0 = something else, same grid), or None where nobody drew one.
     """
 
     camera: Camera
     image_path: Path
     mask_path: Path | None
     depths: PointDepths | None = None
+    sky_path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,9 @@ def image_path(dataset: Path, name: str) -> Path:
     return dataset / IMAGES / PurePosixPath(name)
 
 
-def mask_path(dataset: Path, name: str) -> Path:
+def mask_path(dataset: Path, name: str, folder: str = MASKS) -> Path:
     """Where its mask lies, if it has one: COLMAP's convention, the photo's whole name with `.png` after it."""
-    return dataset / MASKS / PurePosixPath(f"{name}.png")
+    return dataset / folder / PurePosixPath(f"{name}.png")
 
 
 def load_model(dataset: Path) -> pycolmap.Reconstruction:
@@ -119,7 +122,7 @@ def _view(dataset: Path, image: pycolmap.Image) -> View:
         raise StageError(f"The dataset's camera of {image.name} is {camera.model_name}, not PINHOLE.")
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
-    mask = mask_path(dataset, image.name)
+    mask, sky = (mask_path(dataset, image.name, folder) for folder in (MASKS, SKY_MASKS))
     return View(
         Camera(
             image.name,
@@ -133,6 +136,7 @@ def _view(dataset: Path, image: pycolmap.Image) -> View:
         ),
         image_path(dataset, image.name),
         mask if mask.is_file() else None,
+        sky_path=sky if sky.is_file() else None,
     )
 
 
@@ -145,18 +149,11 @@ def load_points(dataset: Path) -> Points:
     Raises:
         StageError: if the model is broken.
     """
-    model = load_model(dataset)
-    points = [model.points3D[number] for number in sorted(model.points3D)]
-    return Points(
-        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        track_lengths=np.array([point.track.length() for point in points], np.int64),
-        errors_px=np.array([point.error for point in points], np.float64),
-    )
+    return _points(load_model(dataset))
 
 
-def load_tracks(dataset: Path) -> dict[str, Int64[np.ndarray, " _"]]:
-    """Which sparse points each photo observes: rows of ``load_points`` by the photo's name, ascending, each once.
+def load_points_and_tracks(dataset: Path) -> tuple[Points, dict[str, Int64[np.ndarray, " _"]]]:
+    """The sparse points, and which of them each photo observes: rows by the photo's name, ascending, each once.
 
     Args:
         dataset: The folder that `undistort` left.
@@ -170,7 +167,17 @@ def load_tracks(dataset: Path) -> dict[str, Int64[np.ndarray, " _"]]:
     for image in model.images.values():
         observed = [point.point3D_id for point in image.points2D if point.has_point3D()]
         tracks[image.name] = np.searchsorted(numbers, np.unique(np.array(observed, np.int64)))
-    return tracks
+    return _points(model), tracks
+
+
+def _points(model: pycolmap.Reconstruction) -> Points:
+    points = [model.points3D[number] for number in sorted(model.points3D)]
+    return Points(
+        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        track_lengths=np.array([point.track.length() for point in points], np.int64),
+        errors_px=np.array([point.error for point in points], np.float64),
+    )
 
 
 def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str], list[str]]:

@@ -55,11 +55,15 @@ def load_colour(view: View) -> Pixels:
 
 def load_mask(view: View) -> Mask | None:
     """A view's mask, (h, w), True where the photo counts; None where it has none."""
-    if view.mask_path is None:
+    return None if view.mask_path is None else _load_mask(view, view.mask_path)
+
+
+def reduced_sky(view: View, max_megapixels: float) -> Mask | None:
+    """A view's drawn sky, (h, w), at the size of ``reduced_view``, True where it is; None where nobody drew it."""
+    if view.sky_path is None:
         return None
-    pixels = read_image(view.mask_path, cv2.IMREAD_GRAYSCALE)
-    _check_size(view, pixels, view.mask_path)
-    return np.asarray(pixels > 0)
+    camera = reduced_camera(view.camera, max_megapixels)
+    return _reduced(_load_mask(view, view.sky_path), (camera.width, camera.height))
 
 
 def reduced_camera(camera: Camera, max_megapixels: float | None, level: int = 0) -> Camera:
@@ -97,11 +101,19 @@ def reduced_view(view: View, max_megapixels: float | None, level: int = 0) -> tu
         return camera, colour, mask
     size = (camera.width, camera.height)
     colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if mask is not None:
-        # Not "all of it counts": OpenCV's weights add up to as little as 0.999, but those of nothing are exactly zero.
-        ignored = cv2.resize((~mask).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        mask = np.asarray(ignored == 0.0)
-    return camera, colour, mask
+    return camera, colour, None if mask is None else _reduced(mask, size)
+
+
+def _load_mask(view: View, path: Path) -> Mask:
+    pixels = read_image(path, cv2.IMREAD_GRAYSCALE)
+    _check_size(view, pixels, path)
+    return np.asarray(pixels > 0)
+
+
+def _reduced(mask: Mask, size: tuple[int, int]) -> Mask:
+    """True where all below is."""
+    # Not by a share of 1: OpenCV's weights add up to as little as 0.999, but those of nothing are exactly zero.
+    return np.asarray(cv2.resize((~mask).astype(np.float32), size, interpolation=cv2.INTER_AREA) == 0.0)
 
 
 def _check_size(view: View, pixels: Pixels, path: Path) -> None:

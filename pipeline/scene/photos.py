@@ -24,6 +24,7 @@ PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LIST_NAME = "photos.json"
 CONVERTED_DIR = "converted"
 MASK_DIR = "masks"
+SKY_DIR = "sky_masks"
 MODEL_FILES = ("cameras.bin", "cameras.txt")
 UNTURN = {  # the inverse of the turn that each EXIF orientation asks for
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -50,6 +51,7 @@ class Photo:
         orientation: EXIF's, 1 to 8; how to turn the picture for people, and only for them.
         converted: The 8-bit PNG to read instead of the file, relative to the part; None when the file itself is plain.
         mask: The 8-bit PNG mask in the stored grid at full size, 0 where ignored, else 255; relative to the part.
+        sky_mask: The same of the sky, which is 255.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Photo:
     orientation: int = 1
     converted: str | None = None
     mask: str | None = None
+    sky_mask: str | None = None
 
 
 @dataclass(frozen=True)
@@ -152,11 +155,20 @@ def decode_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None:
     Raises:
         SplatpipeError: if the mask is gone or has another size than the photo.
     """
-    if photo.mask is None:
+    return _decode_mask(photo, photo.mask, part)
+
+
+def decode_sky_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None:
+    """Read a photo's mask of the sky likewise: 255 where the sky is, else 0."""
+    return _decode_mask(photo, photo.sky_mask, part)
+
+
+def _decode_mask(photo: Photo, file: str | None, part: Path) -> UInt8[np.ndarray, "h w"] | None:
+    if file is None:
         return None
-    mask = _read(_inside(part, photo.mask), "L", photo.mask)
+    mask = _read(_inside(part, file), "L", file)
     if mask.shape != (photo.height, photo.width):
-        raise _changed(photo.mask, f"it is {mask.shape[1]} × {mask.shape[0]} px now")
+        raise _changed(file, f"it is {mask.shape[1]} × {mask.shape[0]} px now")
     return mask
 
 

@@ -54,11 +54,13 @@ class SkyPhoto:
         camera: At the size of ``pixels``.
         pixels: RGB.
         ignored: True where the user's mask leaves pixels out; None without a mask.
+        drawn: The sky, where the user drew it; None where it is to be found.
     """
 
     camera: Camera
     pixels: UInt8[np.ndarray, "h w 3"]
     ignored: Bool[np.ndarray, "h w"] | None = None
+    drawn: Bool[np.ndarray, "h w"] | None = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def find_skies(
     up: Float64[np.ndarray, " 3"],
     threads: int = 1,
 ) -> list[SkyMask]:
-    """The sky in each photo of a capture.
+    """The sky in each photo of a capture: as it is drawn, else found.
 
     Args:
         cameras: Of the photos, in one world frame, of any size.
@@ -117,14 +119,14 @@ def find_skies(
         threads: That load and search.
     """
 
-    def search(index: int) -> tuple[SkyMask, Votes]:
-        found = photo(index)
-        mask = find_sky(found, points_in(found.camera, points), up)
-        return SkyMask.packed(mask), votes_of(found.camera, mask, up)
+    def search(index: int) -> tuple[SkyMask, Votes, bool]:
+        seen = photo(index)
+        mask = find_sky(seen, points_in(seen.camera, points), up) if seen.drawn is None else seen.drawn
+        return SkyMask.packed(mask), votes_of(seen.camera, mask, up), seen.drawn is not None
 
     searched = list(ordered_map(search, range(len(cameras)), threads))
-    kept = agreed([votes for _, votes in searched])
-    return [mask if keep else mask.emptied() for (mask, _), keep in zip(searched, kept, strict=True)]
+    kept = agreed([votes for _, votes, _ in searched])
+    return [mask if keep or drawn else mask.emptied() for (mask, _, drawn), keep in zip(searched, kept, strict=True)]
 
 
 def up_of(

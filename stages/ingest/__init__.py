@@ -18,6 +18,7 @@ from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.photos import (
     CONVERTED_DIR,
     MASK_DIR,
+    SKY_DIR,
     Photo,
     PhotoList,
     colmap_model,
@@ -30,7 +31,7 @@ from splatpipe.stages.ingest.convert import convert_photo, save_png, scale_of
 from splatpipe.stages.ingest.duplicates import split_duplicates
 from splatpipe.stages.ingest.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
 from splatpipe.stages.ingest.positions import DATUM_STEP_M, PositionList, positions_json, read_positions
-from splatpipe.stages.ingest.scan import LeftOut, Scan, scan_folder
+from splatpipe.stages.ingest.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan, scan_folder
 from splatpipe.stages.line import IngestConfig
 
 MIN_PHOTOS = 2
@@ -38,6 +39,17 @@ NAMES_SHOWN = 10  # in one message; left_out.json has them all
 MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly meant
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What masks are for: the name of the user's folders, and of the folder in the part."""
+
+    folder: str
+    part: str
+
+
+_MASKS, _SKIES = _Kind(MASK_FOLDER, MASK_DIR), _Kind(SKY_FOLDER, SKY_DIR)
 
 
 @dataclass(frozen=True)
@@ -75,12 +87,14 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         _tell_left_out(left_out, report)
         groups, camera_of = group_cameras(photos)
         opacity = _convert(photos, camera_of, work)
-        masked = _mask(root, photos, [entry.name for entry in left_out], opacity, work)
+        others = [entry.name for entry in left_out]
+        masked = _mask(_MASKS, root, photos, others, opacity, work)
+        skies = _mask(_SKIES, root, photos, others, {}, work)
     positions = read_positions(photos)
     _tell_positions(positions, report)
     if colmap_model(inputs.photos_dir) is None:  # a given model has its calibration
         _tell_focal(groups, report)
-    save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked) for photo in photos)), part)
+    save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
     _write_json(out / "cameras.json", cameras_json(groups))
     _write_json(out / "positions.json", positions_json(positions))
     _write_json(out / "left_out.json", {"left_out": [{"name": e.name, "reason": e.reason} for e in left_out]})
@@ -91,6 +105,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "focal_sources": sorted({group.focal_source for group in groups}),
         "positions": len(positions.positions),
         "masks": len(masked),
+        "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
     }
 
@@ -126,14 +141,15 @@ def _convert(
 
 
 def _mask(
+    kind: _Kind,
     root: Path,
     photos: Sequence[CheckedPhoto],
     left_out: Sequence[str],
     opacity: Mapping[str, UInt8[np.ndarray, "h w"]],
     work: _Work,
 ) -> set[str]:
-    """Write the masks, from ``masks/`` and from transparency; returns the names of masked photos."""
-    files = find_masks(root) if work.config.masks else []
+    """Write the masks of a kind, from its folder and from transparency; returns the names of masked photos."""
+    files = find_masks(root, kind.folder) if work.config.masks else []
     matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
     if unused:
         names = _names([mask.label for mask in unused])
@@ -147,15 +163,15 @@ def _mask(
             values = clear if values is None else np.minimum(values, clear)
         if values is None:
             return problem
-        save_png(values, work.part / mask_path(photo.name))
-        if np.mean(values == 0) > MOSTLY_IGNORED:
+        save_png(values, work.part / mask_path(photo.name, kind.part))
+        if kind is _MASKS and np.mean(values == 0) > MOSTLY_IGNORED:
             return f"The mask of {_shown(photo.name)} leaves hardly anything of it: black is what is ignored."
         return problem
 
     problems = _in_threads(write, masked, work, "preparing masks", "masks")
     for problem in dict.fromkeys(problem for problem in problems if problem is not None):
         work.report.warning(problem)
-    return {photo.name for photo in masked if (work.part / mask_path(photo.name)).is_file()}
+    return {photo.name for photo in masked if (work.part / mask_path(photo.name, kind.part)).is_file()}
 
 
 def _read(
@@ -174,12 +190,12 @@ def converted_path(name: str) -> str:
     return f"{CONVERTED_DIR}/{name}.png"
 
 
-def mask_path(name: str) -> str:
+def mask_path(name: str, folder: str) -> str:
     """Where a photo's mask lies in the part: as COLMAP looks for it below a mask folder."""
-    return f"{MASK_DIR}/{name}.png"
+    return f"{folder}/{name}.png"
 
 
-def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]) -> Photo:
+def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str], skies: set[str]) -> Photo:
     return Photo(
         name=checked.name,
         sha256=checked.sha256,
@@ -189,7 +205,8 @@ def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]
         time=checked.exif.time,
         orientation=checked.exif.orientation,
         converted=None if checked.plain else converted_path(checked.name),
-        mask=mask_path(checked.name) if checked.name in masked else None,
+        mask=mask_path(checked.name, MASK_DIR) if checked.name in masked else None,
+        sky_mask=mask_path(checked.name, SKY_DIR) if checked.name in skies else None,
     )
 
 

@@ -29,7 +29,7 @@ class MaskError(Exception):
 
 @dataclass(frozen=True)
 class MaskFile:
-    """A file below a ``masks/`` folder.
+    """A file below a ``masks/`` or ``sky_masks/`` folder.
 
     Attributes:
         label: How to call it in a message.
@@ -42,21 +42,22 @@ class MaskFile:
     path: Path
 
 
-def find_masks(root: Path) -> list[MaskFile]:
+def find_masks(root: Path, called: str = MASK_FOLDER) -> list[MaskFile]:
     """Every file below a ``masks/`` folder inside or beside the photo folder.
 
     ``masks/a/x.png`` inside or beside it and ``a/masks/x.png`` inside it stand for the photo ``a/x``.
 
     Args:
         root: The photo folder, whose names it follows.
+        called: The name of the folders.
     """
     found: list[MaskFile] = []
-    beside = root.parent / MASK_FOLDER
+    beside = root.parent / called
     if beside.is_dir() and beside != root:
         found += _mask_files(beside, PurePosixPath(), "../")
     for folder, folders, _ in os.walk(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in [name for name in folders if name.casefold() == MASK_FOLDER]:
+        for name in [name for name in folders if name.casefold() == called]:
             folders.remove(name)
             above = PurePosixPath(Path(folder).relative_to(root).as_posix())
             found += _mask_files(Path(folder) / name, above, "" if str(above) == "." else f"{above}/")

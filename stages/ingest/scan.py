@@ -20,6 +20,7 @@ OTHER_PICTURES = {
 }
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".iiq", ".3fr"}
 MASK_FOLDER = "masks"
+SKY_FOLDER = "sky_masks"
 HEAD_BYTES = 16
 MAX_NAME_BYTES = 250
 TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -59,8 +60,9 @@ class Scan:
 def scan_folder(root: Path) -> Scan:
     """Look through a folder and the folders in it.
 
-    Hidden files and folders and ``masks/`` are passed over, and so are links to folders (they may lead in circles, and
-    what they lead to is not what the run's digests pin). A file is a photo by its first bytes, whatever it is called.
+    Hidden files and folders, ``masks/`` and ``sky_masks/`` are passed over, and so are links to folders (they may lead
+    in circles, and what they lead to is not what the run's digests pin). A file is a photo by its first bytes, whatever
+    it is called.
 
     Args:
         root: The folder that names are relative to.
@@ -73,7 +75,8 @@ def scan_folder(root: Path) -> Scan:
         left_out.append(LeftOut(_name(Path(error.filename), root), "is a folder that may not be read"))
 
     for folder, folders, files in os.walk(root, onerror=unreadable):
-        folders[:] = sorted(name for name in folders if not name.startswith(".") and name.casefold() != MASK_FOLDER)
+        passed = [name for name in folders if name.startswith(".") or name.casefold() in (MASK_FOLDER, SKY_FOLDER)]
+        folders[:] = sorted(set(folders) - set(passed))
         links = [Path(folder) / name for name in folders if (Path(folder) / name).is_symlink()]
         left_out += [LeftOut(_name(link, root), "is a link to a folder, which is not followed") for link in links]
         for name in files:

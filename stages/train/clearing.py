@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatpipe.pipeline.scene.dataset import View, load_points, load_tracks
+from splatpipe.pipeline.scene.dataset import View, load_points_and_tracks
 from splatpipe.pipeline.scene.free_space import FreeSpace, free_space, near_or_free
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.line import TrainConfig
@@ -34,9 +34,9 @@ def free_space_of(views: Sequence[View], dataset: Path, options: TrainConfig) ->
     """
     if not options.prune_free_space:
         return None
-    tracks = load_tracks(dataset)
+    points, tracks = load_points_and_tracks(dataset)
     cameras = [view.camera for view in views]
-    return free_space(cameras, load_points(dataset).xyz, [tracks[camera.name] for camera in cameras])
+    return free_space(cameras, points.xyz, [tracks[camera.name] for camera in cameras])
 
 
 def unwanted(gaussians: Gaussians, space: FreeSpace | None, options: TrainConfig, iteration: int) -> Bool[Tensor, " n"]:

@@ -25,6 +25,7 @@ BACKGROUND = 3
 RELOCATION = 4
 POSITION_NOISE = 5
 DROPOUT = 12
+ELSEWHERE = 13
 
 
 def _mix(bits: Bits) -> Bits:

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
 import torch
 from torch import Tensor
 
@@ -16,16 +15,17 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
-from splatpipe.pipeline.scene.dataset import View, load_views, split_views
+from splatpipe.pipeline.scene.dataset import View, load_views
 from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.clearing import free_space_of
 from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.density import BLIND, Seen
 from splatpipe.stages.train.depth import supervised, with_depth
-from splatpipe.stages.train.draws import BACKGROUND, uniform
+from splatpipe.stages.train.draws import BACKGROUND, ELSEWHERE, uniform
 from splatpipe.stages.train.dropout import dropped
 from splatpipe.stages.train.exposure import exposures_json
 from splatpipe.stages.train.interrupts import deferred_interrupts
@@ -65,14 +65,14 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     start = read_splat(inputs["initialize.splat"])
     every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
 
+    free = make_plan(config, views, every, names, len(start))
+    scene = Scene(config, start, views_of(free, views), len(free.test_views), inputs.machine)
+
     def make() -> Plan:
-        free = make_plan(config, views, every, names, len(start))
-        scene = Scene(config, start, views_of(free, views), len(free.test_views), inputs.machine)
         return under_budgets(free, scene, train_step, report)
 
     with same_bits(inputs.machine.threads):
-        trained_on, _ = split_views([view.camera.name for view in views], every, names)
-        sky = begin_sky(config, [view for view in views if view.camera.name in set(trained_on)], inputs, report)
+        sky = begin_sky(config, scene.trained_on, inputs, report)
         plan = load_or_write_plan(out / "plan.json", make)
         if budgeted(plan):
             report.note(plan.described())
@@ -133,20 +133,6 @@ def check_device(machine: Machine) -> None:
             "This build of splatpipe has no CUDA kernels, so it cannot train on a CUDA device.",
             hint="Leave --device out, or give --device cpu.",
         )
-
-
-@contextmanager
-def same_bits(threads: int) -> Iterator[None]:
-    """Give the native kernels their threads and torch one: its sums depend on how many there are."""
-    before, before_cv2 = torch.get_num_threads(), cv2.getNumThreads()
-    raster.set_threads(threads)
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)  # the reader's photos are resized on its one thread
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-        cv2.setNumThreads(before_cv2)
 
 
 def resume(path: Path, plan: Plan, report: Reporter, sky: SkyModel | None) -> TrainState | None:
@@ -289,7 +275,8 @@ def losses(
     """
     options, shown, penalty = plan.options, rendered.colour, rendered.colour.new_zeros(())
     if state.sky is not None:
-        shown = state.sky.composite(rendered, photo.camera, behind)
+        elsewhere = random_colour(options, state.iteration + 1, ELSEWHERE)
+        shown = state.sky.composite(rendered, photo.camera, behind, elsewhere)
         penalty = state.sky.penalty(rendered.alpha, photo.camera, options.sky_opacity_weight)
     if state.exposure is not None:
         shown = state.exposure.shown(shown, photo.camera.name)
@@ -313,9 +300,14 @@ def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.Rende
 def background(options: TrainConfig, iteration: int) -> tuple[float, float, float]:
     """What is behind the Gaussians in an iteration, red, green, blue."""
     if options.background == "random":
-        red, green, blue = uniform(options.seed, iteration, BACKGROUND, [0, 1, 2]).tolist()
-        return red, green, blue
+        return random_colour(options, iteration, BACKGROUND)
     return BACKGROUNDS[options.background]
+
+
+def random_colour(options: TrainConfig, iteration: int, stream: int) -> tuple[float, float, float]:
+    """A colour of its own for every iteration, red, green, blue; ``stream`` as in ``draws``."""
+    red, green, blue = uniform(options.seed, iteration, stream, [0, 1, 2]).tolist()
+    return red, green, blue
 
 
 class _Clock:

@@ -15,14 +15,18 @@ _MOMENTS = "adam."
 class SideModel:
     """Named tensors, leaves of autograd, that share their rows, with their moments.
 
+    Args:
+        tensors: As they begin; copied.
+        epsilon: Adam's.
+
     Attributes:
         tensors: (n, ...) each; changed in place.
         adam: Their optimiser.
     """
 
-    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+    def __init__(self, tensors: Mapping[str, Tensor], epsilon: float = 1e-15) -> None:
         self.tensors = {name: tensor.detach().clone().requires_grad_() for name, tensor in tensors.items()}
-        self.adam = Adam(self.tensors)
+        self.adam = Adam(self.tensors, epsilon=epsilon)
 
     def descend(self, rates: Mapping[str, Rate], rows: Bool[Tensor, " n"] | None = None) -> None:
         """Step the tensors against their gradients, which are dropped.
@@ -45,11 +49,12 @@ class SideModel:
         """The inverse of ``to_arrays``.
 
         Raises:
-            KeyError, ValueError, RuntimeError: if something is missing or has another shape.
+            KeyError, ValueError: if something is missing or has another shape; nothing is changed, then.
         """
         for name, tensor in self.tensors.items():
             if arrays[name].shape != tensor.shape:
                 raise ValueError(f"{name} is {tuple(arrays[name].shape)}, not {tuple(tensor.shape)}")
-            tensor.detach().copy_(arrays[name])
         moments = {name.removeprefix(_MOMENTS): array for name, array in arrays.items() if name.startswith(_MOMENTS)}
         self.adam.load_state_dict(moments)
+        for name, tensor in self.tensors.items():
+            tensor.detach().copy_(arrays[name])

@@ -4,7 +4,7 @@ A colour by direction alone behind the scene, and a loss on the opacity of rays 
 al., "Urban Radiance Fields", CVPR 2022; beside Gaussians, as an explicit map of directions, of Yan et al., "Street
 Gaussians", ECCV 2024. Here the sky is found without a network (``pipeline.scene.sky``), the map has cells of some
 degrees and starts at what the photos show, and only pixels known to be sky train it: a wall that the Gaussians do not
-cover yet is not painted into the sky.
+cover yet is not painted into the sky. Away from the sky a random colour takes its place: no wall can borrow the sky's.
 """
 
 from __future__ import annotations
@@ -20,32 +20,33 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64, Shaped
 from torch import Tensor
 
 from splatpipe.pipeline.raster import Render
-from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View, load_points
-from splatpipe.pipeline.scene.images import reduced_view
-from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over, panorama_of
+from splatpipe.pipeline.scene.images import reduced_sky, reduced_view
+from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over
 from splatpipe.pipeline.scene.sky import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
+from splatpipe.stages.train.side import SideModel
 
 LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
 MOST_ERROR_PX = 2.0
 SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
+RIM_PX = 3  # around the sky, of ``WORK_MEGAPIXELS``: what the search may have left of it, and thin things before it
 SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills what no photo shows
 FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # of the colours, a step, from the start to the end of the schedule
 EPSILON = 1e-8  # Adam's: cells that hardly any pixel pulls at stay where they are
 FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: what is unseen above the horizon is smooth by then
 LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour is the mean of
 
+RGB = tuple[float, float, float]
+
 _COLOURS = "colours"
-_ADAM = "adam."
 
 
-class SkyModel:
+class SkyModel(SideModel):
     """The panorama that is trained, and the sky's masks.
 
     Attributes:
         panorama: Its colours are a leaf of autograd.
-        photos: In how many photos there is sky.
     """
 
     def __init__(
@@ -58,9 +59,9 @@ class SkyModel:
             colours: Of the panorama's cells.
             masks: By the photos' names; those without sky may be left out.
         """
-        self.panorama = Panorama(up, torch.from_numpy(colours.copy()).requires_grad_())
+        super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
+        self.panorama = Panorama(up, self.tensors[_COLOURS])
         self._masks = {name: mask for name, mask in masks.items() if mask.any()}
-        self._adam = Adam({_COLOURS: self.panorama.colours}, epsilon=EPSILON)
 
     @property
     def photos(self) -> int:
@@ -85,7 +86,8 @@ class SkyModel:
 
         def photo(index: int) -> SkyPhoto:
             camera, pixels, mask = reduced_view(views[index], WORK_MEGAPIXELS)
-            return SkyPhoto(camera, pixels, None if mask is None else ~mask)
+            drawn = reduced_sky(views[index], WORK_MEGAPIXELS)
+            return SkyPhoto(camera, pixels, None if mask is None else ~mask, drawn)
 
         up = up_of(cameras, photo, believed, threads)
         masks = find_skies(cameras, photo, believed, up, threads)
@@ -95,19 +97,24 @@ class SkyModel:
         colours = first_colours(((photo(index), masks[index].unpacked()) for index in shown), up)
         return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
 
-    def composite(
-        self, rendered: Render, camera: Camera, background: tuple[float, float, float]
-    ) -> Float[Tensor, "h w 3"]:
-        """The render with the sky behind it; what is no sky in the camera's photo does not train the sky.
+    def composite(self, rendered: Render, camera: Camera, background: RGB, elsewhere: RGB) -> Float[Tensor, "h w 3"]:
+        """The render as the photo shows it: before the sky where that may be seen, before ``elsewhere`` where not.
+
+        With the sky behind a wall, too, whatever of the wall is as bright as the sky would be left transparent.
 
         Args:
             rendered: Over ``background``.
             camera: A training photo's.
             background: Stays behind everything below the horizon.
+            elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
         """
         behind = self.panorama.behind(camera, background)
-        mask = self.mask(camera)
-        behind = behind.detach() if mask is None else torch.where(mask[:, :, None], behind, behind.detach())
+        mask, around = self.mask(camera), self.mask(camera, RIM_PX)
+        if mask is None or around is None:
+            return laid_over(rendered.colour, rendered.alpha, background, behind.detach())
+        flat = Panorama(self.panorama.up, behind.new_tensor(elsewhere).expand_as(self.panorama.colours))
+        behind = torch.where(mask[:, :, None], behind, behind.detach())
+        behind = torch.where(around[:, :, None], behind, flat.behind(camera, background))
         return laid_over(rendered.colour, rendered.alpha, background, behind)
 
     def penalty(self, alpha: Float[Tensor, "h w"], camera: Camera, opacity_weight: float) -> Float[Tensor, ""]:
@@ -116,12 +123,19 @@ class SkyModel:
         mask = self.mask(camera)
         return loss if mask is None else loss + opacity_weight * torch.where(mask, alpha, 0.0).mean()
 
-    def mask(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Where a photo surely shows the sky, at the size of ``camera``; None where it shows none."""
+    def mask(self, camera: Camera, rim: int = 0) -> Bool[Tensor, "h w"] | None:
+        """Where a photo surely shows the sky, at the size of ``camera``; None where it shows none.
+
+        Args:
+            camera: A training photo's.
+            rim: Its surroundings, too, so many pixels of ``WORK_MEGAPIXELS`` wide.
+        """
         found = self._masks.get(camera.name)
         if found is None:
             return None
         share = found.unpacked().astype(np.float32)
+        if rim:
+            share = np.asarray(cv2.dilate(share, np.ones((2 * rim + 1, 2 * rim + 1), np.uint8)))
         if share.shape != (camera.height, camera.width):
             shrinks = camera.height < share.shape[0]
             way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -134,26 +148,9 @@ class SkyModel:
         Args:
             share: Of the schedule that is done, 0..1.
         """
-        colours = self.panorama.colours
         rate = math.exp(math.log(FIRST_RATE) * (1.0 - share) + math.log(LAST_RATE) * share)
-        self._adam.step({_COLOURS: colours}, {_COLOURS: rate})
-        colours.grad = None
-        colours.detach().clamp_(0.0, 1.0)
-
-    def to_arrays(self) -> dict[str, Tensor]:
-        """What changes in training, for a checkpoint; not copied."""
-        moments = {_ADAM + name: tensor for name, tensor in self._adam.state_dict().items()}
-        return {_COLOURS: self.panorama.colours.detach(), **moments}
-
-    def load(self, arrays: Mapping[str, Tensor]) -> None:
-        """The inverse of ``to_arrays``.
-
-        Raises:
-            KeyError, ValueError: if the arrays are not a sky's; it is as it was, then.
-        """
-        colours = panorama_of(self.panorama.up, arrays[_COLOURS].numpy()).colours
-        self._adam.load_state_dict({name.removeprefix(_ADAM): tensor for name, tensor in arrays.items()})
-        self.panorama.colours = colours.clone().requires_grad_()
+        self.descend({_COLOURS: rate})
+        self.panorama.colours.detach().clamp_(0.0, 1.0)
 
 
 def roughness(colours: Float[Tensor, "cells 3"]) -> Float[Tensor, ""]:

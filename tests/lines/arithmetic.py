@@ -94,6 +94,9 @@ def count(config: CountConfig, inputs: Inputs, out: Path, report: Reporter) -> S
 def tell(config: TellConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     text = inputs["count.count"].read_text() + " " + inputs["add.total"].read_text()
     (out / "telling.txt").write_text(text.upper() if config.loud else text)
+    (out / "more").mkdir()
+    if config.loud:
+        (out / "more" / "echo.txt").write_text(text.upper())
     return {"length": len(text)}
 
 
@@ -114,9 +117,9 @@ TELL = Stage(
     1,
     TellConfig,
     ("count.count", "add.total"),
-    {"telling": "telling.txt"},
+    {"telling": "telling.txt", "more": "more"},
     "arithmetic:tell",
-    deliverables=("telling",),
+    deliverables=("telling", "more"),
 )
 
 LINE = (READ, ADD, COUNT, TELL)
