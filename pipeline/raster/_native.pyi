@@ -91,7 +91,7 @@ def affine_colour_backward(
     """Gradients by the picture and by the map, written to the last two, from the one by the result."""
 
 def bilateral_colour(grid: Tensor, picture: Tensor, out: Tensor) -> None:
-    """The colours of a float32 (h, w, 3) picture through a (levels, rows, columns, 12) grid of affine maps, to `out`."""
+    """The colours of a float32 (h, w, 3) picture through a (levels, rows, columns, 12) grid of maps, to `out`."""
 
 def bilateral_colour_backward(
     grid: Tensor, picture: Tensor, upstream: Tensor, gradient: Tensor, by_grid: Tensor

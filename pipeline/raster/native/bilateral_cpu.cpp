@@ -13,14 +13,19 @@ namespace {
 
 constexpr float kLuma[3] = {0.299f, 0.587f, 0.114f};  // ITU-R BT.601, of gamma-coded colours
 
-// Twelve vectors a level: the entries of the columns' maps.
-struct Maps {
-    Floats of[kGridLevels][kAffine];
-    SPLAT_METHOD void clear(int levels) {
-        for (int d = 0; d < levels; ++d)
-            for (int k = 0; k < kAffine; ++k) of[d][k] = fill(0.0f);
-    }
+constexpr int kLine = 16;      // floats of a cache line
+constexpr int64_t kAhead = 4;  // rows: a row's vector is in lines, and mostly a page, of its own, which no CPU foresees
+
+// A level's maps for a vector of columns, entry by entry, and dL/d(them). What is used together lies together: arrays
+// of their own would be multiples of 4096 bytes apart, where a CPU takes a load for one of what was just stored.
+struct Level {
+    Floats above[kAffine], growth[kAffine];  // at the row of nodes above, and by what it grows down to the one below
+    Floats upper[kAffine], lower[kAffine];   // dL/d(map of a pixel), all of it and the part that goes down the rows
 };
+
+SPLAT_INLINE void clear(Floats* entries) {
+    for (int k = 0; k < kAffine; ++k) entries[k] = fill(0.0f);
+}
 
 SPLAT_INLINE int bounded(int x, int low, int high) { return x < low ? low : x > high ? high : x; }
 
@@ -48,16 +53,16 @@ SPLAT_INLINE const float* map_at(const GridChunk& chunk, int level, int row, int
     return chunk.maps + ((static_cast<int64_t>(level) * chunk.rows + row) * chunk.columns + column) * kAffine;
 }
 
-// The columns' maps at the row of nodes above, and what they grow by down to the one below.
-SPLAT_INLINE void interpolate(const GridChunk& chunk, const Columns& columns, Maps* above, Maps* growth) {
-    above->clear(chunk.levels), growth->clear(chunk.levels);
-    for (int node = columns.first; node <= columns.last; ++node) {
-        const Floats weight = columns.weight(node);
-        for (int d = 0; d < chunk.levels; ++d) {
+SPLAT_INLINE void interpolate(const GridChunk& chunk, const Columns& columns, Level* levels) {
+    for (int d = 0; d < chunk.levels; ++d) {
+        Level& level = levels[d];
+        clear(level.above), clear(level.growth), clear(level.upper), clear(level.lower);
+        for (int node = columns.first; node <= columns.last; ++node) {
+            const Floats weight = columns.weight(node);
             const float *top = map_at(chunk, d, chunk.cell, node), *bottom = map_at(chunk, d, chunk.cell + 1, node);
             for (int k = 0; k < kAffine; ++k) {
-                above->of[d][k] = fma(weight, fill(top[k]), above->of[d][k]);
-                growth->of[d][k] = fma(weight, fill(bottom[k] - top[k]), growth->of[d][k]);
+                level.above[k] = fma(weight, fill(top[k]), level.above[k]);
+                level.growth[k] = fma(weight, fill(bottom[k] - top[k]), level.growth[k]);
             }
         }
     }
@@ -77,15 +82,16 @@ SPLAT_INLINE Floats level_of(const Floats& luminance, int levels) {
     return clamp(luminance, fill(0.0f), fill(1.0f)) * fill(static_cast<float>(levels - 1));
 }
 
-SPLAT_INLINE Colours sliced(const Maps& above, const Maps& growth, int levels, const Floats& down, const Colours& in) {
-    const Floats place = level_of(luminance(in), levels);
+SPLAT_INLINE Colours sliced(const Level* levels, int count, const Floats& down, const Colours& in) {
+    const Floats place = level_of(luminance(in), count);
     Floats map[kAffine];
     for (int k = 0; k < kAffine; ++k) map[k] = fill(0.0f);
-    for (int d = 0; d < levels; ++d) {
+    for (int d = 0; d < count; ++d) {
         const Floats away = magnitude(place - fill(static_cast<float>(d)));
         if (!any(less(away, fill(1.0f)))) continue;
         const Floats weight = max(fill(1.0f) - away, fill(0.0f)), lower = weight * down;
-        for (int k = 0; k < kAffine; ++k) map[k] = fma(weight, above.of[d][k], fma(lower, growth.of[d][k], map[k]));
+        for (int k = 0; k < kAffine; ++k)
+            map[k] = fma(weight, levels[d].above[k], fma(lower, levels[d].growth[k], map[k]));
     }
     Colours out;
     for (int i = 0; i < 3; ++i)
@@ -101,32 +107,32 @@ SPLAT_INLINE Floats slope_at(const Floats& cell, int level) {
     return rising - only(both(at_most(at, cell), at_most(cell, at)), fill(1.0f));
 }
 
-// dL/d(in); adds dL/d(map) to `upper`, and its part that goes down the rows to `lower`.
-SPLAT_INLINE Colours sliced_back(const Maps& above, const Maps& growth, int levels, const Floats& down,
-                                 const Colours& in, const Colours& up, Maps* upper, Maps* lower) {
-    const Floats brightness = luminance(in), place = level_of(brightness, levels);
-    const Floats cell = min(floor(place), fill(static_cast<float>(levels - 2)));
+// dL/d(in); adds dL/d(maps) to the levels.
+SPLAT_INLINE Colours sliced_back(Level* levels, int count, const Floats& down, const Colours& in, const Colours& up) {
+    const Floats brightness = luminance(in), place = level_of(brightness, count);
+    const Floats cell = min(floor(place), fill(static_cast<float>(count - 2)));
     Floats products[kAffine], map[kAffine], by_place = fill(0.0f);  // dL/d(map of the pixel), that map
     for (int k = 0; k < kAffine; ++k) {
         products[k] = k % 4 == 3 ? up.channel[k / 4] : up.channel[k / 4] * in.channel[k % 4];
         map[k] = fill(0.0f);
     }
-    for (int d = 0; d < levels; ++d) {
+    for (int d = 0; d < count; ++d) {
         const Floats away = magnitude(place - fill(static_cast<float>(d)));
         if (!any(at_most(away, fill(1.0f)))) continue;
         const Floats weight = max(fill(1.0f) - away, fill(0.0f)), weight_down = weight * down;
+        Level& level = levels[d];
         Floats change = fill(0.0f);
         for (int k = 0; k < kAffine; ++k) {
-            const Floats entry = fma(down, growth.of[d][k], above.of[d][k]);
+            const Floats entry = fma(down, level.growth[k], level.above[k]);
             if (k % 4 != 3) map[k] = fma(weight, entry, map[k]);
             change = fma(products[k], entry, change);
-            upper->of[d][k] = fma(weight, products[k], upper->of[d][k]);
-            lower->of[d][k] = fma(weight_down, products[k], lower->of[d][k]);
+            level.upper[k] = fma(weight, products[k], level.upper[k]);
+            level.lower[k] = fma(weight_down, products[k], level.lower[k]);
         }
         by_place = fma(slope_at(cell, d), change, by_place);
     }
     const Mask inside = both(at_most(fill(0.0f), brightness), at_most(brightness, fill(1.0f)));
-    const Floats by_luminance = only(inside, by_place * fill(static_cast<float>(levels - 1)));
+    const Floats by_luminance = only(inside, by_place * fill(static_cast<float>(count - 1)));
     Colours by_in;
     for (int j = 0; j < 3; ++j)
         by_in.channel[j] =
@@ -135,19 +141,24 @@ SPLAT_INLINE Colours sliced_back(const Maps& above, const Maps& growth, int leve
     return by_in;
 }
 
+SPLAT_INLINE void prefetch(const float* colours) {
+    for (int i = 0; i < 3 * kLanes; i += kLine) __builtin_prefetch(colours + i);
+}
+
 void forward(const GridChunk& chunk, const float* in, float* out) {
-    Maps above, growth;
+    Level levels[kGridLevels];
     for (int64_t x = chunk.first_x; x < chunk.last_x; x += kLanes) {
-        interpolate(chunk, Columns(chunk, x), &above, &growth);
-        const int64_t count = chunk.last_x - x;
+        interpolate(chunk, Columns(chunk, x), levels);
+        const int64_t count = chunk.last_x - x, ahead = 3 * chunk.width * kAhead;
         for (int64_t y = chunk.first_y; y < chunk.last_y; ++y) {
             const int64_t at = 3 * (y * chunk.width + x);
             const Floats down = share_down(chunk, y);
+            if (y + kAhead < chunk.last_y) prefetch(in + at + ahead), prefetch(out + at + ahead);
             if (count >= kLanes) {
-                put(out + at, sliced(above, growth, chunk.levels, down, get(in + at)));
+                put(out + at, sliced(levels, chunk.levels, down, get(in + at)));
             } else {
                 Ragged last(in + at, count);
-                put(last.pixels, sliced(above, growth, chunk.levels, down, get(last.pixels)));
+                put(last.pixels, sliced(levels, chunk.levels, down, get(last.pixels)));
                 last.to(out + at, count);
             }
         }
@@ -155,8 +166,7 @@ void forward(const GridChunk& chunk, const float* in, float* out) {
 }
 
 // A block's dL/d(map) to the nodes left and right of its columns.
-SPLAT_INLINE void add_to_nodes(const GridChunk& chunk, const Columns& columns, const Maps& upper, const Maps& lower,
-                               float* sums) {
+SPLAT_INLINE void add_to_nodes(const GridChunk& chunk, const Columns& columns, const Level* levels, float* sums) {
     for (int node = columns.first; node <= columns.last; ++node) {
         const Floats weight = columns.weight(node);
         for (int d = 0; d < chunk.levels; ++d) {
@@ -165,8 +175,8 @@ SPLAT_INLINE void add_to_nodes(const GridChunk& chunk, const Columns& columns, c
             for (int k = 0; k < kAffine; k += 4) {
                 Floats rising[4], falling[4];
                 for (int i = 0; i < 4; ++i) {
-                    rising[i] = weight * lower.of[d][k + i];
-                    falling[i] = weight * (upper.of[d][k + i] - lower.of[d][k + i]);
+                    rising[i] = weight * levels[d].lower[k + i];
+                    falling[i] = weight * (levels[d].upper[k + i] - levels[d].lower[k + i]);
                 }
                 float parts[8];
                 sum_lanes(falling[0], falling[1], falling[2], falling[3], parts);
@@ -178,28 +188,27 @@ SPLAT_INLINE void add_to_nodes(const GridChunk& chunk, const Columns& columns, c
 }
 
 void backward(const GridChunk& chunk, const float* in, const float* upstream, float* gradient, float* sums) {
-    Maps above, growth, upper, lower;
+    Level levels[kGridLevels];
     for (int64_t x = chunk.first_x; x < chunk.last_x; x += kLanes) {
         const Columns columns(chunk, x);
-        interpolate(chunk, columns, &above, &growth);
-        upper.clear(chunk.levels), lower.clear(chunk.levels);
-        const int64_t count = chunk.last_x - x;
+        interpolate(chunk, columns, levels);
+        const int64_t count = chunk.last_x - x, ahead = 3 * chunk.width * kAhead;
         for (int64_t y = chunk.first_y; y < chunk.last_y; ++y) {
             const int64_t at = 3 * (y * chunk.width + x);
             const Floats down = share_down(chunk, y);
+            if (y + kAhead < chunk.last_y)
+                prefetch(in + at + ahead), prefetch(upstream + at + ahead), prefetch(gradient + at + ahead);
             if (count >= kLanes) {
-                put(gradient + at,
-                    sliced_back(above, growth, chunk.levels, down, get(in + at), get(upstream + at), &upper, &lower));
+                put(gradient + at, sliced_back(levels, chunk.levels, down, get(in + at), get(upstream + at)));
             } else {
                 const Ragged last(in + at, count);
                 Ragged up(upstream + at, count);
                 const Colours colours = get(up.pixels);
-                put(up.pixels,
-                    sliced_back(above, growth, chunk.levels, down, get(last.pixels), colours, &upper, &lower));
+                put(up.pixels, sliced_back(levels, chunk.levels, down, get(last.pixels), colours));
                 up.to(gradient + at, count);
             }
         }
-        add_to_nodes(chunk, columns, upper, lower, sums);
+        add_to_nodes(chunk, columns, levels, sums);
     }
 }
 
