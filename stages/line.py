@@ -113,8 +113,9 @@ class TrainConfig(StageConfig):
     """Nodes of a bilateral grid along each side of a photo."""
     exposure_levels: Annotated[int, Field(ge=2, le=16)] = 4
     """Its nodes from black to white."""
-    exposure_smoothness: NonNegativeFloat = 10.0
-    """Weight in the loss of the mean squared differences between its neighbouring nodes."""
+    exposure_smoothness: NonNegativeFloat = 100.0
+    """Weight in the loss of the mean squared differences between its neighbouring nodes; with less of it the grid takes
+    shading and colour from the splat."""
     exposure_decay: NonNegativeFloat = 1e-3
     """How strongly the maps are drawn to the identity: this times their deviation joins the loss's gradient."""
     lr_exposure: PositiveFloat = 1e-3

@@ -42,12 +42,11 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def trained(scene: Path, out: Path, exposure: str, smoothness: float = 100.0) -> Path:
+def trained(scene: Path, out: Path, exposure: str) -> Path:
     out.mkdir(parents=True)
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
     settings = {"evaluate.every": 0, "evaluate.views": ""}
     config = TrainConfig(iterations=400, densify_gradient=1e-3, exposure=exposure, lr_exposure=1e-2)
-    config = config.model_copy(update={"exposure_smoothness": smoothness})
     train.run(config, Inputs(parts, scene, settings, Machine("cpu", 2)), out, tiny_scene.Recorder())
     return out
 
