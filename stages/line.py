@@ -106,9 +106,17 @@ class TrainConfig(StageConfig):
     """Share of 1 - SSIM in the loss; the rest is L1."""
     loss: Literal["native", "kornia"] = "native"
     """Who computes the loss and its gradient: our kernels, or kornia's SSIM under torch, some 50 times slower."""
-    exposure: Literal["off", "affine"] = "off"
+    exposure: Literal["off", "affine", "bilateral"] = "off"
     """What exposure and white balance did to each photo: not modelled, or as an affine map of its colours that is
-    trained along. The splat keeps the photos' mean appearance."""
+    trained along; `bilateral`: one by place and brightness, for vignetting and local tone mapping. The splat keeps the
+    photos' mean appearance."""
+    exposure_side: Annotated[int, Field(ge=2, le=64)] = 8
+    """Nodes of a bilateral grid along each side of a photo."""
+    exposure_levels: Annotated[int, Field(ge=2, le=16)] = 4
+    """Its nodes from black to white."""
+    exposure_smoothness: NonNegativeFloat = 100.0
+    """Weight in the loss of the mean squared differences between its neighbouring nodes; with less of it the grid takes
+    shading and colour from the splat."""
     exposure_decay: NonNegativeFloat = 1e-3
     """How strongly the maps are drawn to the identity: this times their deviation joins the loss's gradient."""
     lr_exposure: PositiveFloat = 1e-3
@@ -285,6 +293,7 @@ TRAIN = Stage(
         "history": "history.json",
         "plan": "plan.json",
         "exposures": "exposures.json",
+        "exposure_grids": "exposures.npz",
         "sky": "sky.npz",
     },
     entry="splatpipe.stages.train:run",

@@ -30,7 +30,7 @@ from splatpipe.stages.train.stream import TrainingPhoto
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "sky.npz"]
+PARTS = ["exposures.json", "exposures.npz", "history.json", "model.ply", "plan.json", "sky.npz"]
 TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "exposure": "affine",
     "filter_3d": True,
@@ -148,8 +148,11 @@ def test_killed_training_goes_on_and_ends_with_the_same_bits(
     assert digest(tmp_path) == digest(undisturbed)
 
 
-def test_killed_training_with_every_technique_ends_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
-    config = QUICK.model_copy(update=TECHNIQUES)
+@pytest.mark.parametrize("exposure", ["affine", "bilateral"])
+def test_killed_training_with_every_technique_ends_with_the_same_bits(
+    scene: Path, tmp_path: Path, exposure: str
+) -> None:
+    config = QUICK.model_copy(update=TECHNIQUES | {"exposure": exposure})
     whole = trained(scene, tmp_path / "whole", config)
     for name, value in TECHNIQUES.items():
         assert getattr(TrainConfig(), name) != value

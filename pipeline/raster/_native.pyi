@@ -90,6 +90,14 @@ def affine_colour_backward(
 ) -> None:
     """Gradients by the picture and by the map, written to the last two, from the one by the result."""
 
+def bilateral_colour(grid: Tensor, picture: Tensor, out: Tensor) -> None:
+    """The colours of a float32 (h, w, 3) picture through a (levels, rows, columns, 12) grid of maps, to `out`."""
+
+def bilateral_colour_backward(
+    grid: Tensor, picture: Tensor, upstream: Tensor, gradient: Tensor, by_grid: Tensor
+) -> None:
+    """Gradients by the picture and by the grid, written to the last two, from the one by the result."""
+
 def adam_step(
     values: Sequence[Tensor],
     gradients: Sequence[Tensor],

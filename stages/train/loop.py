@@ -28,6 +28,7 @@ from splatpipe.stages.train.depth import supervised, with_depth
 from splatpipe.stages.train.draws import BACKGROUND, ELSEWHERE, uniform
 from splatpipe.stages.train.dropout import dropped
 from splatpipe.stages.train.exposure import exposures_json
+from splatpipe.stages.train.exposure_grid import write_grids
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
@@ -89,6 +90,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
+    write_grids(out / "exposures.npz", state.exposure)
     return {
         "gaussians": len(gaussians),
         "iterations": state.iteration,

@@ -23,6 +23,7 @@ from splatpipe.stages.train.clearing import unwanted
 from splatpipe.stages.train.densify import DensityEvent, is_density_step, is_opacity_reset, reset_opacity, room_at
 from splatpipe.stages.train.density import Density, DensityStep, make_density
 from splatpipe.stages.train.exposure import Exposure
+from splatpipe.stages.train.exposure_grid import make_exposure
 from splatpipe.stages.train.history import History
 from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.regularise import limit_needles
@@ -105,7 +106,7 @@ class TrainState:
         """Gaussians with everything that the plan wants beside them, nothing of it trained."""
         options = plan.options
         state = TrainState(gaussians, Adam(gaussians.tensors()), make_density(options, len(gaussians)), history)
-        state.exposure = Exposure(plan.train_views) if options.exposure != "off" else None
+        state.exposure = make_exposure(plan.train_views, options)
         state.coverage = Coverage(len(gaussians)) if options.sh_limit else None
         state.sky = sky
         return state

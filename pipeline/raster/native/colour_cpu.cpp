@@ -1,22 +1,10 @@
 // A picture's colours through one affine map, and back. Compiled once per ISA: internal linkage, no std templates.
 #include "colour.h"
-#include "simd.h"
+#include "rgb.h"
 
 namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
-
-struct Colours {
-    Floats channel[3];
-};
-
-SPLAT_INLINE Colours get(const float* p) {
-    Colours c;
-    load_rgb(p, &c.channel[0], &c.channel[1], &c.channel[2]);
-    return c;
-}
-
-SPLAT_INLINE void put(float* p, const Colours& c) { store_rgb(p, c.channel[0], c.channel[1], c.channel[2]); }
 
 SPLAT_INLINE Colours mapped(const float* map, const Colours& in) {
     Colours out;
@@ -47,17 +35,6 @@ SPLAT_INLINE void add_products(const Colours& in, const Colours& up, Sums* sums)
         sums->of[4 * i + 3] = sums->of[4 * i + 3] + up.channel[i];
     }
 }
-
-// The last pixels, fewer than kLanes, padded with zeros, which add nothing to a sum.
-struct Ragged {
-    float pixels[3 * kLanes];
-    SPLAT_METHOD Ragged(const float* p, int64_t count) {
-        for (int64_t i = 0; i < 3 * kLanes; ++i) pixels[i] = i < 3 * count ? p[i] : 0.0f;
-    }
-    SPLAT_METHOD void to(float* p, int64_t count) const {
-        for (int64_t i = 0; i < 3 * count; ++i) p[i] = pixels[i];
-    }
-};
 
 void forward(const float* map, const float* in, int64_t pixels, float* out) {
     int64_t i = 0;
