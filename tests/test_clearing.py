@@ -13,7 +13,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.free_space import FreeSpace, near_or_free
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.line import TrainConfig
-from splatpipe.stages.train.clearing import STEPS_BETWEEN, free_space_of, unwanted
+from splatpipe.stages.train.clearing import STEPS_BETWEEN, free_space_of, is_clearing_step, unwanted
 from splatpipe.stages.train.plan import make_plan, resolve_schedule
 from splatpipe.stages.train.state import TrainState
 
@@ -72,6 +72,24 @@ def test_every_strategy_takes_it_away(dataset: Path, space: FreeSpace, density: 
     state.control_density(plan.options, plan.extent, 8, LOOKS)
     assert len(state.gaussians) >= 4
     assert not near_or_free(state.gaussians.detach(), space, 2).any()
+
+
+def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: Path, space: FreeSpace) -> None:
+    plan = make_plan(TrainConfig(prune_free_space=2), load_views(dataset), 0, "", 8)
+    step = STEPS_BETWEEN * int(plan.options.densify_every)
+    after = (int(plan.options.densify_until) // step + 1) * step
+    assert is_clearing_step(space, plan.options, after) and not is_clearing_step(space, plan.options, after + 1)
+    assert not is_clearing_step(space, plan.options, plan.options.iterations)
+    state = TrainState.begin(haze_and_wall(), plan)
+    state.free_space = space
+    before = state.gaussians.detach().select(torch.arange(4, 8))
+    state.control_density(plan.options, plan.extent, 8, after)
+    for name, tensor in before.tensors().items():
+        assert torch.equal(state.gaussians.detach().tensors()[name], tensor)
+    assert state.history.density == [
+        {"iteration": after, "gaussians": 4, "pruned": 4}
+        | dict.fromkeys(("cloned", "split", "held_back", "relocated", "added"), 0)
+    ]
 
 
 def test_nobody_asks_nothing_is_looked_at(dataset: Path) -> None:

@@ -19,6 +19,7 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.line import TrainConfig
 
 STEPS_BETWEEN = 5  # steps of density control from one look to the next: a look takes as long as several iterations
+LAST_LOOK = 0.9  # of the run: the rest closes the holes
 
 
 def free_space_of(views: Sequence[View], dataset: Path, options: TrainConfig) -> FreeSpace | None:
@@ -39,6 +40,22 @@ def free_space_of(views: Sequence[View], dataset: Path, options: TrainConfig) ->
     return free_space(cameras, points.xyz, [tracks[camera.name] for camera in cameras])
 
 
+def is_clearing_step(space: FreeSpace | None, options: TrainConfig, iteration: int) -> bool:
+    """Whether Gaussians in free space are looked for after an iteration (from 1).
+
+    Density control has its own beginning and end. Looking goes on after it: what is left fits the photos by hanging
+    before the surface, most of all where they are few.
+
+    Args:
+        space: What is free; None where nobody asks.
+        options: Resolved.
+        iteration: The one that ends.
+    """
+    every = STEPS_BETWEEN * int(options.densify_every)
+    due = iteration % every == 0 and int(options.densify_from) <= iteration <= LAST_LOOK * options.iterations
+    return space is not None and options.densify and due
+
+
 def unwanted(gaussians: Gaussians, space: FreeSpace | None, options: TrainConfig, iteration: int) -> Bool[Tensor, " n"]:
     """Which Gaussians hang in free space, at a step of density control that looks; none at the others.
 
@@ -48,6 +65,6 @@ def unwanted(gaussians: Gaussians, space: FreeSpace | None, options: TrainConfig
         options: Resolved.
         iteration: Now.
     """
-    if space is None or iteration % (STEPS_BETWEEN * int(options.densify_every)) != 0:
+    if space is None or not is_clearing_step(space, options, iteration):
         return torch.zeros(len(gaussians), dtype=torch.bool)
     return near_or_free(gaussians, space, options.prune_free_space)

@@ -47,6 +47,13 @@ class Growth:
         return Growth(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
+def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> Growth:
+    """The Gaussians of a mask, as they are."""
+    source = torch.nonzero(rows).flatten()
+    kept = gaussians.select(source)
+    return Growth(source, torch.zeros(len(kept), dtype=torch.bool), kept.means, kept.log_scales, kept.opacity_logits)
+
+
 @dataclass(frozen=True)
 class DensityEvent:
     """What a step of density control did.

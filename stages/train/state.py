@@ -19,8 +19,16 @@ from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, Checkpoint
-from splatpipe.stages.train.clearing import unwanted
-from splatpipe.stages.train.densify import DensityEvent, is_density_step, is_opacity_reset, reset_opacity, room_at
+from splatpipe.stages.train.clearing import is_clearing_step, unwanted
+from splatpipe.stages.train.densify import (
+    DensityEvent,
+    Growth,
+    is_density_step,
+    is_opacity_reset,
+    reset_opacity,
+    room_at,
+    unchanged,
+)
 from splatpipe.stages.train.density import Density, DensityStep, make_density
 from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.exposure_grid import make_exposure
@@ -184,6 +192,8 @@ class TrainState:
         with torch.no_grad():
             if is_density_step(options, iteration):
                 self._densify(options, extent, room_at(options, initial, iteration), iteration)
+            elif is_clearing_step(self.free_space, options, iteration):
+                self._clear(options, iteration)
             if is_opacity_reset(options, iteration):
                 self._reset_opacity(options.reset_opacity)
                 self.adam.zero_state(names=("opacity_logits",))
@@ -205,7 +215,22 @@ class TrainState:
         gone = unwanted(rendered, self.free_space, options, iteration)
         step = DensityStep(options, extent, limit, iteration, rendered, gone)
         growth, counts = self.density.control(gaussians, step)
-        grown = gaussians.select(growth.source)
+        self._become(growth)
+        self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
+
+    def _clear(self, options: TrainConfig, iteration: int) -> None:
+        """Remove what hangs in free space, after the last step of density control, too."""
+        gaussians = self.gaussians.detach()
+        gone = unwanted(self._filtered(gaussians), self.free_space, options, iteration)
+        if bool(gone.any()) and not bool(gone.all()):
+            self._become(unchanged(gaussians, ~gone))
+            pruned = int(gone.sum())
+            self.history.add_density(DensityEvent(iteration, 0, 0, pruned, 0, gaussians=len(self.gaussians)))
+
+    def _become(self, growth: Growth) -> None:
+        """Take the rows of a growth, with their moments."""
+        self.buffers = GradientBuffers()
+        grown = self.gaussians.detach().select(growth.source)
         grown.means, grown.log_scales, grown.opacity_logits = growth.means, growth.log_scales, growth.opacity_logits
         self.gaussians, self.filter_sigmas = grown.requires_grad_(), None
         self.adam.select(growth.source)
@@ -213,7 +238,6 @@ class TrainState:
         if self.coverage is not None:
             self.coverage.select(growth.source)
         self.density.restart(len(grown))
-        self.history.add_density(DensityEvent(iteration, gaussians=len(grown), **counts))
 
     def finished(self) -> Gaussians:
         """The trained model as it is rendered, with its 3D filter: finite, with unit quaternions."""
