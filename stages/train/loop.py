@@ -39,7 +39,7 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
-from splatpipe.stages.train.refinement import anchor_of, refined_json
+from splatpipe.stages.train.refinement import anchor, refined_json
 from splatpipe.stages.train.regularise import add_decay
 from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.smoothing import sampling_of
@@ -81,8 +81,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
         state.sampling = sampling_of(plan, views_of(plan, views))
         state.free_space = free_space_of(views_of(plan, views), inputs["undistort.dataset"], plan.options)
-        if state.refinement is not None:
-            state.refinement.anchor = anchor_of(plan, views_of(plan, views), inputs["undistort.dataset"])
+        anchor(state.refinement, plan, views_of(plan, views), inputs["undistort.dataset"])
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
@@ -103,12 +102,12 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     } | write_side_models(out, state, plan.options)
 
 
-def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> Summary:
+def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dict[str, float]:
     """Write what was trained beside the Gaussians; what the summary says of it."""
     write_panorama(out / "sky.npz", None if state.sky is None else state.sky.panorama)
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
     (out / "cameras_refined.json").write_text(refined_json(state.refinement, options), encoding="utf-8")
-    summary: Summary = {} if state.refinement is None else dict(state.refinement.summary())
+    summary = {} if state.refinement is None else state.refinement.summary()
     if options.sky != "off":
         summary["sky_photos"] = 0 if state.sky is None else state.sky.photos
     return summary

@@ -142,6 +142,12 @@ class CameraRefinement(SideModel):
         }
 
 
+def anchor(refinement: CameraRefinement | None, plan: Plan, views: Sequence[View], dataset: Path) -> None:
+    """Hold a refinement to SfM's cameras, arguments as of ``anchor_of``; nothing where there is none."""
+    if refinement is not None:
+        refinement.anchor = anchor_of(plan, views, dataset)
+
+
 def anchor_of(plan: Plan, views: Sequence[View], dataset: Path) -> Anchor:
     """What a training's cameras are held to.
 
