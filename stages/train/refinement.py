@@ -29,6 +29,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View, load_points, load_tracks
 from splatpipe.pipeline.scene.images import reduced_camera
@@ -40,6 +41,7 @@ from splatpipe.stages.train.stream import TrainingPhoto
 FIRST_SHARE = 0.2  # of the run, in which the Gaussians find their places among SfM's cameras
 LAST_RATE = 0.1  # of the first; exponential in between
 LIMIT_PX = 2.0  # of a photo's motion: what is farther off was placed wrongly, which is not for training to mend
+BETAS = (0.9, 0.99)  # a photo has some dozens of steps: by 0.999 its gradients' size would always be underestimated
 DRIFT_GRID = 5  # places along each side of a picture at which its motion is measured
 DEPENDENT = 1e-9  # of a direction's length: what is left of it is rounding
 _NAME = "shifts"
@@ -76,6 +78,7 @@ class CameraRefinement(SideModel):
 
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__({_NAME: torch.zeros(len(names), 7)})
+        self.adam = Adam(self.tensors, betas=BETAS)
         self._row = {name: row for row, name in enumerate(sorted(names))}
         self.anchor: Anchor | None = None
 

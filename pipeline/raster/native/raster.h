@@ -32,10 +32,10 @@ constexpr int kTile = 16;  // pixels along a tile's side
 constexpr int kTilePixels = kTile * kTile;
 constexpr float kHalfLog2E = 0.72134752044448170f;  // exp(-x/2) = 2^(-kHalfLog2E x)
 constexpr uint32_t kCulled = 0xffffffffu;           // sort key of a Gaussian that is not visible
+constexpr int kSlotFloats = 12;                     // a pair's gradients: SplatGradient's fields in their order
 // How a camera may move, in its own frame: a point x goes to exp(rotation) x + translation, about the camera's centre;
 // then both focal lengths are multiplied by exp(log_focal). In this order.
 constexpr int kCameraFloats = 7;
-constexpr int kSlotFloats = 12;  // a pair's gradients: SplatGradient's fields in their order
 
 // A camera and what to render, in the kernels' precision.
 struct View {

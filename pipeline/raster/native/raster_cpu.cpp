@@ -58,7 +58,7 @@ void RasterFrame::backward(const Parameters& in, const PictureGradients& gradien
         here.camera = shares ? shares + task * kCameraFloats : nullptr;
         project_->project_backward(view_, in, begin, end, data_, here);
     });
-    if (!shares) return;
+    if (!out.camera) return;
     for (int f = 0; f < kCameraFloats; ++f) {  // in the tasks' order, whoever did them
         double sum = 0.0;
         for (int64_t task = 0; task < tasks; ++task) sum += shares[task * kCameraFloats + f];
