@@ -27,6 +27,7 @@ from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.clearing import free_space_of
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
+from splatpipe.stages.train.refinement import anchor
 from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream
@@ -92,6 +93,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
         trained_on = [view for view in views if view.camera.name in names]
         state.sampling = sampling_of(plan, trained_on)
         state.free_space = free_space_of(trained_on, dataset, plan.options)
+        anchor(state.refinement, plan, trained_on, dataset)
         with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
                 loop.train_step(state, plan, photo)

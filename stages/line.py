@@ -121,6 +121,13 @@ class TrainConfig(StageConfig):
     """How strongly the maps are drawn to the identity: this times their deviation joins the loss's gradient."""
     lr_exposure: PositiveFloat = 1e-3
     """Learning rate of the maps at the start; a tenth of it at the end."""
+    refine_cameras: Literal["off", "pose", "pose_focal"] = "off"
+    """Correct the training photos' poses by a fraction of a pixel, 2 at most, from a fifth of the run on; `pose_focal`
+    their focal lengths, too. All together stay where SfM and its georeference have them."""
+    refine_decay: NonNegativeFloat = 1e-3
+    """How strongly each is drawn back to SfM's: this times its motion in pixels joins the loss's gradient."""
+    lr_cameras: PositiveFloat = 0.05
+    """Learning rate of the cameras at the start, pixels; a tenth of it at the end."""
     antialias: bool = False
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
     filter_3d: bool = False
@@ -295,6 +302,7 @@ TRAIN = Stage(
         "exposures": "exposures.json",
         "exposure_grids": "exposures.npz",
         "sky": "sky.npz",
+        "cameras_refined": "cameras_refined.json",
     },
     entry="splatpipe.stages.train:run",
     borrows=("evaluate.every", "evaluate.views"),

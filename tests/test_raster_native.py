@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,9 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.raster import GradientBuffers, Render, RenderOptions, _native, render, set_threads
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from random_scene import random_camera, random_scene
 
 # Tolerances of float32 against float64.
 COLOUR = 1e-5  # sums of up to 60 rounded terms of size 1
@@ -34,29 +39,6 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
     yield request.param
     _native.set_isa(before)
     set_threads(2)
-
-
-def random_scene(seed: int, n: int = 60, sh_degree: int = 3, size: float = -1.5) -> Gaussians:
-    """Overlapping Gaussians before a camera at the origin, some outside its view, some behind it."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    means = normal(n, 3) * torch.tensor([1.5, 1.2, 1.5]) + torch.tensor([0, 0, 4.0])
-    sh = normal(n, (sh_degree + 1) ** 2, 3) * 0.3
-    return Gaussians(means, normal(n, 3) * 0.6 + size, normal(n, 4), normal(n) * 2.0, sh)
-
-
-def random_camera(seed: int, width: int = 70, height: int = 53) -> Camera:
-    """Turned and moved a little, with different focal lengths and the principal point off the centre."""
-    generator = torch.Generator().manual_seed(seed)
-    a, b, c = (0.1 * torch.randn(3, generator=generator, dtype=torch.float64)).tolist()
-    pose = np.eye(4)
-    pose[:3, :3] = torch.matrix_exp(torch.tensor([[0, -c, b], [c, 0, -a], [-b, a, 0]], dtype=torch.float64)).numpy()
-    pose[:3, 3] = 0.1 * torch.randn(3, generator=generator, dtype=torch.float64).numpy()
-    cx, cy = (torch.rand(2, generator=generator, dtype=torch.float64) * 0.4 + 0.3).tolist()
-    return Camera("view", width, height, 60.0, 64.0, width * cx, height * cy, pose)
 
 
 @dataclass

@@ -30,7 +30,7 @@ from splatpipe.stages.train.stream import TrainingPhoto
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-PARTS = ["exposures.json", "exposures.npz", "history.json", "model.ply", "plan.json", "sky.npz"]
+PARTS = ["cameras_refined.json", "exposures.json", "exposures.npz", "history.json", "model.ply", "plan.json", "sky.npz"]
 TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "exposure": "affine",
     "filter_3d": True,
@@ -40,6 +40,7 @@ TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "dropout": 0.2,
     "max_anisotropy": 5.0,
     "prune_free_space": 2,
+    "refine_cameras": "pose_focal",
 }
 QUICK = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15)
 

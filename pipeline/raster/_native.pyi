@@ -58,6 +58,7 @@ class Frame:
         outputs: Sequence[Tensor],
         means2d: Tensor,
         magnitudes: bool = False,
+        camera: Tensor | None = None,
     ) -> None:
         """Gradients of the last forward(); can be repeated.
 
@@ -67,6 +68,7 @@ class Frame:
             outputs: Written: gradients of the parameters, laid out like them.
             means2d: Written: dL/d(centres on screen), pixels (n, 2).
             magnitudes: Make that the sum of its absolute values over the pixels, x and y apart.
+            camera: Written: the gradient by a motion of the camera (7,), see `Camera.moved`.
         """
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -36,11 +37,19 @@ class GradientBuffers:
         return tuple(buffer.detach() for buffer in self._buffers)
 
 
+@dataclass(frozen=True)
+class Probes:
+    """Zeros whose gradients say more of a render than those of the Gaussians; see ``render``."""
+
+    means2d: Float[Tensor, "n 2"] | None = None
+    camera: Float[Tensor, " 7"] | None = None
+
+
 def render_native(
     gaussians: Gaussians,
     camera: Camera,
     options: RenderOptions,
-    means2d_probe: Float[Tensor, "n 2"] | None = None,
+    probes: Probes,
     buffers: GradientBuffers | None = None,
 ) -> Render:
     """Render with the native kernels; arguments as of ``render``.
@@ -53,7 +62,7 @@ def render_native(
     for name, tensor in gaussians.tensors().items():
         if tensor.device.type != "cpu" or tensor.dtype != torch.float32:
             raise ValueError(f"the native rasterizer takes float32 on the CPU, not {name} of {tensor.dtype}")
-    return Render(*_Rasterize.apply(camera, options, buffers, means2d_probe, *parameters))  # type: ignore[no-untyped-call]
+    return Render(*_Rasterize.apply(camera, options, buffers, probes.means2d, probes.camera, *parameters))  # type: ignore[no-untyped-call]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -66,6 +75,7 @@ class _Rasterize(torch.autograd.Function):
         options: RenderOptions,
         buffers: GradientBuffers | None,
         _means2d_probe: Tensor | None,
+        _camera_probe: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         parameters = tuple(tensor.detach().contiguous() for tensor in parameters)
@@ -105,12 +115,13 @@ class _Rasterize(torch.autograd.Function):
         parameters = ctx.saved_tensors
         gradients = ctx.buffers.like(parameters)
         means2d = torch.empty(len(parameters[0]), 2)
+        camera = torch.empty(7) if ctx.needs_input_grad[4] else None
         try:
-            ctx.frame.backward(parameters, pictures, gradients, means2d, ctx.magnitudes)
+            ctx.frame.backward(parameters, pictures, gradients, means2d, ctx.magnitudes, camera)
         except MemoryError as error:
             _refuse(error, len(parameters[0]))
         wanted = ctx.needs_input_grad[3:]
-        asked = (grad if needs else None for grad, needs in zip((means2d, *gradients), wanted, strict=True))
+        asked = (grad if needs else None for grad, needs in zip((means2d, camera, *gradients), wanted, strict=True))
         return (None, None, None, *asked)
 
 

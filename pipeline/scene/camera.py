@@ -69,6 +69,19 @@ class Camera:
             cy=self.cy * by_y,
         )
 
+    def moved(self, motion: Float64[np.ndarray, " 7"]) -> Camera:
+        """The camera turned about its centre, then shifted, then with another focal length.
+
+        Args:
+            motion: Rotation vector (radians) and translation (world units) of a point in the camera's frame,
+                x' = exp(rotation) x + translation; logarithm of the factor on both focal lengths.
+        """
+        step = np.eye(4)
+        step[:3, :3] = rotation_matrix(motion[:3])
+        step[:3, 3] = motion[3:6]
+        factor = math.exp(motion[6])
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor, cam_from_world=step @ self.cam_from_world)
+
     def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Project world points to pixels.
 
@@ -78,6 +91,16 @@ class Camera:
         in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
         in_image = in_camera[:, :2] / in_camera[:, 2:]
         return np.asarray(in_image * [self.fx, self.fy] + [self.cx, self.cy])
+
+
+def rotation_matrix(rotation_vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The rotation by a vector's length (radians) about its direction: Rodrigues' formula."""
+    angle = float(np.sqrt((rotation_vector**2).sum()))
+    x, y, z = rotation_vector
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # np.sinc(t / pi) is sin(t) / t, right at 0, too; 1 - cos t = 2 sin² (t / 2) does not cancel.
+    first, second = np.sinc(angle / math.pi), 0.5 * np.sinc(angle / (2.0 * math.pi)) ** 2
+    return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
 
 
 def reduced_size(width: int, height: int, max_megapixels: float) -> tuple[int, int]:

@@ -40,6 +40,7 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
+from splatpipe.stages.train.refinement import anchor, refined_json
 from splatpipe.stages.train.regularise import add_decay
 from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.smoothing import sampling_of
@@ -54,7 +55,7 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the model, its history, plan and exposures; go on from a checkpoint where a killed run left one.
+    """Write the model, its history, its plan and side models; go on from a checkpoint where a killed run left one.
 
     Raises:
         SplatpipeError: if nothing is left to train on.
@@ -81,16 +82,14 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
         state.sampling = sampling_of(plan, views_of(plan, views))
         state.free_space = free_space_of(views_of(plan, views), inputs["undistort.dataset"], plan.options)
+        anchor(state.refinement, plan, views_of(plan, views), inputs["undistort.dataset"])
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
-    write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
-    (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
-    write_grids(out / "exposures.npz", state.exposure)
     return {
         "gaussians": len(gaussians),
         "iterations": state.iteration,
@@ -101,7 +100,19 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         "peak_memory_bytes": peak_memory_bytes(),
         "device": "cpu",
         "instruction_set": raster.isa_name(),
-    } | ({} if config.sky == "off" else {"sky_photos": 0 if sky is None else sky.photos})
+    } | write_side_models(out, state, plan.options)
+
+
+def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dict[str, float]:
+    """Write what was trained beside the Gaussians; what the summary says of it."""
+    write_panorama(out / "sky.npz", None if state.sky is None else state.sky.panorama)
+    (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
+    write_grids(out / "exposures.npz", state.exposure)
+    (out / "cameras_refined.json").write_text(refined_json(state.refinement, options), encoding="utf-8")
+    summary = {} if state.refinement is None else state.refinement.summary()
+    if options.sky != "off":
+        summary["sky_photos"] = 0 if state.sky is None else state.sky.photos
+    return summary
 
 
 def begin_sky(config: TrainConfig, views: Sequence[View], inputs: Inputs, report: Reporter) -> SkyModel | None:
@@ -239,13 +250,17 @@ def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str
 def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
+    if state.refinement is not None:
+        photo = state.refinement.refined(photo, iteration, options)
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
     look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
     settings = render_options(plan, iteration, look.magnitudes)
     probe = state.probe() if look.probe else None
     model = dropped(state.rendered_model(options), options, iteration)
     buffers = None if look.again else state.buffers
-    rendered = raster.render(model, photo.camera, settings, means2d_probe=probe, buffers=buffers)
+    rendered = raster.render(
+        model, photo.camera, settings, means2d_probe=probe, camera_probe=photo.camera_probe, buffers=buffers
+    )
     photometric, penalties = losses(state, plan, photo, rendered, settings.background)
     loss = with_depth(photometric, rendered, photo, options, iteration) + penalties
     loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
@@ -259,6 +274,8 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
         if state.exposure is not None:
             state.exposure.step(photo.camera.name, iteration, options)
+        if state.refinement is not None:
+            state.refinement.step(photo, iteration, options)
         if state.sky is not None:
             state.sky.step(min(1.0, iteration / options.iterations))
 

@@ -34,6 +34,7 @@ from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.exposure_grid import make_exposure
 from splatpipe.stages.train.history import History
 from splatpipe.stages.train.plan import Plan
+from splatpipe.stages.train.refinement import CameraRefinement
 from splatpipe.stages.train.regularise import limit_needles
 from splatpipe.stages.train.sh_limit import Coverage
 from splatpipe.stages.train.sky import SkyModel
@@ -68,6 +69,7 @@ class TrainState:
         buffers: Memory of the gradients.
         exposure: The photos' colours, where they are modelled.
         sky: Trained beside the Gaussians; None where there is none.
+        refinement: Of the photos' cameras, with `refine_cameras`; its anchor is not in the checkpoint.
         coverage: Directions that Gaussians were seen from; None without `sh_limit`.
         sampling: The training cameras, with `filter_3d`; not in the checkpoint.
         free_space: What photos look through, with `prune_free_space`; not in the checkpoint.
@@ -83,6 +85,7 @@ class TrainState:
     buffers: GradientBuffers = field(default_factory=GradientBuffers)
     exposure: Exposure | None = None
     sky: SkyModel | None = None
+    refinement: CameraRefinement | None = None
     coverage: Coverage | None = None
     sampling: Sampling | None = None
     free_space: FreeSpace | None = None
@@ -115,6 +118,7 @@ class TrainState:
         options = plan.options
         state = TrainState(gaussians, Adam(gaussians.tensors()), make_density(options, len(gaussians)), history)
         state.exposure = make_exposure(plan.train_views, options)
+        state.refinement = CameraRefinement(plan.train_views) if options.refine_cameras != "off" else None
         state.coverage = Coverage(len(gaussians)) if options.sh_limit else None
         state.sky = sky
         return state
@@ -251,6 +255,7 @@ class TrainState:
         parts: dict[str, Stateful | None] = {
             "density": self.density,
             "exposure": self.exposure,
+            "refinement": self.refinement,
             "coverage": self.coverage,
             "sky": self.sky,
         }

@@ -32,12 +32,14 @@ class TrainingPhoto:
         colour: In [0, 1].
         mask: True where the photo counts; None where all of it does.
         depths: Of the sparse points that it shows; None where they do not count.
+        camera_probe: Takes the gradient by a motion of the camera, where that is wanted.
     """
 
     camera: Camera
     colour: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None
     depths: PointDepths | None = None
+    camera_probe: Float[Tensor, " 7"] | None = None
 
 
 class PhotoStream:

@@ -247,7 +247,7 @@ SPLAT_INLINE void put_rows(const LanesGradient& d, Floats* sh, int sh_row, Mask 
 
 SPLAT_INLINE ParameterGradients rows_from(const ParameterGradients& out, int sh_row, int64_t first) {
     return {out.means + 3 * first,   out.log_scales + 3 * first, out.quats + 4 * first, out.opacity_logits + first,
-            out.sh + sh_row * first, out.means2d + 2 * first,    out.magnitudes};
+            out.sh + sh_row * first, out.means2d + 2 * first,    out.magnitudes,        nullptr};
 }
 
 void copy_rows(const GradientRows& from, int sh_row, int count, const ParameterGradients& to) {
@@ -258,10 +258,14 @@ void copy_rows(const GradientRows& from, int sh_row, int count, const ParameterG
     copy(to.opacity_logits, from.opacity_logits, 1), copy(to.means2d, from.means2d, 2), copy(to.sh, from.sh, sh_row);
 }
 
-void project_backward(const View& view, const Parameters& in, int64_t begin, int64_t end, const FrameData& frame,
-                      const ParameterGradients& out) {
+// With or without the camera's gradient, each compiled apart: the one without is rounded as if there were no other.
+template <bool kCamera>
+SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, int64_t begin, int64_t end,
+                                      const FrameData& frame, const ParameterGradients& out) {
     Rows rows;
     GradientRows ragged;
+    Floats camera[kCameraFloats], share[kCameraFloats];
+    for (int f = 0; f < kCameraFloats; ++f) camera[f] = fill(0.0f);
     const int sh_row = view.sh_count * 3;
     alignas(64) float sums[kSlotFloats][kLanes], touched[kLanes];
     for (int64_t first = begin; first < end; first += kLanes) {
@@ -289,15 +293,32 @@ void project_backward(const View& view, const Parameters& in, int64_t begin, int
                                  load(sums[9]),
                                  load(sums[10]),
                                  load(sums[11])};
-        LanesGradient d = project_lanes_backward(view, project_lanes(view, lanes), g, out.magnitudes);
-        d.mean = d.mean + colour_backward(view, lanes.mean, g.colour, sh);
+        const Projection p = project_lanes(view, lanes);
+        LanesGradient d = project_lanes_backward(view, p, g, out.magnitudes);
+        const Vec3 by_direction = colour_backward(view, lanes.mean, g.colour, sh);
+        d.mean = d.mean + by_direction;
+        const Mask seen = less(fill(0.0f), load(touched));
+        if (kCamera) {
+            camera_gradient(view, p, d, by_direction, share);
+            for (int f = 0; f < kCameraFloats; ++f) camera[f] = camera[f] + only(seen, share[f]);
+        }
         const ParameterGradients here = rows_from(out, sh_row, first);
-        const ParameterGradients stack = {ragged.means, ragged.log_scales, ragged.quats,  ragged.opacity_logits,
-                                          ragged.sh,    ragged.means2d,    out.magnitudes};
-        put_rows(d, sh, sh_row, less(fill(0.0f), load(touched)), valid == kLanes ? here : stack);
+        const ParameterGradients stack = {ragged.means, ragged.log_scales, ragged.quats,   ragged.opacity_logits,
+                                          ragged.sh,    ragged.means2d,    out.magnitudes, nullptr};
+        put_rows(d, sh, sh_row, seen, valid == kLanes ? here : stack);
         if (valid < kLanes) copy_rows(ragged, sh_row, valid, here);
     }
+    if (kCamera)
+        for (int f = 0; f < kCameraFloats; ++f) out.camera[f] = sum_lanes(camera[f]);
     streamed();
+}
+
+void project_backward(const View& view, const Parameters& in, int64_t begin, int64_t end, const FrameData& frame,
+                      const ParameterGradients& out) {
+    if (out.camera)
+        project_backward_of<true>(view, in, begin, end, frame, out);
+    else
+        project_backward_of<false>(view, in, begin, end, frame, out);
 }
 
 }  // namespace
