@@ -28,6 +28,7 @@ from splatpipe.stages.train.depth import supervised, with_depth
 from splatpipe.stages.train.draws import BACKGROUND, uniform
 from splatpipe.stages.train.dropout import dropped
 from splatpipe.stages.train.exposure import exposures_json
+from splatpipe.stages.train.flatness import ends_at, is_flat, place_in_schedule, settled_from
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
@@ -76,30 +77,44 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         plan = load_or_write_plan(out / "plan.json", make)
         if budgeted(plan):
             report.note(plan.described())
-        levels = coarse_levels(plan.options, plan.last_iteration)
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
+        levels = coarse_levels(plan.options, ends_at(plan, state.history.flat_at))
         state.sampling = sampling_of(plan, views_of(plan, views))
         state.free_space = free_space_of(views_of(plan, views), inputs["undistort.dataset"], plan.options)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
+        if state.history.flat_at:
+            report.note(
+                f"the loss is flat after {state.history.flat_at:,} iterations, so it ends with {state.iteration:,} "
+                f"of {plan.options.iterations:,}"
+            )
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
-    return {
-        "gaussians": len(gaussians),
-        "iterations": state.iteration,
-        "planned_iterations": plan.options.iterations,
-        "loss": state.history.last_loss(),
-        "train_seconds": round(state.seconds, 1),
-        "train_megapixels": plan.train_megapixels,
-        "peak_memory_bytes": peak_memory_bytes(),
-        "device": "cpu",
-        "instruction_set": raster.isa_name(),
-    } | ({} if config.sky == "off" else {"sky_photos": 0 if sky is None else sky.photos})
+    return (
+        {
+            "gaussians": len(gaussians),
+            "iterations": state.iteration,
+            "planned_iterations": plan.options.iterations,
+            "loss": state.history.last_loss(),
+            "train_seconds": round(state.seconds, 1),
+            "train_megapixels": plan.train_megapixels,
+            "peak_memory_bytes": peak_memory_bytes(),
+            "device": "cpu",
+            "instruction_set": raster.isa_name(),
+        }
+        | ({} if config.sky == "off" else {"sky_photos": 0 if sky is None else sky.photos})
+        | ending(state)
+    )
+
+
+def ending(state: TrainState) -> Summary:
+    """What the summary says of an early end."""
+    return {"flat_at": state.history.flat_at} if state.history.flat_at else {}
 
 
 def begin_sky(config: TrainConfig, views: Sequence[View], inputs: Inputs, report: Reporter) -> SkyModel | None:
@@ -189,11 +204,14 @@ def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Pat
             if clock.is_up(plan):
                 end_now(state, plan, photo, report)
                 break
-            if clock.checkpoint_due() and state.iteration < plan.last_iteration:
+            last = ends_at(plan, state.history.flat_at)
+            if clock.checkpoint_due() and state.iteration < last:
                 with clock.checkpointing():
                     save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
-            if state.iteration % REPORT_EVERY == 0 or state.iteration == plan.last_iteration:
+            if state.iteration % REPORT_EVERY == 0 or state.iteration == last:
                 tell(state, plan, report)
+            if state.iteration == last:
+                break
     if interrupt.requested:  # asked of once more: it may have come after the last iteration's look
         save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
         raise KeyboardInterrupt
@@ -212,7 +230,8 @@ def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporte
 
 def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
     """Report how far the training is."""
-    report.progress(state.iteration, max(state.iteration, plan.options.iterations), "training", "iterations")
+    planned = min(plan.options.iterations, ends_at(plan, state.history.flat_at))
+    report.progress(state.iteration, max(state.iteration, planned), "training", "iterations")
     if (loss := state.history.recent_loss()) is not None:
         report.metric("loss", loss, state.iteration)
     report.metric("gaussians", len(state.gaussians), state.iteration)
@@ -236,7 +255,18 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     if growing and is_density_step(options, iteration) and over_memory(options):
         state.history.growth_ended = iteration
     state.iteration = iteration
-    state.history.end_iteration(iteration, iteration == plan.last_iteration, curve_facts(state, plan, photo))
+    if options.stop_when_flat > 0.0 and iteration % len(plan.train_views) == 0:
+        judge_epoch(state, plan)
+    is_last = iteration == ends_at(plan, state.history.flat_at)
+    state.history.end_iteration(iteration, is_last, curve_facts(state, plan, photo))
+
+
+def judge_epoch(state: TrainState, plan: Plan) -> None:
+    """Close an epoch, and note where the loss is flat."""
+    history, photos = state.history, len(plan.train_views)
+    history.end_epoch(state.iteration - photos // 2, state.iteration - photos >= settled_from(plan.options))
+    if not history.flat_at and is_flat(history.epochs, plan, state.iteration):
+        history.flat_at = state.iteration
 
 
 def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str, int]:
@@ -254,12 +284,13 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
     look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
     settings = render_options(plan, iteration, look.magnitudes)
+    place = place_in_schedule(plan, state.history.flat_at, iteration)
     probe = state.probe() if look.probe else None
-    model = dropped(state.rendered_model(options), options, iteration)
+    model = dropped(state.rendered_model(options), options, place)
     buffers = None if look.again else state.buffers
     rendered = raster.render(model, photo.camera, settings, means2d_probe=probe, buffers=buffers)
     photometric, penalties = losses(state, plan, photo, rendered, settings.background)
-    loss = with_depth(photometric, rendered, photo, options, iteration) + penalties
+    loss = with_depth(photometric, rendered, photo, options, place) + penalties
     loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
     state.observe_directions(photo.camera)
@@ -268,11 +299,11 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         if observed:
             gradient_px = None if probe is None else probe.grad
             state.density.observe(Seen(state.gaussians, rendered, photo, look, gradient_px), options)
-        state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
+        state.step(rendered.visible, means_rate(plan, place), plan.extent, options)
         if state.exposure is not None:
-            state.exposure.step(photo.camera.name, iteration, options)
+            state.exposure.step(photo.camera.name, place, options)
         if state.sky is not None:
-            state.sky.step(min(1.0, iteration / options.iterations))
+            state.sky.step(min(1.0, place / options.iterations))
 
 
 def losses(
