@@ -52,7 +52,7 @@ def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
     slope = float((x * y).sum() / (x * x).sum())
     scatter = float(np.square(y - y.mean() - slope * x).sum()) / (len(x) - 2)
     slope -= STANDARD_ERRORS * math.sqrt(scatter / float((x * x).sum()))
-    return 1.0 - (last / epochs[-1][0]) ** slope
+    return 1.0 - math.exp(slope * math.log(last / epochs[-1][0]))
 
 
 def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> bool:

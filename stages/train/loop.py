@@ -80,41 +80,46 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
         levels = coarse_levels(plan.options, ends_at(plan, state.history.flat_at))
         state.sampling = sampling_of(plan, views_of(plan, views))
+        if state.robust is not None:
+            state.robust.watch(view.camera for view in views_of(plan, views))
         state.free_space = free_space_of(views_of(plan, views), inputs["undistort.dataset"], plan.options)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
-        if state.history.flat_at:
+        if (flat_at := state.history.flat_at) > 0:
             report.note(
-                f"the loss is flat after {state.history.flat_at:,} iterations, so it ends with {state.iteration:,} "
-                f"of {plan.options.iterations:,}"
+                f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.options.iterations:,}"
             )
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
-    return (
-        {
-            "gaussians": len(gaussians),
-            "iterations": state.iteration,
-            "planned_iterations": plan.options.iterations,
-            "loss": state.history.last_loss(),
-            "train_seconds": round(state.seconds, 1),
-            "train_megapixels": plan.train_megapixels,
-            "peak_memory_bytes": peak_memory_bytes(),
-            "device": "cpu",
-            "instruction_set": raster.isa_name(),
-        }
-        | ({} if config.sky == "off" else {"sky_photos": 0 if sky is None else sky.photos})
-        | ending(state)
-    )
+    facts = {
+        "gaussians": len(gaussians),
+        "iterations": state.iteration,
+        "planned_iterations": plan.options.iterations,
+        "loss": state.history.last_loss(),
+        "train_seconds": round(state.seconds, 1),
+        "train_megapixels": plan.train_megapixels,
+        "peak_memory_bytes": peak_memory_bytes(),
+        "device": "cpu",
+        "instruction_set": raster.isa_name(),
+    }
+    return facts | technique_facts(state, config)
 
 
-def ending(state: TrainState) -> Summary:
-    """What the summary says of an early end."""
-    return {"flat_at": state.history.flat_at} if state.history.flat_at else {}
+def technique_facts(state: TrainState, config: TrainConfig) -> dict[str, int | float]:
+    """What the summary says of techniques that were asked for."""
+    facts: dict[str, int | float] = {}
+    if config.sky != "off":
+        facts["sky_photos"] = 0 if state.sky is None else state.sky.photos
+    if state.history.flat_at:
+        facts["flat_at"] = state.history.flat_at
+    if state.robust is not None:
+        facts["robust_left_out"] = round(state.robust.share_left_out(), 5)
+    return facts
 
 
 def begin_sky(config: TrainConfig, views: Sequence[View], inputs: Inputs, report: Reporter) -> SkyModel | None:
@@ -248,7 +253,7 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     options, iteration = plan.options, state.iteration + 1
     if photo.mask is None or bool(photo.mask.any()):
         descend(state, plan, photo, iteration)
-    state.end_epoch(iteration, len(plan.train_views))
+    state.end_epoch(iteration, len(plan.train_views), options)
     growing = not state.history.growth_ended
     control = options if growing else without_growth(options)
     state.control_density(control, plan.extent, plan.initial_gaussians, iteration)
@@ -289,7 +294,7 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     model = dropped(state.rendered_model(options), options, place)
     buffers = None if look.again else state.buffers
     rendered = raster.render(model, photo.camera, settings, means2d_probe=probe, buffers=buffers)
-    photometric, penalties = losses(state, plan, photo, rendered, settings.background)
+    photometric, penalties, photo = losses(state, plan, photo, rendered, settings.background)
     loss = with_depth(photometric, rendered, photo, options, place) + penalties
     loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
@@ -308,8 +313,9 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
 
 def losses(
     state: TrainState, plan: Plan, photo: TrainingPhoto, rendered: raster.Render, behind: tuple[float, float, float]
-) -> tuple[Tensor, Tensor]:
-    """How far a render is from its photo, shown as the photo's sky and exposure would, and what the sky adds to that.
+) -> tuple[Tensor, Tensor, TrainingPhoto]:
+    """How far a render is from its photo, shown as the photo's sky and exposure would, what the sky adds to that, and
+    the photo with what of it counts.
 
     Args:
         state: Of whose side models the render is completed.
@@ -324,8 +330,10 @@ def losses(
         penalty = state.sky.penalty(rendered.alpha, photo.camera, options.sky_opacity_weight)
     if state.exposure is not None:
         shown = state.exposure.shown(shown, photo.camera.name)
+    if state.robust is not None:
+        photo = state.robust.look(photo, rendered, shown)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty
+    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty, photo
 
 
 def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:
@@ -336,7 +344,7 @@ def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.Rende
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
-        depth=options.depth_weight > 0.0,
+        depth=options.depth_weight > 0.0 or options.robust > 0.0,
         magnitudes=magnitudes,
     )
 

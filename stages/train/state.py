@@ -26,6 +26,7 @@ from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.history import History
 from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.regularise import limit_needles
+from splatpipe.stages.train.robust import Robust, share_at
 from splatpipe.stages.train.sh_limit import Coverage
 from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.smoothing import REFRESH_EVERY, Sampling, raw_opacity_limits, smoothed
@@ -60,6 +61,7 @@ class TrainState:
         exposure: The photos' colours, where they are modelled.
         sky: Trained beside the Gaussians; None where there is none.
         coverage: Directions that Gaussians were seen from; None without `sh_limit`.
+        robust: What of each photo the others contradict; None without `robust`.
         sampling: The training cameras, with `filter_3d`; not in the checkpoint.
         free_space: What photos look through, with `prune_free_space`; not in the checkpoint.
         filter_sigmas: Of the 3D filter, a Gaussian each, world units; None before the first and after density control.
@@ -75,6 +77,7 @@ class TrainState:
     exposure: Exposure | None = None
     sky: SkyModel | None = None
     coverage: Coverage | None = None
+    robust: Robust | None = None
     sampling: Sampling | None = None
     free_space: FreeSpace | None = None
     filter_sigmas: Float[Tensor, " n"] | None = None
@@ -107,6 +110,7 @@ class TrainState:
         state = TrainState(gaussians, Adam(gaussians.tensors()), make_density(options, len(gaussians)), history)
         state.exposure = Exposure(plan.train_views) if options.exposure != "off" else None
         state.coverage = Coverage(len(gaussians)) if options.sh_limit else None
+        state.robust = Robust(plan.train_views) if options.robust else None
         state.sky = sky
         return state
 
@@ -160,9 +164,14 @@ class TrainState:
             self.coverage.observe(self.gaussians.means.detach(), camera, logits.grad != 0.0)
             self.coverage.clear(sh.grad)
 
-    def end_epoch(self, iteration: int, photos: int) -> None:
-        """With `sh_limit`, after the last iteration of an epoch: take its degrees, and clear what exceeds them."""
-        if self.coverage is not None and iteration % photos == 0:
+    def end_epoch(self, iteration: int, photos: int, options: TrainConfig) -> None:
+        """After the last iteration of an epoch, with `sh_limit`: take its degrees, and clear what exceeds them; with
+        `robust`: take its threshold."""
+        if iteration % photos != 0:
+            return
+        if self.robust is not None:
+            self.robust.end_epoch(share_at(options, iteration))
+        if self.coverage is not None:
             self.coverage.end_epoch()
             for coefficients in (self.gaussians.sh.detach(), self.adam.mean["sh"], self.adam.square["sh"]):
                 self.coverage.clear(coefficients)
@@ -227,6 +236,7 @@ class TrainState:
             "density": self.density,
             "exposure": self.exposure,
             "coverage": self.coverage,
+            "robust": self.robust,
             "sky": self.sky,
         }
         return {name: part for name, part in parts.items() if part is not None}
