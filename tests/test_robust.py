@@ -127,18 +127,26 @@ def test_masked_pixels_stay_masked_and_are_not_judged(robust: Robust) -> None:
     assert photo.mask is not None and not bool((photo.mask & ~mask).any())
     assert bool((mask & ~photo.mask).any())
     rendered = true_render(camera)
-    all_masked = TrainingPhoto(camera, true_photo(camera), torch.zeros_like(mask))
-    assert bool((cell_residuals(rendered.colour, all_masked) == UNKNOWN).all())
+    nothing = cell_residuals(rendered.colour, true_photo(camera), torch.zeros_like(mask))
+    assert bool((nothing == UNKNOWN).all())
 
 
 def test_exposure_and_detail_out_of_place_are_no_motion_but_a_block_is() -> None:
     camera = cameras()[3]
-    model = true_photo(camera)
+    model, everywhere = true_photo(camera), torch.ones(camera.height, camera.width, dtype=torch.bool)
     for other in (model, model + 0.2, model.roll((1, 1), (0, 1)), model.roll(-1, 1)):
-        residual = cell_residuals(model, TrainingPhoto(camera, other, None))[4:-4, 4:-4]  # rolled in at the rim
+        residual = cell_residuals(model, other, everywhere)[4:-4, 4:-4]  # rolled in at the rim
         assert float((residual > LEAST_RESIDUAL).float().mean()) < 0.01
-    residual = cell_residuals(model, TrainingPhoto(camera, painted(model, CARS[2]), None))
+    residual = cell_residuals(model, painted(model, CARS[2]), everywhere)
     assert float((residual > LEAST_RESIDUAL).float().mean()) > 0.02
+
+
+def test_holes_of_the_model_contradict_nothing(robust: Robust) -> None:
+    an_epoch(robust, cars=())
+    camera = cameras()[2]
+    rendered, hole = true_render(camera), of_block(camera, CARS[2])
+    rendered.alpha[hole], rendered.colour[hole] = 0.3, 0.0
+    assert robust.look(TrainingPhoto(camera, true_photo(camera), None), rendered, rendered.colour).mask is None
 
 
 def test_no_more_than_a_quarter_of_a_photo_is_left_out(robust: Robust) -> None:
@@ -237,7 +245,7 @@ def test_held_out_photos_are_better_without_what_moved(scene: Path, tmp_path: Pa
     for number, (top, left, bottom, right) in CARS.items():
         camera = cameras()[number]
         painted_share = (bottom - top) * (right - left) / (camera.height * camera.width)
-        assert 0.8 * painted_share < left_out.pop(camera.name) < 1.4 * painted_share
+        assert 0.8 * painted_share < left_out.pop(camera.name) < 1.7 * painted_share
     assert max(left_out.values()) < 0.02
 
 

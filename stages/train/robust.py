@@ -7,7 +7,7 @@ Neither learned features nor weights are used here. What fine detail and unlearn
 motion by three tests of our own:
 
 - residuals are compared between cells, not pixels, less the photo's median (exposure), and a difference that a cell
-  nearby would explain does not count: edges and texture a little off, or the depths of a tree, are no car;
+  beside would explain does not count: edges and texture a little off are no car; nor does a hole in the model;
 - a cell's residual is a mean over the visits to its photo;
 - the other photos that see a cell's surface, as the model has it, have to agree with the model there: where they do not
   either, the place is hard or not learnt yet, and nobody has contradicted.
@@ -32,13 +32,14 @@ from splatpipe.stages.train.stream import TrainingPhoto
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them
 LEAST_CELL_PX = 4  # smaller photos have fewer: a cell has to average out detail
 MEMORY = 0.5  # of a cell's residual, that the visits before keep
-NEARBY = 2  # cells: what the model shows so near may be what the photo shows here; with 1 trees were taken for motion
+NEARBY = 1  # cells: what the model shows so near may be what the photo shows here
 LEAST_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: less than this is shading, not another thing
 VOTES = 4  # of a cell and its eight neighbours: two by two are a thing, one alone is noise
 RIM = 0.5  # of the threshold: what lies beside a left-out cell and is above that goes, too
 MOST_OF_A_PHOTO = 0.25  # may be left out: more than that is no passer-by but a model that is wrong
 MOST_WITNESSES = 24  # nearest photos that are asked about a place
-LEAST_ALPHA = 0.5  # below it the model has no surface to ask about
+LEAST_ALPHA = 0.8  # of a pixel that is judged: below it the model has a hole, not another opinion
+SURFACE_ALPHA = 0.5  # of a cell with a depth
 UNKNOWN = -1.0  # residual of a cell that no visit has shown
 
 
@@ -87,9 +88,12 @@ class Robust:
         """
         with torch.no_grad():
             row = self._row[photo.camera.name]
-            before, now = self.scores[row], cell_residuals(shown, photo)
+            opaque = rendered.alpha >= LEAST_ALPHA
+            counts = opaque if photo.mask is None else photo.mask & opaque
+            before, now = self.scores[row], cell_residuals(shown, photo.colour, counts)
             mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
-            self.scores[row] = torch.where(now < 0.0, before, mixed)
+            faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: nothing held against it
+            self.scores[row] = torch.where(now < 0.0, faded, mixed)
             cells = self._left_out_cells(row, photo.camera, rendered)
             size = shown.shape[:2]
             out = functional.interpolate(cells[None, None].float(), size=size, mode="nearest")[0, 0] > 0.0
@@ -115,7 +119,7 @@ class Robust:
         """Of some cells, those where more of the other photos that see the place agree with the model than not."""
         result = torch.zeros_like(cells)
         alpha, depth_sum = _pooled(torch.stack((rendered.alpha, rendered.depth_sum)), (GRID, GRID)).double()
-        asked = cells & (alpha >= LEAST_ALPHA)
+        asked = cells & (alpha >= SURFACE_ALPHA)
         v, u = (index.numpy() for index in torch.nonzero(asked, as_tuple=True))
         if len(u) == 0 or not self.cameras:
             return result
@@ -169,32 +173,31 @@ class Robust:
             tensor.copy_(arrays[name])
 
 
-def cell_residuals(shown: Float[Tensor, "h w 3"], photo: TrainingPhoto) -> Float[Tensor, "g g"]:
+def cell_residuals(
+    shown: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"]
+) -> Float[Tensor, "g g"]:
     """How far each cell's mean colour is from the nearest of the model's there and nearby, averaged over the channels.
 
     Args:
         shown: The model's picture.
-        photo: With the mask of what counts.
+        colour: The photo's.
+        counts: The pixels to compare.
 
     Returns:
         ``UNKNOWN`` where less than half of a cell counts.
     """
-    height, width = shown.shape[:2]
+    height, width = counts.shape
     size = (min(GRID, max(1, height // LEAST_CELL_PX)), min(GRID, max(1, width // LEAST_CELL_PX)))
-    counts = torch.ones(1, *shown.shape[:2]) if photo.mask is None else photo.mask[None].float()
-    weight = _pooled(counts, size)
+    weight = _pooled(counts[None].float(), size)
     known = weight[0] >= 0.5
     if not bool(known.any()):
         return torch.full((GRID, GRID), UNKNOWN)
     model, picture = (
-        _pooled(colours.permute(2, 0, 1) if photo.mask is None else colours.permute(2, 0, 1) * counts, size)
-        / weight.clamp(min=1e-6)
-        for colours in (shown, photo.colour)
+        _pooled(picture.permute(2, 0, 1) * counts, size) / weight.clamp(min=1e-6) for picture in (shown, colour)
     )
     model = model - (model - picture)[:, known].median(dim=1).values[:, None, None]
-    nearby = _nearby(model)
     usable = _nearby(known[None].float())[0] > 0.0
-    apart = torch.where(usable, (nearby - picture[:, None]).abs().mean(dim=0), torch.inf)
+    apart = torch.where(usable, (_nearby(model) - picture[:, None]).abs().mean(dim=0), torch.inf)
     residual = torch.where(known, apart.amin(dim=0), UNKNOWN)
     return functional.interpolate(residual[None, None], size=(GRID, GRID), mode="nearest")[0, 0]
 
