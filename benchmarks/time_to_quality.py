@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from measure import Row, machine, parse, parser, prepare, report, restart_peak, scratch, size_factor
+from measure import Row, SilentReporter, machine, parse, parser, prepare, report, restart_peak, scratch, size_factor
 
 from splatpipe.pipeline.engine.config import parse_set, resolve
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
@@ -25,12 +25,12 @@ from splatpipe.stages.evaluate import as_trained, measure, render_pixels
 from splatpipe.stages.line import LineConfig, TrainConfig
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
-from splatpipe.stages.train.clearing import free_space_of
+from splatpipe.stages.train.depth import supervised
+from splatpipe.stages.train.flatness import ends_at
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
-from splatpipe.stages.train.refinement import anchor
-from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream
+from splatpipe.stages.train.surroundings import begin_sky, surround
 
 COLUMNS = {
     "iteration": "iteration:,",
@@ -40,6 +40,7 @@ COLUMNS = {
     "wall s": "wall_s:.1f",
     "CPU s": "cpu_s:.1f",
     "PSNR dB": "psnr:.2f",
+    "PSNR cc": "psnr_cc:.2f",
     "SSIM": "ssim:.3f",
     "peak MB": "peak_bytes:MB",
 }
@@ -82,22 +83,20 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     """
     before = restart_peak()
     clocks, due, peak = Clocks(), arguments.every, 0
-    views = load_views(dataset)
+    views = supervised(load_views(dataset), dataset, config.train)
     start = read_splat(dataset / "init.ply")
     plan = make_plan(config.train, views, config.evaluate.every, arguments.held_out, len(start))
-    names = set(plan.train_views)
+    trained_on = loop.views_of(plan, views)
     levels = coarse_levels(plan.options)
     with same_bits(arguments.threads):
         clocks.start()
-        state = TrainState.begin(start, plan)
-        trained_on = [view for view in views if view.camera.name in names]
-        state.sampling = sampling_of(plan, trained_on)
-        state.free_space = free_space_of(trained_on, dataset, plan.options)
-        anchor(state.refinement, plan, trained_on, dataset)
+        sky = begin_sky(config.train, trained_on, dataset, arguments.threads, SilentReporter())
+        state = TrainState.begin(start, plan, sky)
+        surround(state, plan, trained_on, dataset)
         with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
                 loop.train_step(state, plan, photo)
-                last = state.iteration == plan.options.iterations
+                last = state.iteration == ends_at(plan, state.history.flat_at)
                 if clocks.cpu_now() < due and not last:
                     continue
                 clocks.stop()
@@ -106,12 +105,14 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
                 row = {"iteration": state.iteration, "gaussians": len(state.gaussians), "threads": arguments.threads}
                 row |= {"megapixels": plan.train_megapixels, "wall_s": clocks.wall_s, "cpu_s": clocks.cpu_s}
                 yield row | held_out(state, plan, dataset) | {"peak_bytes": peak}
+                if last:
+                    return
                 restart_peak()
                 clocks.start()
 
 
 def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
-    """Mean PSNR and SSIM of the views that were held out, as `evaluate` measures them."""
+    """Mean PSNR, PSNR after a colour fit and SSIM of the views that were held out, as `evaluate` measures them."""
     gaussians = state.finished()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.json"
@@ -123,7 +124,7 @@ def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
         for view in load_views(dataset)
         if view.camera.name in set(plan.test_views)
     ]
-    values = {name: [float(found[name] or 0.0) for found in measured] for name in ("psnr", "ssim")}
+    values = {name: [float(found[name] or 0.0) for found in measured] for name in ("psnr", "psnr_cc", "ssim")}
     return {name: sum(each) / len(each) for name, each in values.items()}
 
 

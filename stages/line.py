@@ -204,6 +204,12 @@ class TrainConfig(StageConfig):
     Gaussians; the deliverable leaves it out. Where no photo shows any it stays off."""
     sky_opacity_weight: NonNegativeFloat = 0.1
     """Weight of the mean opacity before the sky in the loss."""
+    robust: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+    """Moving things: up to about this share of all pixels, a quarter of a photo at most, is left out of the loss where
+    a photo differs, visit after visit, from what the others agree on; 0: none. Tried: 0.05."""
+    stop_when_flat: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    """Where going on would take off less than this share of the training photos' loss, the schedule is run down within
+    a tenth of the iterations done; 0 for never. Tried: 0.1, of which held-out photos see little."""
 
 
 class EvaluateConfig(StageConfig):

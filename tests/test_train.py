@@ -41,6 +41,8 @@ TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "max_anisotropy": 5.0,
     "prune_free_space": 2,
     "refine_cameras": "pose_focal",
+    "robust": 0.1,
+    "stop_when_flat": 0.5,
 }
 QUICK = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15)
 

@@ -21,7 +21,6 @@ from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
-from splatpipe.stages.train.clearing import free_space_of
 from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.density import BLIND, Seen
 from splatpipe.stages.train.depth import supervised, with_depth
@@ -29,6 +28,7 @@ from splatpipe.stages.train.draws import BACKGROUND, ELSEWHERE, uniform
 from splatpipe.stages.train.dropout import dropped
 from splatpipe.stages.train.exposure import exposures_json
 from splatpipe.stages.train.exposure_grid import write_grids
+from splatpipe.stages.train.flatness import ends_at, is_flat, place_in_schedule, settled_from
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
@@ -40,12 +40,12 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
-from splatpipe.stages.train.refinement import anchor, refined_json
+from splatpipe.stages.train.refinement import refined_json
 from splatpipe.stages.train.regularise import add_decay
 from splatpipe.stages.train.sky import SkyModel
-from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
+from splatpipe.stages.train.surroundings import begin_sky, surround
 
 CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
@@ -63,7 +63,8 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     check_device(inputs.machine)
-    views = supervised(load_views(inputs["undistort.dataset"]), inputs["undistort.dataset"], config)
+    dataset = inputs["undistort.dataset"]
+    views = supervised(load_views(dataset), dataset, config)
     start = read_splat(inputs["initialize.splat"])
     every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
 
@@ -74,19 +75,21 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         return under_budgets(free, scene, train_step, report)
 
     with same_bits(inputs.machine.threads):
-        sky = begin_sky(config, scene.trained_on, inputs, report)
+        sky = begin_sky(config, scene.trained_on, dataset, inputs.machine.threads, report)
         plan = load_or_write_plan(out / "plan.json", make)
         if budgeted(plan):
             report.note(plan.described())
-        levels = coarse_levels(plan.options, plan.last_iteration)
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
-        state.sampling = sampling_of(plan, views_of(plan, views))
-        state.free_space = free_space_of(views_of(plan, views), inputs["undistort.dataset"], plan.options)
-        anchor(state.refinement, plan, views_of(plan, views), inputs["undistort.dataset"])
+        levels = coarse_levels(plan.options, ends_at(plan, state.history.flat_at))
+        surround(state, plan, scene.trained_on, dataset)
         first, size = state.iteration + 1, plan.megapixels
-        with PhotoStream(views_of(plan, views), levels, plan.options.seed, first, out, size) as photos:
+        with PhotoStream(scene.trained_on, levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
+        if (flat_at := state.history.flat_at) > 0:
+            report.note(
+                f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.options.iterations:,}"
+            )
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
@@ -104,7 +107,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
 
 
 def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dict[str, float]:
-    """Write what was trained beside the Gaussians; what the summary says of it."""
+    """Write what was trained beside the Gaussians; what the summary says of techniques that were asked for."""
     write_panorama(out / "sky.npz", None if state.sky is None else state.sky.panorama)
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
     write_grids(out / "exposures.npz", state.exposure)
@@ -112,16 +115,11 @@ def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dic
     summary = {} if state.refinement is None else state.refinement.summary()
     if options.sky != "off":
         summary["sky_photos"] = 0 if state.sky is None else state.sky.photos
+    if state.history.flat_at:
+        summary["flat_at"] = state.history.flat_at
+    if state.robust is not None:
+        summary["robust_left_out"] = round(state.robust.share_left_out(), 5)
     return summary
-
-
-def begin_sky(config: TrainConfig, views: Sequence[View], inputs: Inputs, report: Reporter) -> SkyModel | None:
-    """The sky to be trained; None where it is off or none of the photos shows any, which is told."""
-    if config.sky == "off":
-        return None
-    sky = SkyModel.begin(views, inputs["undistort.dataset"], inputs.machine.threads)
-    report.note("no photo shows the sky, so there is no model of it" if sky is None else f"sky in {sky.photos} photos")
-    return sky
 
 
 def views_of(plan: Plan, views: Sequence[View]) -> list[View]:
@@ -188,11 +186,14 @@ def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Pat
             if clock.is_up(plan):
                 end_now(state, plan, photo, report)
                 break
-            if clock.checkpoint_due() and state.iteration < plan.last_iteration:
+            last = ends_at(plan, state.history.flat_at)
+            if clock.checkpoint_due() and state.iteration < last:
                 with clock.checkpointing():
                     save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
-            if state.iteration % REPORT_EVERY == 0 or state.iteration == plan.last_iteration:
+            if state.iteration % REPORT_EVERY == 0 or state.iteration == last:
                 tell(state, plan, report)
+            if state.iteration == last:
+                break
     if interrupt.requested:  # asked of once more: it may have come after the last iteration's look
         save_checkpoint(checkpoint, plan.digest(), state.checkpoint(raster.isa_name()))
         raise KeyboardInterrupt
@@ -211,7 +212,8 @@ def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporte
 
 def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
     """Report how far the training is."""
-    report.progress(state.iteration, max(state.iteration, plan.options.iterations), "training", "iterations")
+    planned = min(plan.options.iterations, ends_at(plan, state.history.flat_at))
+    report.progress(state.iteration, max(state.iteration, planned), "training", "iterations")
     if (loss := state.history.recent_loss()) is not None:
         report.metric("loss", loss, state.iteration)
     report.metric("gaussians", len(state.gaussians), state.iteration)
@@ -228,14 +230,25 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     options, iteration = plan.options, state.iteration + 1
     if photo.mask is None or bool(photo.mask.any()):
         descend(state, plan, photo, iteration)
-    state.end_epoch(iteration, len(plan.train_views))
+    state.end_epoch(iteration, len(plan.train_views), options)
     growing = not state.history.growth_ended
     control = options if growing else without_growth(options)
     state.control_density(control, plan.extent, plan.initial_gaussians, iteration)
     if growing and is_density_step(options, iteration) and over_memory(options):
         state.history.growth_ended = iteration
     state.iteration = iteration
-    state.history.end_iteration(iteration, iteration == plan.last_iteration, curve_facts(state, plan, photo))
+    if options.stop_when_flat > 0.0 and iteration % len(plan.train_views) == 0:
+        judge_epoch(state, plan)
+    is_last = iteration == ends_at(plan, state.history.flat_at)
+    state.history.end_iteration(iteration, is_last, curve_facts(state, plan, photo))
+
+
+def judge_epoch(state: TrainState, plan: Plan) -> None:
+    """Close an epoch, and note where the loss is flat."""
+    history, photos = state.history, len(plan.train_views)
+    history.end_epoch(state.iteration - photos // 2, state.iteration - photos >= settled_from(plan.options))
+    if not history.flat_at and is_flat(history.epochs, plan, state.iteration):
+        history.flat_at = state.iteration
 
 
 def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str, int]:
@@ -255,14 +268,15 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
     look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
     settings = render_options(plan, iteration, look.magnitudes)
+    place = place_in_schedule(plan, state.history.flat_at, iteration)
     probe = state.probe() if look.probe else None
-    model = dropped(state.rendered_model(options), options, iteration)
+    model = dropped(state.rendered_model(options), options, place)
     buffers = None if look.again else state.buffers
     rendered = raster.render(
         model, photo.camera, settings, means2d_probe=probe, camera_probe=photo.camera_probe, buffers=buffers
     )
-    photometric, penalties = losses(state, plan, photo, rendered, settings.background)
-    loss = with_depth(photometric, rendered, photo, options, iteration) + penalties
+    photometric, penalties, photo = losses(state, plan, photo, rendered, settings.background)
+    loss = with_depth(photometric, rendered, photo, options, place) + penalties
     loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
     state.observe_directions(photo.camera)
@@ -271,19 +285,20 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         if observed:
             gradient_px = None if probe is None else probe.grad
             state.density.observe(Seen(state.gaussians, rendered, photo, look, gradient_px), options)
-        state.step(rendered.visible, means_rate(plan, iteration), plan.extent, options)
+        state.step(rendered.visible, means_rate(plan, place), plan.extent, options)
         if state.exposure is not None:
-            state.exposure.step(photo.camera.name, iteration, options)
+            state.exposure.step(photo.camera.name, place, options)
         if state.refinement is not None:
-            state.refinement.step(photo, iteration, options)
+            state.refinement.step(photo, place, options)
         if state.sky is not None:
-            state.sky.step(min(1.0, iteration / options.iterations))
+            state.sky.step(min(1.0, place / options.iterations))
 
 
 def losses(
     state: TrainState, plan: Plan, photo: TrainingPhoto, rendered: raster.Render, behind: tuple[float, float, float]
-) -> tuple[Tensor, Tensor]:
-    """How far a render is from its photo, shown as the photo's sky and exposure would, and what the sky adds to that.
+) -> tuple[Tensor, Tensor, TrainingPhoto]:
+    """How far a render is from its photo, shown as the photo's sky and exposure would, what the sky adds to that, and
+    the photo with what of it counts.
 
     Args:
         state: Of whose side models the render is completed.
@@ -299,8 +314,10 @@ def losses(
         penalty = state.sky.penalty(rendered.alpha, photo.camera, options.sky_opacity_weight)
     if state.exposure is not None:
         shown = state.exposure.shown(shown, photo.camera.name)
+    if state.robust is not None:
+        photo = state.robust.look(photo, rendered, shown)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty
+    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty, photo
 
 
 def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:
@@ -311,7 +328,7 @@ def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.Rende
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
-        depth=options.depth_weight > 0.0,
+        depth=options.depth_weight > 0.0 or options.robust > 0.0,
         magnitudes=magnitudes,
     )
 

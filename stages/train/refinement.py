@@ -31,7 +31,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import View, load_points, load_tracks
+from splatpipe.pipeline.scene.dataset import View, load_points_and_tracks
 from splatpipe.pipeline.scene.images import reduced_camera
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.plan import Plan
@@ -164,8 +164,8 @@ def anchor_of(plan: Plan, views: Sequence[View], dataset: Path) -> Anchor:
     """
     views = sorted(views, key=lambda view: view.camera.name)
     cameras = tuple(reduced_camera(view.camera, plan.megapixels) for view in views)
-    xyz, tracks = load_points(dataset).xyz, load_tracks(dataset)
-    depths = _median_depths(cameras, [xyz[tracks[camera.name]] for camera in cameras], plan.extent)
+    points, tracks = load_points_and_tracks(dataset)
+    depths = _median_depths(cameras, [points.xyz[tracks[camera.name]] for camera in cameras], plan.extent)
     focals = np.array([math.sqrt(camera.fx * camera.fy) for camera in cameras])
     # Root mean square distance of a picture's pixels from its middle: what turning about the view axis moves them by.
     radii = np.array([math.hypot(camera.width, camera.height) / math.sqrt(12.0) for camera in cameras])

@@ -36,6 +36,7 @@ from splatpipe.stages.train.history import History
 from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.refinement import CameraRefinement
 from splatpipe.stages.train.regularise import limit_needles
+from splatpipe.stages.train.robust import Robust, share_at
 from splatpipe.stages.train.sh_limit import Coverage
 from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.smoothing import REFRESH_EVERY, Sampling, raw_opacity_limits, smoothed
@@ -71,6 +72,7 @@ class TrainState:
         sky: Trained beside the Gaussians; None where there is none.
         refinement: Of the photos' cameras, with `refine_cameras`; its anchor is not in the checkpoint.
         coverage: Directions that Gaussians were seen from; None without `sh_limit`.
+        robust: What of each photo the others contradict; None without `robust`.
         sampling: The training cameras, with `filter_3d`; not in the checkpoint.
         free_space: What photos look through, with `prune_free_space`; not in the checkpoint.
         filter_sigmas: Of the 3D filter, a Gaussian each, world units; None before the first and after density control.
@@ -87,6 +89,7 @@ class TrainState:
     sky: SkyModel | None = None
     refinement: CameraRefinement | None = None
     coverage: Coverage | None = None
+    robust: Robust | None = None
     sampling: Sampling | None = None
     free_space: FreeSpace | None = None
     filter_sigmas: Float[Tensor, " n"] | None = None
@@ -120,6 +123,7 @@ class TrainState:
         state.exposure = make_exposure(plan.train_views, options)
         state.refinement = CameraRefinement(plan.train_views) if options.refine_cameras != "off" else None
         state.coverage = Coverage(len(gaussians)) if options.sh_limit else None
+        state.robust = Robust(plan.train_views) if options.robust else None
         state.sky = sky
         return state
 
@@ -173,9 +177,14 @@ class TrainState:
             self.coverage.observe(self.gaussians.means.detach(), camera, logits.grad != 0.0)
             self.coverage.clear(sh.grad)
 
-    def end_epoch(self, iteration: int, photos: int) -> None:
-        """With `sh_limit`, after the last iteration of an epoch: take its degrees, and clear what exceeds them."""
-        if self.coverage is not None and iteration % photos == 0:
+    def end_epoch(self, iteration: int, photos: int, options: TrainConfig) -> None:
+        """After the last iteration of an epoch, with `sh_limit`: take its degrees, and clear what exceeds them; with
+        `robust`: take its threshold."""
+        if iteration % photos != 0:
+            return
+        if self.robust is not None:
+            self.robust.end_epoch(share_at(options, iteration))
+        if self.coverage is not None:
             self.coverage.end_epoch()
             for coefficients in (self.gaussians.sh.detach(), self.adam.mean["sh"], self.adam.square["sh"]):
                 self.coverage.clear(coefficients)
@@ -196,7 +205,7 @@ class TrainState:
         with torch.no_grad():
             if is_density_step(options, iteration):
                 self._densify(options, extent, room_at(options, initial, iteration), iteration)
-            elif is_clearing_step(self.free_space, options, iteration):
+            elif not self.history.flat_at and is_clearing_step(self.free_space, options, iteration):
                 self._clear(options, iteration)
             if is_opacity_reset(options, iteration):
                 self._reset_opacity(options.reset_opacity)
@@ -257,6 +266,7 @@ class TrainState:
             "exposure": self.exposure,
             "refinement": self.refinement,
             "coverage": self.coverage,
+            "robust": self.robust,
             "sky": self.sky,
         }
         return {name: part for name, part in parts.items() if part is not None}

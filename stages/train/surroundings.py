@@ -1,0 +1,46 @@
+"""What a training sees of its dataset besides the photos: made anew for each run of it, no checkpoint keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.scene.dataset import View
+from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.train.clearing import free_space_of
+from splatpipe.stages.train.plan import Plan
+from splatpipe.stages.train.refinement import anchor
+from splatpipe.stages.train.sky import SkyModel
+from splatpipe.stages.train.smoothing import sampling_of
+from splatpipe.stages.train.state import TrainState
+
+
+def begin_sky(
+    config: TrainConfig, views: Sequence[View], dataset: Path, threads: int, report: Reporter
+) -> SkyModel | None:
+    """The sky to be trained; None where it is off or none of the photos shows any, which is told."""
+    if config.sky == "off":
+        return None
+    sky = SkyModel.begin(views, dataset, threads)
+    report.note("no photo shows the sky, so there is no model of it" if sky is None else f"sky in {sky.photos} photos")
+    return sky
+
+
+def surround(state: TrainState, plan: Plan, views: Sequence[View], dataset: Path) -> None:
+    """Give a state what its techniques want of the dataset: sampling, free space, cameras to hold to and to compare.
+
+    Args:
+        state: Changed in place.
+        plan: The training's.
+        views: Those that it trains on.
+        dataset: Theirs, with the sparse points.
+
+    Raises:
+        StageError: if the dataset is broken.
+    """
+    state.sampling = sampling_of(plan, views)
+    state.free_space = free_space_of(views, dataset, plan.options)
+    anchor(state.refinement, plan, views, dataset)
+    if state.robust is not None:
+        state.robust.watch(view.camera for view in views)

@@ -1,0 +1,138 @@
+"""Early end: told from the training photos' loss alone, after a tail, at the same iteration however it was run."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.stages import initialize, train
+from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.train import flatness, loop
+from splatpipe.stages.train.plan import Plan, means_rate, resolve_schedule
+from splatpipe.stages.train.state import TrainState
+from splatpipe.stages.train.stream import TrainingPhoto
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+FEW = TrainConfig(iterations=200, densify=False, sh_every=5, exposure="affine", dropout=0.1, depth_weight=0.1)
+FLAT = FEW.model_copy(update={"stop_when_flat": 0.9})  # so much that any curve is flat
+PARTS = ("model.ply", "history.json", "exposures.json", "plan.json")
+
+
+def make_plan(iterations: int, threshold: float, last: int = 0, **options: object) -> Plan:
+    fields = TrainConfig().model_dump() | {"iterations": iterations, "stop_when_flat": threshold} | options
+    resolved = resolve_schedule(TrainConfig.model_validate(fields))
+    return Plan(resolved, 1.0, 0.01, ("a", "b"), (), 0.1, 10, last or iterations)
+
+
+def power_law(exponent: float, noise: float = 0.0, until: int = 5000) -> list[tuple[int, float]]:
+    """Epochs of 100 iterations from the 3501st on."""
+    middles = np.arange(3550, until, 100)
+    scatter = 1.0 + noise * np.random.default_rng(1).standard_normal(len(middles))
+    return [(int(m), float(0.1 * (m / 1000.0) ** exponent * s)) for m, s in zip(middles, scatter, strict=True)]
+
+
+@pytest.mark.parametrize("exponent", [-0.5, -0.1, 0.0, 0.2])
+def test_expected_gain_of_a_power_law_is_what_the_law_says(exponent: float) -> None:
+    gain = flatness.expected_gain(power_law(exponent), 7000)
+    assert gain == pytest.approx(1.0 - (7000 / 4950) ** exponent, abs=1e-9)
+
+
+def test_noise_raises_the_expected_gain_and_does_not_end_a_training() -> None:
+    plan = make_plan(7000, 0.01)
+    assert flatness.is_flat(power_law(-0.001), plan, 5000)
+    assert flatness.expected_gain(power_law(-0.001, noise=0.05), 7000) > 0.01
+    assert not flatness.is_flat(power_law(-0.001, noise=0.05), plan, 5000)
+
+
+def test_a_curve_that_still_falls_a_few_epochs_or_the_schedules_end_are_not_flat() -> None:
+    plan = make_plan(7000, 0.05)
+    assert not flatness.is_flat(power_law(-0.5), plan, 5000)
+    assert not flatness.is_flat(power_law(0.0)[: flatness.FEWEST_EPOCHS - 1], plan, 4200)
+    assert not flatness.is_flat(power_law(0.0, until=6500), plan, 6500)  # a tail would end after the schedule
+    assert not flatness.is_flat([(middle, 0.0) for middle, _ in power_law(0.0)], plan, 5000)
+
+
+def test_nothing_is_judged_before_density_control_all_degrees_and_full_size() -> None:
+    options = make_plan(1000, 0.1).options
+    assert flatness.settled_from(options) == 3 * int(options.sh_every) == 600
+    assert flatness.settled_from(make_plan(1000, 0.1, densify_until=700).options) == 700
+    assert flatness.settled_from(make_plan(1000, 0.1, densify_until=700, densify=False, sh_degree=1).options) == 200
+    assert flatness.settled_from(make_plan(1000, 0.1, coarse_levels=1, coarse_until=900).options) == 900
+
+
+def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None:
+    plan = make_plan(7000, 0.1)
+    assert flatness.ends_at(plan, 0) == 7000 and flatness.ends_at(plan, 5000) == 5500
+    assert flatness.ends_at(replace(plan, last_iteration=5200), 5000) == 5200
+    places = [flatness.place_in_schedule(plan, 5000, iteration) for iteration in range(4990, 5501)]
+    assert places[:11] == list(range(4990, 5001)) and places[-1] == 7000
+    assert set(np.diff(places[10:])) == {4}
+    assert means_rate(plan, places[-1]) == means_rate(plan, 7000)
+    assert flatness.place_in_schedule(plan, 0, 6000) == 6000
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `dataset` and `init.ply`."""
+    folder = tmp_path_factory.mktemp("scene")
+    tiny_scene.write_dataset(folder / "dataset")
+    inputs = Inputs({"undistort.dataset": folder / "dataset"}, folder)
+    initialize.run(InitializeConfig(), inputs, folder, tiny_scene.Recorder())
+    return folder
+
+
+def trained(scene: Path, out: Path, config: TrainConfig) -> tuple[dict[str, object], tiny_scene.Recorder]:
+    out.mkdir(exist_ok=True)
+    parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
+    inputs = Inputs(parts, scene, {"evaluate.every": 4, "evaluate.views": ""}, Machine("cpu", 1))
+    recorder = tiny_scene.Recorder()
+    return dict(train.run(config, inputs, out, recorder)), recorder
+
+
+def test_a_flat_training_ends_early_and_says_so(scene: Path, tmp_path: Path) -> None:
+    summary, recorder = trained(scene, tmp_path, FLAT)
+    flat_at = summary["flat_at"]
+    assert isinstance(flat_at, int) and flat_at % 6 == 0 and flat_at >= 15 + 6 * flatness.FEWEST_EPOCHS
+    end = flat_at + round(0.1 * flat_at)
+    assert summary["iterations"] == end < summary["planned_iterations"] == 200
+    assert recorder.steps[-1] == (end, end)
+    assert any("flat" in note and f"{end:,} of 200" in note for note in recorder.notes)
+    history = json.loads((tmp_path / "history.json").read_text())
+    assert history["flat_at"] == flat_at and history["curve"][-1]["iteration"] == end
+
+
+def test_a_training_that_gains_goes_on_to_its_end_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
+    off, _ = trained(scene, tmp_path / "off", FEW)
+    on, recorder = trained(scene, tmp_path / "on", FEW.model_copy(update={"stop_when_flat": 1e-3}))
+    assert on["iterations"] == off["iterations"] == 200 and "flat_at" not in on and not recorder.notes
+    for part in ("model.ply", "history.json", "exposures.json"):
+        assert (tmp_path / "on" / part).read_bytes() == (tmp_path / "off" / part).read_bytes()
+
+
+@pytest.mark.parametrize("before_end", [25, 3, 0])
+def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
+    scene: Path, tmp_path: Path, before_end: int
+) -> None:
+    whole, _ = trained(scene, tmp_path / "whole", FLAT)
+    step = loop.train_step
+
+    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+        if state.iteration + 1 == int(str(whole["iterations"])) - before_end:
+            raise KeyboardInterrupt
+        step(state, plan, photo)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
+        patch.setattr(loop, "train_step", dying)
+        trained(scene, tmp_path / "killed", FLAT)
+    resumed, _ = trained(scene, tmp_path / "killed", FLAT)
+    assert resumed["iterations"] == whole["iterations"] and resumed["flat_at"] == whole["flat_at"]
+    for part in PARTS:
+        assert (tmp_path / "killed" / part).read_bytes() == (tmp_path / "whole" / part).read_bytes()
