@@ -106,13 +106,15 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     } | write_side_models(out, state, plan.options)
 
 
-def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dict[str, float]:
+def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dict[str, int | float]:
     """Write what was trained beside the Gaussians; what the summary says of techniques that were asked for."""
     write_panorama(out / "sky.npz", None if state.sky is None else state.sky.panorama)
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
     write_grids(out / "exposures.npz", state.exposure)
     (out / "cameras_refined.json").write_text(refined_json(state.refinement, options), encoding="utf-8")
-    summary = {} if state.refinement is None else state.refinement.summary()
+    summary: dict[str, int | float] = {}
+    if state.refinement is not None:
+        summary |= state.refinement.summary()
     if options.sky != "off":
         summary["sky_photos"] = 0 if state.sky is None else state.sky.photos
     if state.history.flat_at:
