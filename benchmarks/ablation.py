@@ -21,7 +21,7 @@ from comparison import MEASURES, differences, means, written
 from finished import Finished, best_and_end, clear, figures, tidy, work_folder
 from measure import SilentReporter, machine, write_figures
 from tables import Row, print_table
-from variants import NAME, Variant, choose, config_of, split
+from variants import NAME, Variant, base_of, choose, config_of, split
 
 from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.digests import HashTable, digest
@@ -77,6 +77,7 @@ def base_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
         f"train.max_gaussians={arguments.max_gaussians}",
         f"undistort.max_megapixels={arguments.megapixels!r}",
         "evaluate.every=4",
+        *base_of(arguments.variants),
         *split(arguments.base),
     )
 

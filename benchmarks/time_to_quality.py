@@ -83,10 +83,10 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     """
     before = restart_peak()
     clocks, due, peak = Clocks(), arguments.every, 0
-    views = supervised(load_views(dataset), dataset, config.train)
+    views = load_views(dataset)
     start = read_splat(dataset / "init.ply")
     plan = make_plan(config.train, views, config.evaluate.every, arguments.held_out, len(start))
-    trained_on = loop.views_of(plan, views)
+    trained_on = supervised(loop.views_of(plan, views), dataset, plan.options)
     levels = coarse_levels(plan.options)
     with same_bits(arguments.threads):
         clocks.start()

@@ -64,12 +64,26 @@ def choose(file: Path, extra: Sequence[str], only: Sequence[str] | None, base: S
     return chosen
 
 
+def base_of(path: Path) -> tuple[str, ...]:
+    """What a TOML file of variants wants all of them, and the base, to have: the options of its table ``base``.
+
+    Raises:
+        UsageError: as ``read``.
+    """
+    return next((variant.sets for variant in tables_of(path) if variant.name == BASE), ())
+
+
 def read(path: Path) -> list[Variant]:
     """Variants from a TOML file: a table each, with ``set`` and ``what``.
 
     Raises:
         UsageError: if it is not one.
     """
+    return [checked_name(variant) for variant in tables_of(path) if variant.name != BASE]
+
+
+def tables_of(path: Path) -> list[Variant]:
+    """All tables of the file, the base's too; their names are not checked."""
     found = []
     for name, table in load_file(path).items():
         sets = table.get("set") if isinstance(table, dict) else None
@@ -78,7 +92,7 @@ def read(path: Path) -> list[Variant]:
                 f"{path}: the variant {name} is not understood.",
                 hint=f'Write it as [{name}], and below it set = ["train.antialias=true"] and what = "a line".',
             )
-        found.append(checked_name(Variant(name, tuple(sets), str(table.get("what", "")))))
+        found.append(Variant(name, tuple(sets), str(table.get("what", ""))))
     return found
 
 

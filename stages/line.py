@@ -128,7 +128,7 @@ class TrainConfig(StageConfig):
     """How strongly each is drawn back to SfM's: this times its motion in pixels joins the loss's gradient."""
     lr_cameras: PositiveFloat = 0.05
     """Learning rate of the cameras at the start, pixels; a tenth of it at the end."""
-    antialias: bool = False
+    antialias: bool = True
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
     filter_3d: bool = False
     """3D smoothing filter (Mip-Splatting): no Gaussian finer than the photos could show; for close-up views."""
@@ -166,7 +166,7 @@ class TrainConfig(StageConfig):
     """Those larger than this share of the extent are removed after the first opacity reset; 0 for never."""
     prune_screen_px: NonNegativeFloat = 0.0
     """Those with a larger radius on screen are removed, too (published: 20); 0 for never: it eats aerial ground."""
-    prune_free_space: NonNegativeInt = 0
+    prune_free_space: NonNegativeInt = 2
     """Gaussians before the surface for at least so many photos, or right before a camera, are removed; 0 for never."""
     reset_every: LengthOrZero = "auto"
     """Iterations between opacity resets, 0 for none. Auto: 3000; below 10,000 iterations and for `mcmc` none."""
@@ -191,15 +191,17 @@ class TrainConfig(StageConfig):
     """Learning rate of rotations."""
     sparse_adam: bool = True
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
-    depth_weight: NonNegativeFloat = 0.0
-    """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training."""
+    depth_weight: Literal["auto"] | NonNegativeFloat = "auto"
+    """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training.
+    Auto: 0.1 up to 16 photos, evenly less up to 32, from there on 0."""
     sh_limit: bool = False
     """Hold the degree of each Gaussian's colour to what the photos that saw it can tell by number and angles."""
     max_anisotropy: NonNegativeFloat = 0.0
     """No axis of a Gaussian is longer than this many times its middle one (at least 1): no needles. 0: no limit."""
-    dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
-    """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian: 0.2)."""
-    sky: Literal["off", "model"] = "off"
+    dropout: Literal["auto"] | Annotated[float, Field(ge=0.0, le=0.9)] = "auto"
+    """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian).
+    Auto: 0.2 up to 16 photos, evenly less up to 32, from there on 0."""
+    sky: Literal["off", "model"] = "model"
     """`model`: the sky, found in the photos or drawn in `sky_masks/`, has a colour by direction of its own and no
     Gaussians; the deliverable leaves it out. Where no photo shows any it stays off."""
     sky_opacity_weight: NonNegativeFloat = 0.1

@@ -19,6 +19,7 @@ from commands import Command, End, run_all, splatpipe
 from finished import Finished, figures, work_folder
 
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.stages.line import TrainConfig
 
 KEYS = {"variant", "capture", "seed", "gaussians", "megapixels", "threads", "wall_s", "cpu_s", "peak_bytes"}
 KEYS |= {"psnr", "psnr_cc", "ssim", "train_seconds", "loss"}
@@ -134,11 +135,15 @@ def test_a_wrong_call_is_refused_before_anything_runs(
 
 
 def test_the_variants_beside_the_script_are_all_valid() -> None:
-    chosen = variants.choose(ablation.VARIANTS, (), None, ())
+    base = variants.base_of(ablation.VARIANTS)
+    chosen = variants.choose(ablation.VARIANTS, (), None, base)
     assert chosen[0].name == "base" and len(chosen) > 5
-    whole = [variants.config_of(each.sets, 0) for each in chosen]
-    assert len({config.model_dump_json() for config in whole}) == len(whole)  # each changes something
+    whole = {each.name: variants.config_of((*base, *each.sets), 0) for each in chosen}
+    assert len({config.model_dump_json() for config in whole.values()}) == len(whole)  # each changes something
     assert all(each.what for each in chosen)
+    unlike_presets = {"iterations": 7, "stop_when_flat": 0.0}  # every variant has these alike
+    alone = whole["defaults"].train.model_copy(update=unlike_presets)
+    assert alone == TrainConfig().model_copy(update=unlike_presets)
 
 
 def test_differences_are_paired_by_capture_and_seed() -> None:

@@ -126,14 +126,14 @@ def test_no_cost_is_below_zero_whatever_was_measured() -> None:
 
 
 def test_forecast_is_the_sum_over_the_iterations() -> None:
-    options = resolve_schedule(TrainConfig(iterations=2400, max_gaussians=50_000, coarse_levels=2))
+    options = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
     levels = coarse_levels(options)
     each = [SPEED.seconds(room_at(options, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
     assert forecast(SPEED, options, 8_000, 0.4) == pytest.approx(math.fsum(each), rel=0.01)
 
 
 def plan_for(seconds: float, photos: int = 30, initial: int = 8_000, size: float = 0.5, cap: int = 1_000_000) -> Choice:
-    config = TrainConfig(time_budget_s=seconds, max_gaussians=cap)
+    config = tiny_scene.plain(time_budget_s=seconds, max_gaussians=cap)
     return choose(Task(config, initial, photos, size, SPEED, 0.0, lambda _size: seconds))
 
 
@@ -196,7 +196,7 @@ def digest(out: Path) -> str:
 
 def test_a_budget_is_planned_told_and_ends_the_training(scene: Path, tmp_path: Path) -> None:
     recorder = tiny_scene.Recorder()
-    summary = train.run(TrainConfig(time_budget_s=5.0), make_inputs(scene), tmp_path, recorder)
+    summary = train.run(tiny_scene.plain(time_budget_s=5.0), make_inputs(scene), tmp_path, recorder)
     plan = read_plan(tmp_path)
     assert 0.0 < plan.train_seconds < 5.0
     assert summary["planned_iterations"] == plan.options.iterations
@@ -223,7 +223,7 @@ def trained(scene: Path, out: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch)
         (out / "plan.json").write_text(plan.to_json())
     monkeypatch.setattr(planning, "measure", None)
     recorder = tiny_scene.Recorder()
-    train.run(TrainConfig(time_budget_s=600.0), make_inputs(scene), out, recorder)
+    train.run(tiny_scene.plain(time_budget_s=600.0), make_inputs(scene), out, recorder)
     return recorder
 
 
@@ -309,7 +309,7 @@ def test_photos_are_trained_on_and_measured_at_the_planned_size(
 
 def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused(scene: Path, tmp_path: Path) -> None:
     count = len(read_splat(scene / "init.ply"))
-    config = TrainConfig(iterations=10, max_memory_bytes=resident_bytes() + FIXED_BYTES // 2)
+    config = tiny_scene.plain(iterations=10, max_memory_bytes=resident_bytes() + FIXED_BYTES // 2)
     with pytest.raises(MachineError, match="of them already") as raised:
         train.run(config, make_inputs(scene), tmp_path, tiny_scene.Recorder())
     assert "--max-memory at least" in raised.value.hint
@@ -325,14 +325,13 @@ import tiny_scene
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
-from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.memory import FIXED_BYTES, resident_bytes
 
 scene, out = Path(sys.argv[2]), Path(sys.argv[3])
 limit = resident_bytes() + FIXED_BYTES + int(sys.argv[4])
 parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
 inputs = Inputs(parts, scene, {"evaluate.every": 4, "evaluate.views": ""}, Machine("cpu", 1))
-config = TrainConfig(iterations=40, densify_from=2, densify_every=1, densify_until=40, densify_gradient=1e-12,
+config = tiny_scene.plain(iterations=40, densify_from=2, densify_every=1, densify_until=40, densify_gradient=1e-12,
                      prune_opacity=0.0, prune_extent=0.0, max_memory_bytes=limit)
 recorder = tiny_scene.Recorder()
 summary = train.run(config, inputs, out, recorder)
@@ -363,7 +362,7 @@ def test_growth_ends_where_memory_runs_out_all_the_same(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop, "over_memory", lambda options: True)
-    config = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=60, densify_gradient=1e-9)
+    config = tiny_scene.plain(iterations=60, densify_from=10, densify_every=10, densify_until=60, densify_gradient=1e-9)
     recorder = tiny_scene.Recorder()
     train.run(config, make_inputs(scene), tmp_path, recorder)
     assert len(recorder.warnings) == 1 and "no Gaussian is added after iteration 10" in recorder.warnings[0]

@@ -61,7 +61,7 @@ def trained(scene: Path, out: Path, **options: object) -> tuple[Summary, dict[st
     out.mkdir(exist_ok=True)
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
     settings = {"evaluate.every": 0, "evaluate.views": ""}
-    config = TrainConfig.model_validate({"iterations": 400, "densify": False} | options)
+    config = tiny_scene.plain(**{"iterations": 400, "densify": False} | options)
     summary = train.run(config, Inputs(parts, scene, settings, Machine("cpu", 1)), out, tiny_scene.Recorder())
     return summary, json.loads((out / "cameras_refined.json").read_text())
 

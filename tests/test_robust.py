@@ -225,7 +225,7 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "train_step", keeping)
-        config = TrainConfig(iterations=iterations, robust=robust, densify_gradient=1e-3)
+        config = tiny_scene.plain(iterations=iterations, robust=robust, densify_gradient=1e-3)
         summary = dict(train.run(config, inputs, out, tiny_scene.Recorder()))
     model = read_splat(out / "model.ply")
     views = [cameras()[number] for number in HELD_OUT]

@@ -256,7 +256,7 @@ def test_a_time_budget_is_planned_with_the_filter(scene: Path, tmp_path: Path) -
 @pytest.fixture(scope="module")
 def models(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Gaussians]:
     """Trained long enough that Gaussians become finer than the pixels: plain, with the 3D filter, with both filters."""
-    folder, long = tmp_path_factory.mktemp("models"), TrainConfig(iterations=200)
+    folder, long = tmp_path_factory.mktemp("models"), tiny_scene.plain(iterations=200)
     options: dict[str, dict[str, bool]] = {
         "plain": {},
         "filtered": {"filter_3d": True},

@@ -44,7 +44,9 @@ TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "robust": 0.1,
     "stop_when_flat": 0.5,
 }
-QUICK = TrainConfig(iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15)
+QUICK = tiny_scene.plain(
+    iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15
+)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +90,7 @@ def held_out_psnr(scene: Path, model: Path) -> float:
 
 
 def test_training_approaches_the_truth_in_a_photo_it_never_saw(scene: Path, tmp_path: Path) -> None:
-    config = TrainConfig(iterations=400, densify_gradient=1e-3)
+    config = tiny_scene.plain(iterations=400, densify_gradient=1e-3)
     recorder = tiny_scene.Recorder()
     summary = train.run(config, make_inputs(scene), tmp_path, recorder)
     before, after = held_out_psnr(scene, scene / "init.ply"), held_out_psnr(scene, tmp_path / "model.ply")
@@ -158,7 +160,7 @@ def test_killed_training_with_every_technique_ends_with_the_same_bits(
     config = QUICK.model_copy(update=TECHNIQUES | {"exposure": exposure})
     whole = trained(scene, tmp_path / "whole", config)
     for name, value in TECHNIQUES.items():
-        assert getattr(TrainConfig(), name) != value
+        assert getattr(tiny_scene.plain(), name) != value
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         die_at(patch, 34, killed)
         trained(scene, tmp_path / "killed", config)
@@ -214,7 +216,7 @@ def test_broken_checkpoint_is_told_and_ignored(scene: Path, undisturbed: Path, t
 
 
 def test_masked_pixels_are_not_learnt(scene: Path, tmp_path: Path) -> None:
-    config = TrainConfig(iterations=200, densify=False)
+    config = tiny_scene.plain(iterations=200, densify=False)
     gaussians = read_splat(trained(scene, tmp_path, config) / "model.ply")
     view = next(view for view in load_views(scene / "dataset") if view.mask_path is not None)
     render = tiny_scene.photograph(gaussians, view.camera)[:, : tiny_scene.WIDTH // 2].astype(float)

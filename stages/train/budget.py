@@ -197,7 +197,7 @@ def choose(task: Task) -> Choice:
         least = min(first, FEWEST_GAUSSIANS)
         cap = _largest(least, first, lambda gaussians: _fits(task, size, gaussians, FEWEST))
     iterations = _largest(FEWEST, max(LONGEST, iterations), lambda count: _fits(task, size, cap, count))
-    options = planned_options(task.config, size, cap, iterations)
+    options = planned_options(task, size, cap, iterations)
     reduced_to = None if size >= task.megapixels else size
     return Choice(options, reduced_to, task.left(size, cap), task.takes(options, size))
 
@@ -227,20 +227,21 @@ def worthwhile_iterations(seconds: float) -> int:
     return int(min(LONGEST, max(FEWEST, wanted)))
 
 
-def planned_options(config: TrainConfig, megapixels: float, cap: int, iterations: int) -> TrainConfig:
+def planned_options(task: Task, megapixels: float, cap: int, iterations: int) -> TrainConfig:
     """The options of a planned training, resolved."""
+    config = task.config
     halvings = int(max(0.0, math.log(megapixels / COARSEST_MEGAPIXELS, 4)))
     planned = {
         "iterations": iterations,
         "max_gaussians": cap,
         "coarse_levels": max(config.coarse_levels, min(2, halvings)),
-        "densify_gradient": GRADIENT_SHARE * float(resolve_schedule(config).densify_gradient),
+        "densify_gradient": GRADIENT_SHARE * float(resolve_schedule(config, task.photos).densify_gradient),
     }
-    return resolve_schedule(config.model_copy(update=planned))
+    return resolve_schedule(config.model_copy(update=planned), task.photos)
 
 
 def _fits(task: Task, megapixels: float, cap: int, iterations: int) -> bool:
-    options = planned_options(task.config, megapixels, cap, iterations)
+    options = planned_options(task, megapixels, cap, iterations)
     return task.takes(options, megapixels) <= SCHEDULE_SHARE * task.left(megapixels, cap)
 
 

@@ -22,7 +22,7 @@ LARGEST_OPACITY = 0.999  # of the scaled ones, which a logit has to hold; the bl
 
 def share_at(options: TrainConfig, iteration: int) -> float:
     """The share left out at an iteration (from 1): rises evenly to `dropout` at the schedule's end."""
-    return options.dropout * min(1.0, iteration / options.iterations)
+    return float(options.dropout) * min(1.0, iteration / options.iterations)
 
 
 def dropped(gaussians: Gaussians, options: TrainConfig, iteration: int) -> Gaussians:

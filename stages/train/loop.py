@@ -64,26 +64,27 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     """
     check_device(inputs.machine)
     dataset = inputs["undistort.dataset"]
-    views = supervised(load_views(dataset), dataset, config)
+    views = load_views(dataset)
     start = read_splat(inputs["initialize.splat"])
     every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
 
     free = make_plan(config, views, every, names, len(start))
-    scene = Scene(config, start, views_of(free, views), len(free.test_views), inputs.machine)
+    trained_on = supervised(views_of(free, views), dataset, free.options)
+    scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
 
     def make() -> Plan:
         return under_budgets(free, scene, train_step, report)
 
     with same_bits(inputs.machine.threads):
-        sky = begin_sky(config, scene.trained_on, dataset, inputs.machine.threads, report)
+        sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
         plan = load_or_write_plan(out / "plan.json", make)
         if budgeted(plan):
             report.note(plan.described())
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
         levels = coarse_levels(plan.options, ends_at(plan, state.history.flat_at))
-        surround(state, plan, scene.trained_on, dataset)
+        surround(state, plan, trained_on, dataset)
         first, size = state.iteration + 1, plan.megapixels
-        with PhotoStream(scene.trained_on, levels, plan.options.seed, first, out, size) as photos:
+        with PhotoStream(trained_on, levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
             optimise(state, plan, photos, out / CHECKPOINT, report)
         if (flat_at := state.history.flat_at) > 0:
@@ -330,7 +331,7 @@ def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.Rende
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
-        depth=options.depth_weight > 0.0 or options.robust > 0.0,
+        depth=float(options.depth_weight) > 0.0 or options.robust > 0.0,
         magnitudes=magnitudes,
     )
 

@@ -22,6 +22,8 @@ EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
 NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones see nothing that near
 PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
 LARGEST_BOOST = 4.0  # of learning rates: measured best at 1,500 iterations, and beyond it Gaussians overshoot
+FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
+FEW_DEPTH_WEIGHT, FEW_DROPOUT = 0.1, 0.2
 SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings
 
 
@@ -134,8 +136,18 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes % 60 else f"{minutes // 60} h"
 
 
-def resolve_schedule(config: TrainConfig) -> TrainConfig:
-    """Replace every `auto` by the published value, changed for short runs as the option's text says."""
+def share_of_few(photos: int) -> float:
+    """How much of what few photos need a training takes: all of it up to FEW_PHOTOS, nothing from MANY_PHOTOS on."""
+    return min(1.0, max(0.0, (MANY_PHOTOS - photos) / (MANY_PHOTOS - FEW_PHOTOS)))
+
+
+def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> TrainConfig:
+    """Replace every `auto` by the published value, changed for short runs and few photos as the option's text says.
+
+    Args:
+        config: The options.
+        photos: That are trained on.
+    """
     run, strategy = config.iterations, DENSITY_DEFAULTS[config.density]
     until = config.densify_until if config.densify_until != "auto" else int(run * strategy.until)
     auto = {
@@ -148,6 +160,8 @@ def resolve_schedule(config: TrainConfig) -> TrainConfig:
         "opacity_decay": strategy.decay,
         "scale_decay": strategy.decay,
         "coarse_until": until,
+        "depth_weight": round(FEW_DEPTH_WEIGHT * share_of_few(photos), 4),
+        "dropout": round(FEW_DROPOUT * share_of_few(photos), 4),
         "lr_boost": round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / run))), 4),
     }
     resolved = {name: value for name, value in auto.items() if getattr(config, name) == "auto"}
@@ -190,7 +204,7 @@ def make_plan(config: TrainConfig, views: Sequence[View], every: int, names: str
             hint="Take the photos from different places, and hold out fewer of them.",
         )
     return Plan(
-        options=resolve_schedule(config),
+        options=resolve_schedule(config, len(train)),
         extent=extent,
         near=NEAR_PER_EXTENT * extent,
         train_views=tuple(sorted(train)),

@@ -107,7 +107,7 @@ def pilot(plan: Plan, config: TrainConfig) -> Plan:
     """
     wanted = max(FIRST_GROWTH * plan.initial_gaussians, PILOT_GROWTH_A_SECOND * config.time_budget_s, FEWEST_GAUSSIANS)
     short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
-    return replace(plan, options=resolve_schedule(config.model_copy(update=short)))
+    return replace(plan, options=resolve_schedule(config.model_copy(update=short), len(plan.train_views)))
 
 
 def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:

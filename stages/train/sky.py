@@ -194,4 +194,5 @@ def filled(total: Float64[np.ndarray, "cells 4"]) -> Float32[np.ndarray, "cells 
 
 
 def _sums(cells: Int64[np.ndarray, "n 4"], values: Shaped[np.ndarray, "n 4"]) -> Float64[np.ndarray, " cells"]:
-    return np.bincount(cells.ravel(), values.ravel(), minlength=ROWS * COLUMNS)
+    sums = np.bincount(cells.ravel(), values.ravel(), minlength=ROWS * COLUMNS)
+    return sums.astype(np.float64)  # of nothing, they are integers

@@ -19,11 +19,12 @@ from splatpipe.stages.train.state import TrainState
 def begin_sky(
     config: TrainConfig, views: Sequence[View], dataset: Path, threads: int, report: Reporter
 ) -> SkyModel | None:
-    """The sky to be trained; None where it is off or none of the photos shows any, which is told."""
+    """The sky to be trained; None where it is off or none of the photos shows any."""
     if config.sky == "off":
         return None
     sky = SkyModel.begin(views, dataset, threads)
-    report.note("no photo shows the sky, so there is no model of it" if sky is None else f"sky in {sky.photos} photos")
+    if sky is not None:
+        report.note(f"sky in {sky.photos} photos")
     return sky
 
 

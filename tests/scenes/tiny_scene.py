@@ -14,11 +14,26 @@ from splatpipe.pipeline import raster
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.sh import dc_to_rgb, rgb_to_dc
+from splatpipe.stages.line import TrainConfig
 
 WIDTH, HEIGHT, FOCAL = 72, 54, 70.0
 CAMERAS = 9
 GAUSSIANS = 150
 POINT_NOISE = 0.03  # world units; the model is two units across
+
+# No technique that is on by default: what a test of one technique alone begins with.
+PLAIN: dict[str, object] = {
+    "antialias": False,
+    "sky": "off",
+    "prune_free_space": 0,
+    "dropout": 0.0,
+    "depth_weight": 0.0,
+}
+
+
+def plain(**options: object) -> TrainConfig:
+    """A training's configuration without them, but for the options given."""
+    return TrainConfig.model_validate(PLAIN | options)
 
 
 @dataclass
