@@ -129,6 +129,24 @@ def test_error_is_looked_at_just_before_a_step_and_never_often(every: int, photo
     assert again == [False] * (every - looks) + [True] * looks
 
 
+def test_looking_at_the_error_leaves_the_gradients_of_the_loss() -> None:
+    """The second backward pass must not write into the memory that the first one's gradients lie in."""
+    gradients = []
+    for density in (None, make_density(TrainConfig(density="error"), 60)):
+        gaussians = scene(60).requires_grad_()
+        look = Look(again=density is not None)
+        render = rendered(gaussians, look)
+        (render.colour - picture()).square().mean().backward(retain_graph=look.again)
+        if density is not None:
+            with torch.no_grad():
+                photo = TrainingPhoto(CAMERA, picture(), None)
+                density.observe(Seen(gaussians, render, photo, look, None), TrainConfig())
+        gradients.append({name: tensor.grad for name, tensor in gaussians.tensors().items()})
+    alone, looked_at = gradients
+    for name, gradient in alone.items():
+        assert gradient is not None and torch.equal(gradient, looked_at[name]), name
+
+
 @pytest.mark.parametrize("name", ["published", "absolute", "error", "mcmc"])
 def test_every_strategy_keeps_to_the_limit_and_its_statistics_survive(name: str) -> None:
     options = resolve_schedule(TrainConfig.model_validate({"density": name, "densify_gradient": 1e-9}))
