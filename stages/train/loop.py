@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -72,7 +73,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     scene = Scene(config, start, views_of(free, views), len(free.test_views), inputs.machine)
 
     def make() -> Plan:
-        return under_budgets(free, scene, train_step, report)
+        return under_budgets(free, replace(scene, sky=sky), train_step, report)
 
     with same_bits(inputs.machine.threads):
         sky = begin_sky(config, scene.trained_on, dataset, inputs.machine.threads, report)
