@@ -55,7 +55,8 @@ def observed(density: Density, gaussians: Gaussians, weights: Tensor) -> Tensor:
     (render.colour * weights).sum().backward(retain_graph=look.again)
     photo = TrainingPhoto(CAMERA, picture(), None)
     with torch.no_grad():
-        density.observe(Seen(gaussians, render, photo, look, None if probe is None else probe.grad), TrainConfig())
+        gradient = None if probe is None else probe.grad
+        density.observe(Seen(gaussians, render, photo, look, gradient, render.colour), TrainConfig())
     assert isinstance(density, ScoredDensity)
     return density.statistics.score()
 
@@ -108,6 +109,15 @@ def test_error_score_is_blending_weight_times_error_summed_over_the_pixels() -> 
     torch.testing.assert_close(score, expected, rtol=1e-4, atol=1e-5)
 
 
+def test_error_is_that_of_the_render_as_its_sky_and_exposure_show_it() -> None:
+    gaussians, density = scene(12).requires_grad_(), make_density(TrainConfig(density="error"), 12)
+    look, photo = Look(again=True), TrainingPhoto(CAMERA, picture(), None)
+    render = rendered(gaussians, look)
+    with torch.no_grad():
+        density.observe(Seen(gaussians, render, photo, look, None, shown=picture()), TrainConfig())
+    assert isinstance(density, ScoredDensity) and not density.statistics.score().any()
+
+
 def test_error_share_looks_past_channels_that_are_clamped_and_masked_pixels() -> None:
     gaussians = scene(1)
     gaussians.sh[0, 0] = torch.tensor([-9.0, -9.0, 0.1])
@@ -127,6 +137,24 @@ def test_error_is_looked_at_just_before_a_step_and_never_often(every: int, photo
     density = make_density(options, 3)
     again = [density.look(options, iteration, photos).again for iteration in range(every + 1, 2 * every + 1)]
     assert again == [False] * (every - looks) + [True] * looks
+
+
+def test_looking_at_the_error_leaves_the_gradients_of_the_loss() -> None:
+    """The second backward pass must not write into the memory that the first one's gradients lie in."""
+    gradients = []
+    for density in (None, make_density(TrainConfig(density="error"), 60)):
+        gaussians = scene(60).requires_grad_()
+        look = Look(again=density is not None)
+        render = rendered(gaussians, look)
+        (render.colour - picture()).square().mean().backward(retain_graph=look.again)
+        if density is not None:
+            with torch.no_grad():
+                photo = TrainingPhoto(CAMERA, picture(), None)
+                density.observe(Seen(gaussians, render, photo, look, None, render.colour), TrainConfig())
+        gradients.append({name: tensor.grad for name, tensor in gaussians.tensors().items()})
+    alone, looked_at = gradients
+    for name, gradient in alone.items():
+        assert gradient is not None and torch.equal(gradient, looked_at[name]), name
 
 
 @pytest.mark.parametrize("name", ["published", "absolute", "error", "mcmc"])

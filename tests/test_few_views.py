@@ -363,3 +363,8 @@ def test_only_what_a_photo_really_shows_is_counted_as_seen() -> None:
     state.observe_directions(FRONT)
     assert state.coverage is not None
     assert float(state.coverage.seen[-1]) == 0.0 and float(state.coverage.seen.sum()) > 20.0
+
+
+def test_coverage_of_another_number_of_gaussians_is_refused() -> None:
+    with pytest.raises(RuntimeError, match="directions"):
+        Coverage(5).load(Coverage(1).to_arrays())

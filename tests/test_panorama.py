@@ -117,9 +117,21 @@ def test_broken_files_are_refused_with_a_hint(tmp_path: Path) -> None:
     np.savez(tmp_path / "pole.npz", up=np.zeros(3), colours=np.zeros((ROWS * COLUMNS, 3), np.float32))
     np.savez(tmp_path / "small.npz", up=TILTED, colours=np.zeros((7, 3), np.float32))
     np.savez(tmp_path / "objects.npz", up=TILTED, colours=np.array([{}], object))
+    with (tmp_path / "lone.npz").open("wb") as file:
+        np.save(file, TILTED)
+    foreign = whole.read_bytes()
+    for name, at, byte in (("packed", 10, 99), ("secret", 8, 1), ("later", 6, 200)):  # of zip's central directory
+        at += foreign.index(b"PK\x01\x02")
+        (tmp_path / f"{name}.npz").write_bytes(foreign[:at] + bytes([byte]) + foreign[at + 1 :])
+    header = foreign.index(b"}", foreign.index(b"NUMPY"))
+    (tmp_path / "header.npz").write_bytes(foreign[:header] + b"(" + foreign[header + 1 :])
     (tmp_path / "half.npz").write_bytes(whole.read_bytes()[:1000])
     (tmp_path / "large.npz").write_bytes(whole.read_bytes() + bytes(2_000_000))
-    for name in ("nan", "pole", "small", "objects", "half", "large", "missing"):
+    arrays, files = (
+        ("nan", "pole", "small", "objects", "lone"),
+        ("half", "large", "packed", "secret", "later", "header"),
+    )
+    for name in (*arrays, *files, "missing"):
         with pytest.raises(StageError, match="sky") as raised:
             read_panorama(tmp_path / f"{name}.npz")
         assert raised.value.hint

@@ -177,7 +177,9 @@ def test_damaged_and_foreign_checkpoints_are_told(tmp_path: Path) -> None:
     whole = path.read_bytes()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1
-    for broken in (b"", b"rubbish", whole[: len(whole) // 2], whole[:-10], bytes(flipped)):
+    packed = bytearray(whole)
+    packed[whole.index(b"PK\x01\x02") + 10] = 99  # zip's method of compression
+    for broken in (b"", b"rubbish", whole[: len(whole) // 2], whole[:-10], bytes(flipped), bytes(packed)):
         path.write_bytes(broken)
         with pytest.raises(BrokenCheckpointError, match="damaged"):
             load_checkpoint(path, "plan")

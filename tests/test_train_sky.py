@@ -24,7 +24,8 @@ from splatpipe.pipeline.scene.sky import SkyMask, directions
 from splatpipe.stages import evaluate, initialize, train
 from splatpipe.stages.line import EvaluateConfig, InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
-from splatpipe.stages.train.plan import Plan
+from splatpipe.stages.train.measure import Effort, measure
+from splatpipe.stages.train.plan import Plan, make_plan
 from splatpipe.stages.train.sky import SkyModel, filled
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import TrainingPhoto
@@ -252,3 +253,19 @@ def test_held_out_views_are_rendered_with_the_sky(scene: Path, tmp_path: Path) -
     expected = sky.at(directions(camera)).numpy()
     assert np.abs(render - expected)[:60].max() < 0.02
     assert render[-20:].max() == 0.0
+
+
+def test_a_budget_measures_iterations_with_the_sky_and_leaves_it_as_it_was(scene: Path) -> None:
+    views, start = load_views(scene / "dataset"), read_splat(scene / "init.ply")
+    sky = SkyModel.begin(views, scene / "dataset", 1)
+    assert sky is not None
+    plan, before = make_plan(QUICK, views, 0, "", len(start)), sky.panorama.colours.detach().clone()
+    moved = []
+
+    def step(state: TrainState, trial: Plan, photo: TrainingPhoto) -> None:
+        loop.train_step(state, trial, photo)
+        assert state.sky is not None
+        moved.append(not torch.equal(state.sky.panorama.colours, before))
+
+    measure(plan, start, views, step, Effort(0.0, 1e-3), sky)
+    assert any(moved) and torch.equal(sky.panorama.colours, before)

@@ -102,7 +102,7 @@ class _Rasterize(torch.autograd.Function):
         if any(ctx.needs_input_grad):
             ctx.frame = frame
             ctx.magnitudes = options.magnitudes
-            ctx.buffers = buffers or GradientBuffers()
+            ctx.buffers = buffers
             ctx.save_for_backward(*parameters)
         return colour, alpha, depth_sum, median_depth, visible, radii
 
@@ -113,7 +113,8 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         pictures = tuple(None if grad is None else grad.contiguous() for grad in (colour, alpha, depth_sum))
         parameters = ctx.saved_tensors
-        gradients = ctx.buffers.like(parameters)
+        # New memory a pass where none was given: a second pass must not write over the gradients of the first.
+        gradients = (ctx.buffers or GradientBuffers()).like(parameters)
         means2d = torch.empty(len(parameters[0]), 2)
         camera = torch.empty(7) if ctx.needs_input_grad[4] else None
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.scene.archives import read_archive
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.sky import directions, horizontal_axes
 
@@ -127,12 +127,12 @@ def read_panorama(path: Path) -> Panorama | None:
     try:
         if path.stat().st_size > LARGEST_FILE_BYTES:
             raise ValueError("too large")
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            up, colours = archive["up"], archive["colours"]
+        arrays = read_archive(path)
+        up, colours = arrays["up"], arrays["colours"]
         if colours.shape == (0, 3):
             return None
         return panorama_of(up, colours)
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise StageError(
             f"The sky of the training cannot be read: {error}.", hint="Run again with --rerun-from train."
         ) from error

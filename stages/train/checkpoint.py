@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatpipe.pipeline.scene.archives import read_archive
 from splatpipe.stages.train.durable import write_durably
 
 CHECKPOINT_FORMAT = 1
@@ -62,14 +62,13 @@ def load_checkpoint(path: Path, plan_digest: str) -> Checkpoint:
         BrokenCheckpointError: if it is damaged, of another version, or of another plan.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        arrays = read_archive(path)
         header = json.loads(arrays.pop(_FACTS).tobytes())
         found = (header["format"], header["plan"])
         facts = header["facts"]
     except FileNotFoundError:
         raise
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise BrokenCheckpointError(f"it is damaged ({error})") from error
     if found[0] != CHECKPOINT_FORMAT:
         raise BrokenCheckpointError("it was written by another version")

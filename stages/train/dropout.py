@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -39,7 +40,7 @@ def dropped(gaussians: Gaussians, options: TrainConfig, iteration: int) -> Gauss
     share = share_at(options, iteration)
     if share == 0.0:
         return gaussians
-    drawn = torch.from_numpy(uniform(options.seed, iteration, DROPOUT, range(len(gaussians))))
+    drawn = torch.from_numpy(uniform(options.seed, iteration, DROPOUT, np.arange(len(gaussians))))
     logits = _Dropped.apply(gaussians.opacity_logits, drawn >= share, share)  # type: ignore[no-untyped-call]
     return replace(gaussians, opacity_logits=logits)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -73,7 +74,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
 
     def make() -> Plan:
-        return under_budgets(free, scene, train_step, report)
+        return under_budgets(free, replace(scene, sky=sky), train_step, report)
 
     with same_bits(inputs.machine.threads):
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
@@ -278,7 +279,7 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     rendered = raster.render(
         model, photo.camera, settings, means2d_probe=probe, camera_probe=photo.camera_probe, buffers=buffers
     )
-    photometric, penalties, photo = losses(state, plan, photo, rendered, settings.background)
+    photometric, penalties, photo, shown = losses(state, plan, photo, rendered, settings.background)
     loss = with_depth(photometric, rendered, photo, options, place) + penalties
     loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
@@ -287,7 +288,7 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     with torch.no_grad():
         if observed:
             gradient_px = None if probe is None else probe.grad
-            state.density.observe(Seen(state.gaussians, rendered, photo, look, gradient_px), options)
+            state.density.observe(Seen(state.gaussians, rendered, photo, look, gradient_px, shown), options)
         state.step(rendered.visible, means_rate(plan, place), plan.extent, options)
         if state.exposure is not None:
             state.exposure.step(photo.camera.name, place, options)
@@ -299,9 +300,9 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
 
 def losses(
     state: TrainState, plan: Plan, photo: TrainingPhoto, rendered: raster.Render, behind: tuple[float, float, float]
-) -> tuple[Tensor, Tensor, TrainingPhoto]:
-    """How far a render is from its photo, shown as the photo's sky and exposure would, what the sky adds to that, and
-    the photo with what of it counts.
+) -> tuple[Tensor, Tensor, TrainingPhoto, Tensor]:
+    """How far a render is from its photo, shown as the photo's sky and exposure would, what the sky adds to that, the
+    photo with what of it counts, and the render as shown.
 
     Args:
         state: Of whose side models the render is completed.
@@ -320,7 +321,7 @@ def losses(
     if state.robust is not None:
         photo = state.robust.look(photo, rendered, shown)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty, photo
+    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty, photo, shown
 
 
 def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:

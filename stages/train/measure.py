@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from splatpipe.pipeline.scene.images import reduced_view
 from splatpipe.stages.line import TrainConfig
 from splatpipe.stages.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
 from splatpipe.stages.train.plan import Plan
+from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import TrainingPhoto
@@ -63,7 +65,9 @@ class Effort:
     iteration_s: float
 
 
-def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, effort: Effort) -> Measured:
+def measure(
+    plan: Plan, start: Gaussians, views: Sequence[View], step: Step, effort: Effort, sky: SkyModel | None = None
+) -> Measured:
     """Time real iterations at two sizes and two numbers of Gaussians.
 
     Args:
@@ -72,13 +76,15 @@ def measure(plan: Plan, start: Gaussians, views: Sequence[View], step: Step, eff
         views: To train on.
         step: An iteration of training.
         effort: Its limit.
+        sky: As training begins with; a copy is trained.
     """
     began = time.monotonic()
     chosen = [views[index * len(views) // min(len(views), MOST_VIEWS)] for index in range(min(len(views), MOST_VIEWS))]
     trial = replace(plan, options=pilot_options(plan))
     small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
-    states = [_pilot_state(stretched(start, count, plan.options.seed), trial, views) for count in counts]
+    models = [stretched(start, count, plan.options.seed) for count in counts]
+    states = [_pilot_state(model, trial, views, copy.deepcopy(sky)) for model in models]
     _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
     first = _timed(states[0], trial, small[0], step)
     # Cost grows a little slower than size, so the line through two sizes is right near them only.
@@ -119,8 +125,8 @@ def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
     return model
 
 
-def _pilot_state(start: Gaussians, trial: Plan, views: Sequence[View]) -> TrainState:
-    state = TrainState.begin(start, trial)
+def _pilot_state(start: Gaussians, trial: Plan, views: Sequence[View], sky: SkyModel | None) -> TrainState:
+    state = TrainState.begin(start, trial, sky)
     state.iteration, state.sampling = PILOT_ITERATION, sampling_of(trial, views)
     return state
 

@@ -21,6 +21,7 @@ from splatpipe.stages.train.budget import (
 from splatpipe.stages.train.measure import Effort, Measured, Step, measure
 from splatpipe.stages.train.memory import within_memory
 from splatpipe.stages.train.plan import Plan, mean_megapixels, resolve_schedule
+from splatpipe.stages.train.sky import SkyModel
 
 MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
 MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
@@ -39,6 +40,7 @@ class Scene:
         trained_on: Views to train on.
         held_out: How many others evaluate measures.
         machine: Threads, and when the command began.
+        sky: As training begins with; None without one.
     """
 
     config: TrainConfig
@@ -46,6 +48,7 @@ class Scene:
     trained_on: Sequence[View]
     held_out: int
     machine: Machine
+    sky: SkyModel | None = None
 
 
 def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
@@ -78,7 +81,7 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
         min(MEASURE_SECONDS, MEASURE_SHARE * budget),
         max(LEAST_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
     )
-    measured = measure(pilot(plan, scene.config), scene.start, scene.trained_on, step, effort)
+    measured = measure(pilot(plan, scene.config), scene.start, scene.trained_on, step, effort, scene.sky)
     left = budget - (time.monotonic() - began)
     choice = choose(_task(plan, scene, measured, left))
     if choice.seconds <= LEAST_SHARE * budget:

@@ -83,6 +83,8 @@ class Coverage:
             RuntimeError: if it is of another number of Gaussians.
         """
         for name, tensor in self.to_arrays().items():
+            if arrays[name].shape != tensor.shape:
+                raise RuntimeError(f"{name} is {tuple(arrays[name].shape)}, not {tuple(tensor.shape)}")
             tensor.copy_(arrays[name])
 
 

@@ -38,7 +38,7 @@ class ErrorDensity(ScoredDensity):
         """Add the shares where the graph was kept for them."""
         self.observe_radii(seen, options)
         if seen.look.again:
-            error = photo_error(seen.rendered.colour.detach(), seen.photo)
+            error = photo_error(seen.shown.detach(), seen.photo)
             self.statistics.add(error_share(seen.gaussians, seen.rendered, error), seen.rendered.visible)
 
 

@@ -45,6 +45,7 @@ class Seen:
         photo: What it was compared with.
         look: What was asked for.
         gradient_px: (n, 2) by the means on the image plane, pixels; None where ``Look.probe`` did not ask for it.
+        shown: The render as it was compared with the photo: before its sky, with its exposure.
     """
 
     gaussians: Gaussians
@@ -52,6 +53,7 @@ class Seen:
     photo: TrainingPhoto
     look: Look
     gradient_px: Float[Tensor, "n 2"] | None
+    shown: Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,26 @@
+"""NumPy archives that may be broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def read_archive(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Read all arrays of an `.npz` file, by name.
+
+    Raises:
+        OSError: if the file cannot be read.
+        ValueError: if it is damaged or no archive.
+    """
+    with path.open("rb") as file:
+        try:
+            with np.load(file, allow_pickle=False) as archive:  # a lone `.npy` is no context: TypeError
+                return {name: archive[name] for name in archive.files}
+        except OSError:
+            raise
+        except Exception as error:  # the readers of zip, of headers and of arrays raise almost anything on broken files
+            raise ValueError(f"no whole archive: {' '.join(str(error).split())[:120]}") from error
