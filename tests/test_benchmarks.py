@@ -77,7 +77,7 @@ def pairs_by_definition(gaussians: Gaussians, camera: Camera, options: RenderOpt
 def test_contributing_pairs_are_those_of_the_definition(dataset: Path, opacity_logit: float) -> None:
     gaussians = tiny_scene.true_model(600)
     gaussians.opacity_logits[:] = opacity_logit  # the last: pixels end early
-    plan = make_plan(TrainConfig(), load_views(dataset), 0, "", len(gaussians))
+    plan = make_plan(tiny_scene.plain(), load_views(dataset), 0, "", len(gaussians))
     for camera in tiny_scene.cameras()[::4]:
         counted = measure.contributing_pairs(gaussians, camera, plan, 1)
         expected = pairs_by_definition(gaussians, camera, RenderOptions(0, near=plan.near))
