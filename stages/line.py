@@ -166,7 +166,7 @@ class TrainConfig(StageConfig):
     """Those larger than this share of the extent are removed after the first opacity reset; 0 for never."""
     prune_screen_px: NonNegativeFloat = 0.0
     """Those with a larger radius on screen are removed, too (published: 20); 0 for never: it eats aerial ground."""
-    prune_free_space: NonNegativeInt = 2
+    prune_free_space: NonNegativeInt = 1
     """Gaussians before the surface for at least so many photos, or right before a camera, are removed; 0 for never."""
     reset_every: LengthOrZero = "auto"
     """Iterations between opacity resets, 0 for none. Auto: 3000; below 10,000 iterations and for `mcmc` none."""
@@ -191,9 +191,8 @@ class TrainConfig(StageConfig):
     """Learning rate of rotations."""
     sparse_adam: bool = True
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
-    depth_weight: Literal["auto"] | NonNegativeFloat = "auto"
-    """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training.
-    Auto: 0.1 up to 16 photos, evenly less up to 32, from there on 0."""
+    depth_weight: NonNegativeFloat = 0.0
+    """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training."""
     sh_limit: bool = False
     """Hold the degree of each Gaussian's colour to what the photos that saw it can tell by number and angles."""
     max_anisotropy: NonNegativeFloat = 0.0

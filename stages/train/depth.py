@@ -94,7 +94,7 @@ def _depths(
 def depth_weight_at(options: TrainConfig, iteration: int) -> float:
     """The weight at an iteration: exponential from `depth_weight` to a tenth of it at the schedule's end."""
     fallen: float = LAST_WEIGHT ** min(1.0, iteration / options.iterations)
-    return float(options.depth_weight) * fallen
+    return options.depth_weight * fallen
 
 
 def with_depth(

@@ -332,7 +332,7 @@ def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.Rende
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
-        depth=float(options.depth_weight) > 0.0 or options.robust > 0.0,
+        depth=options.depth_weight > 0.0 or options.robust > 0.0,
         magnitudes=magnitudes,
     )
 

@@ -23,7 +23,7 @@ NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones
 PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
 LARGEST_BOOST = 4.0  # of learning rates: measured best at 1,500 iterations, and beyond it Gaussians overshoot
 FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
-FEW_DEPTH_WEIGHT, FEW_DROPOUT = 0.1, 0.2
+FEW_DROPOUT = 0.2
 SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings
 
 
@@ -160,7 +160,6 @@ def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> TrainCon
         "opacity_decay": strategy.decay,
         "scale_decay": strategy.decay,
         "coarse_until": until,
-        "depth_weight": round(FEW_DEPTH_WEIGHT * share_of_few(photos), 4),
         "dropout": round(FEW_DROPOUT * share_of_few(photos), 4),
         "lr_boost": round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / run))), 4),
     }
