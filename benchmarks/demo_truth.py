@@ -24,7 +24,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64
 from measure import SilentReporter
-from opened_run import OpenedRun, open_run
+from opened_run import OpenedRun, open_run, write_png
 from tables import Row, print_table
 
 from splatpipe.demo.scene import building_corners
@@ -43,6 +43,7 @@ WITHIN_GSD = 2.0
 ATTACHED_M = 0.05  # in front of the house: the survey targets on its walls, also where they are seen at a slant
 FULL_SCALE_GSD = 4.0  # the brightest colour of an error, the same in every picture
 NOT_THE_HOUSE = 0.35  # how bright the rest of a picture is left
+LARGEST_MEGAPIXELS = 1e6  # no limit
 SIZES = {"half": 0.5, "training": 1.0, "double": 2.0}
 
 DEPTH_COLUMNS = {
@@ -140,12 +141,21 @@ def error_picture(render: Pixels, errors: Float64[np.ndarray, "h w"], seen: Bool
     return np.hstack([render, np.where(seen[:, :, None], heat, dim)])
 
 
-def photos_at(run: OpenedRun, names: Sequence[str], megapixels: float) -> dict[str, tuple[Camera, Pixels]]:
-    """Original photos as the pinhole cameras of `undistort` see them, at most of a size; with these cameras."""
+def photos_at(run: OpenedRun, names: Sequence[str], factor: float) -> dict[str, tuple[Camera, Pixels]]:
+    """Original photos as pinhole cameras see them, as `undistort` makes them, and these cameras.
+
+    Args:
+        run: Whose photos.
+        names: Of which.
+        factor: On the size of training; less where the photos are too small.
+    """
     part = run.parts["ingest.photos"].path
-    model = pycolmap.Reconstruction(run.parts["georef.model"].path)
-    placed = place(model, load_photo_list(part).photos, megapixels, SilentReporter())
-    cameras = {view.camera.name: view.camera for view in run.views}
+    model, photos = pycolmap.Reconstruction(run.parts["georef.model"].path), load_photo_list(part).photos
+    cameras = {view.camera.name: run.camera(view) for view in run.views}
+    full = place(model, photos, LARGEST_MEGAPIXELS, SilentReporter())[0]
+    trained, whole = cameras[full.photo.name], full.target
+    scale = factor * max(trained.width / whole.width, trained.height / whole.height) + 1e-9  # sizes are rounded down
+    placed = place(model, photos, scale**2 * 1e-6 * whole.width * whole.height, SilentReporter())
     return {
         view.photo.name: (
             cameras[view.photo.name].scaled(view.target.width, view.target.height),
@@ -161,7 +171,7 @@ def measure_scales(run: OpenedRun, others: dict[str, OpenedRun], names: Sequence
     trained = run.camera(next(view for view in run.views if view.camera.name in names))
     rows = []
     for size, factor in SIZES.items():
-        views = photos_at(run, names, factor**2 * 1e-6 * trained.width * trained.height)
+        views = photos_at(run, names, factor)
         camera = views[trained.name][0]
         row: Row = {"size": size, "factor": math.sqrt(camera.width * camera.height / (trained.width * trained.height))}
         row |= {"pixels": f"{camera.width}x{camera.height}"} | mean_measures(
@@ -182,13 +192,6 @@ def measure_scales(run: OpenedRun, others: dict[str, OpenedRun], names: Sequence
 
 def _measured(run: OpenedRun, camera: Camera, photo: Pixels) -> dict[str, float | None]:
     return measure(run.picture(camera), photo, None)
-
-
-def write_png(path: Path, pixels: Pixels) -> None:
-    """RGB, 8 bits."""
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, ::-1]))
-    assert done, path
-    path.write_bytes(data.tobytes())
 
 
 def same_frame(run: OpenedRun, other: OpenedRun) -> OpenedRun:
@@ -218,8 +221,9 @@ def main() -> None:
         run = open_run(arguments.out)
         paths = {size: path for size in ("half", "double") if (path := getattr(arguments, size)) is not None}
         others = {size: same_frame(run, open_run(path)) for size, path in paths.items()}
-        names = [view.camera.name for view in run.views] if arguments.all else run.held_out
-        if not set(names) <= true_poses().keys() or not names:
+        every = [view.camera.name for view in run.views]
+        names = every if arguments.all else run.held_out
+        if not names or not set(every) <= true_poses().keys():
             raise UsageError(f"{arguments.out} is no run of the demo capture with photos held out.")
         arguments.save.mkdir(parents=True, exist_ok=True)
         with same_bits(arguments.threads):

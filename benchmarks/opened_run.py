@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float32
@@ -89,3 +90,10 @@ def open_run(out: Path) -> OpenedRun:
     _, held_out = split_views(names, rule["every"], rule["views"])
     sky = read_panorama(parts["train.sky"].path) if "train.sky" in parts else None  # runs of before there were skies
     return OpenedRun(out, photos_dir, parts, (gaussians, sky), options, megapixels, views, held_out)
+
+
+def write_png(path: Path, pixels: Pixels) -> None:
+    """RGB, 8 bits."""
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, ::-1]))
+    assert done, path
+    path.write_bytes(data.tobytes())
