@@ -72,7 +72,7 @@ def add_window(b: Builder, wall: Plane, w: Window, seed: int, reveal: Painter) -
 def add_wall(
     b: Builder,
     wall: Plane,
-    outline: Sequence[tuple[float, float]],
+    outline: Sequence[tuple[float | int, float | int]],
     windows: Sequence[Window],
     paint: Painter,
     seed: int,

@@ -76,7 +76,7 @@ class Plane:
         a, b, c = (np.asarray(x, float)[..., None] for x in (a, b, c))
         return np.asarray(self.origin + a * self.u + b * self.v + c * self.n)
 
-    def at(self, a: float, b: float, c: float = 0.0) -> Plane:
+    def at(self, a: float | int, b: float | int, c: float | int = 0.0) -> Plane:
         """The same axes about another origin."""
         return Plane(self.point(a, b, c), self.u, self.v)
 
@@ -108,8 +108,8 @@ class Builder:
     def rect(
         self,
         plane: Plane,
-        low: Sequence[float],
-        high: Sequence[float],
+        low: Sequence[float | int],
+        high: Sequence[float | int],
         paint: Painter,
         gloss: bool = False,
         texel_m: float = 0.0,
@@ -121,8 +121,8 @@ class Builder:
     def box(
         self,
         plane: Plane,
-        low: Sequence[float],
-        high: Sequence[float],
+        low: Sequence[float | int],
+        high: Sequence[float | int],
         paint: Painter,
         gloss: bool = False,
         top: Painter | None = None,

@@ -94,6 +94,18 @@ def build_scene(seed: int = SEED) -> Scene:
     return Scene(meshes, points)
 
 
+def building_corners() -> Array:
+    """The corners of the house's own triangles, (m, 3, 3), without painting it: the same as in the scene, to float32.
+
+    Targets lie 12 mm before its walls and roofs and do not belong to it.
+    """
+    builder = Builder()
+    add_house(builder)
+    corners = np.concatenate([face.vertices[face.triangles] for face in builder.faces])
+    turned = corners.astype(np.float32).astype(np.float64) @ _turn(PLOT_YAW_DEG).T
+    return np.asarray(turned.astype(np.float32), np.float64)
+
+
 def surface_of(scene: Scene) -> tuple[Array, np.ndarray[tuple[int, int], np.dtype[np.int64]]]:
     """All triangles of the scene as one mesh: vertices (n, 3) and triangles (m, 3), equal vertices joined."""
     vertices, triangles, count = [], [], 0

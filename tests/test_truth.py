@@ -3,29 +3,33 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
-import trimesh
 from jaxtyping import Float64
 
 from splatpipe.demo import CAPTURE, capture_path
+from splatpipe.demo.scene import building_corners
+from splatpipe.demo.truth import Poses, centre, depth_map, true_poses, true_surface, truth_from_model
 from splatpipe.pipeline.raster import RenderOptions, render
 from splatpipe.pipeline.scene.dataset import load_points_and_tracks, load_views
 from splatpipe.pipeline.scene.free_space import free_space, near_or_free
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.scene.similarity import Similarity
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from demo_truth import ATTACHED_M, depth_errors
+from opened_run import OpenedRun, open_run
+from path_frames import measure_path, summary
 from rays import first_hits
 
-Points = Float64[np.ndarray, "n 3"]
-Poses = dict[str, Float64[np.ndarray, "4 4"]]
-Aligned = tuple[float, object, object]  # scale, rotation, translation: truth from model
-
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SETTINGS = (
     "features.extractor=opencv-sift",
     "features.max_image_size=1000",
@@ -58,13 +62,12 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def poses() -> Poses:
-    photos = json.loads((CAPTURE / "truth.json").read_text())["photos"]
-    return {photo["name"]: np.array(photo["cam_from_world"]) for photo in photos}
+    return true_poses()
 
 
 @pytest.fixture(scope="module")
 def surface() -> Float64[np.ndarray, "m 3 3"]:
-    return np.asarray(trimesh.load_mesh(CAPTURE / "surface.ply").triangles, dtype=np.float64)
+    return true_surface()
 
 
 @pytest.fixture(scope="module")
@@ -72,37 +75,26 @@ def model(out: Path) -> pycolmap.Reconstruction:
     return pycolmap.Reconstruction(next((out / "stages").glob("georef-*")) / "sparse" / "0")
 
 
-def centre(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 3"]:
-    return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
-
-
-def similarity(source: Points, target: Points) -> tuple[float, Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
-    """Least squares target = s R source + t: Umeyama 1991, equations 40 to 42."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, d, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(sign) @ vt
-    scale = float((d * sign).sum() / np.square(a).sum())
-    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+@pytest.fixture(scope="module")
+def aligned(model: pycolmap.Reconstruction, poses: Poses) -> Similarity:
+    """Truth from model."""
+    images = [image for image in model.images.values() if image.has_pose]
+    assert len(images) == len(poses)
+    return truth_from_model(
+        {image.name: np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]]) for image in images}
+    )
 
 
 @pytest.fixture(scope="module")
-def aligned(model: pycolmap.Reconstruction, poses: Poses) -> Aligned:
-    images = [image for image in model.images.values() if image.has_pose]
-    assert len(images) == len(poses)
-    estimated = np.array([image.projection_center() for image in images])
-    return similarity(estimated, np.array([centre(poses[image.name]) for image in images]))
+def opened(out: Path) -> OpenedRun:
+    return open_run(out)
 
 
 def test_camera_centres_are_within_a_thousandth_of_the_site(
-    model: pycolmap.Reconstruction, poses: Poses, aligned: Aligned
+    model: pycolmap.Reconstruction, poses: Poses, aligned: Similarity
 ) -> None:
-    scale, rotation, translation = aligned
     true = {name: centre(pose) for name, pose in poses.items()}
-    errors = [
-        scale * rotation @ image.projection_center() + translation - true[image.name]  # type: ignore[operator]
-        for image in model.images.values()
-    ]
+    errors = [aligned.apply(image.projection_center()[None])[0] - true[image.name] for image in model.images.values()]
     diagonal = np.linalg.norm(np.ptp(np.array(list(true.values())), axis=0))
     assert np.sqrt(np.square(errors).sum(axis=1).mean()) < 0.001 * diagonal
 
@@ -130,15 +122,14 @@ def test_the_frame_is_as_good_as_the_positions_allow(out: Path, model: pycolmap.
 def test_sparse_points_lie_on_the_surface(
     model: pycolmap.Reconstruction,
     poses: Poses,
-    aligned: Aligned,
+    aligned: Similarity,
     surface: Float64[np.ndarray, "m 3 3"],
 ) -> None:
-    scale, rotation, translation = aligned
     gaps = []
     for image in list(model.images.values())[::8]:
         origin = centre(poses[image.name])
         ids = [point.point3D_id for point in image.points2D if point.has_point3D()][::20]
-        points = np.array([scale * rotation @ model.points3D[i].xyz + translation for i in ids])  # type: ignore[operator]
+        points = aligned.apply(np.array([model.points3D[i].xyz for i in ids]))
         ahead = points - origin
         distance = np.linalg.norm(ahead, axis=1)
         hits = first_hits(origin, ahead / distance[:, None], surface)
@@ -150,7 +141,7 @@ def test_sparse_points_lie_on_the_surface(
 def test_rendered_depth_is_the_true_depth(
     out: Path,
     poses: Poses,
-    aligned: Aligned,
+    aligned: Similarity,
     surface: Float64[np.ndarray, "m 3 3"],
 ) -> None:
     """The median depth of held-out views, after a short training, against rays into the true surface."""
@@ -162,7 +153,7 @@ def test_rendered_depth_is_the_true_depth(
     errors = []
     for view in views[::16]:
         camera = view.camera
-        depth = render(splat, camera, options).median_depth.numpy() * aligned[0]
+        depth = render(splat, camera, options).median_depth.numpy() * aligned.scale
         top, left = camera.height // 4, camera.width // 4
         rows, columns = np.mgrid[top : camera.height - top : 9, left : camera.width - left : 9]
         seen = depth[rows, columns].ravel()
@@ -176,7 +167,7 @@ def test_rendered_depth_is_the_true_depth(
 
 
 def test_no_true_surface_is_called_free_and_most_of_the_air_is(
-    out: Path, poses: Poses, aligned: Aligned, surface: Float64[np.ndarray, "m 3 3"]
+    out: Path, poses: Poses, aligned: Similarity, surface: Float64[np.ndarray, "m 3 3"]
 ) -> None:
     """Tiny Gaussians on what the photos' rays hit, and at 0.2 to 0.8 of the way there."""
     dataset = next((out / "stages").glob("undistort-*")) / "dataset"
@@ -190,7 +181,7 @@ def test_no_true_surface_is_called_free_and_most_of_the_air_is(
         x, y = (columns.ravel() + 0.5 - camera.cx) / camera.fx, (rows.ravel() + 0.5 - camera.cy) / camera.fy
         rays = np.stack([x, y, np.ones(rows.size)], axis=1)
         pose = poses[camera.name]
-        depth = first_hits(centre(pose), rays @ pose[:3, :3], surface) / aligned[0]
+        depth = first_hits(centre(pose), rays @ pose[:3, :3], surface) / aligned.scale
         rays, depth = rays[np.isfinite(depth)], depth[np.isfinite(depth)]
         for name, share in (("surface", np.ones(len(depth))), ("air", generator.uniform(0.2, 0.8, len(depth)))):
             in_camera = (share * depth)[:, None] * rays
@@ -201,3 +192,73 @@ def test_no_true_surface_is_called_free_and_most_of_the_air_is(
             called[name].append(near_or_free(model, space).numpy())
     assert np.concatenate(called["surface"]).mean() < 0.003
     assert np.concatenate(called["air"]).mean() > 0.5
+
+
+def test_the_depth_map_is_what_rays_hit(opened: OpenedRun, poses: Poses, surface: Float64[np.ndarray, "m 3 3"]) -> None:
+    """From low, with ground that reaches behind the camera, and from straight above."""
+    generator = np.random.default_rng(0)
+    for view in (opened.views[0], opened.views[-1]):
+        camera = replace(opened.camera(view), cam_from_world=poses[view.camera.name])
+        depth = depth_map(camera, surface)
+        row, column = (generator.integers(0, size, 60) for size in depth.shape)
+        x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
+        rays = np.stack([x, y, np.ones(60)], axis=1) @ camera.cam_from_world[:3, :3]
+        np.testing.assert_allclose(depth[row, column], first_hits(camera.centre(), rays, surface), rtol=1e-9)
+
+
+def test_depth_errors_are_those_of_rays_that_hit_the_house(
+    opened: OpenedRun, aligned: Similarity, surface: Float64[np.ndarray, "m 3 3"]
+) -> None:
+    """The house with its annex, steps and eaves lies in a turned box: all of it counts, and no tree."""
+    camera = opened.camera(opened.views[0])
+    house = building_corners()
+    errors, seen, gsd = depth_errors(opened, camera, aligned, (surface, house))
+    row, column = (part[::97] for part in np.nonzero(seen))
+    assert 0.1 < seen.mean() < 0.7
+    x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
+    there = aligned.camera_pose(camera.cam_from_world)
+    rays = np.stack([x, y, np.ones(len(x))], axis=1) @ there[:3, :3]
+    true = first_hits(centre(there), rays, surface)
+    found = aligned.scale * opened.median_depth(camera)[row, column].astype(np.float64)
+    np.testing.assert_allclose(gsd[row, column], true / camera.fx, rtol=1e-3)
+    expected = np.where(found > 0.0, (found - true) / gsd[row, column], np.inf)
+    np.testing.assert_allclose(errors[row, column], expected, atol=1e-6)
+    places = centre(there) + true[:, None] * rays
+    angle = np.deg2rad(json.loads((CAPTURE / "truth.json").read_text())["house_yaw_deg"])
+    east, north = places[:, 0], places[:, 1]
+    along, across = np.cos(angle) * east + np.sin(angle) * north, np.cos(angle) * north - np.sin(angle) * east
+    assert along.min() > -6.6 - ATTACHED_M and along.max() < 11.1 + ATTACHED_M
+    assert np.abs(across).max() < 6.8 and places[:, 2].max() < 11.1
+
+
+def test_demo_truth_measures_a_model_beside_the_one_trained_for_the_size(out: Path, tmp_path: Path) -> None:
+    """The same model is as good as itself; the capture's photos are large enough for double the size of this run."""
+    command = [sys.executable, BENCHMARKS / "demo_truth.py", out, "--half", out, "--double", out, "--save", tmp_path]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert "median depth on the house" in done.stdout and "scales" in done.stdout
+    found = json.loads((tmp_path / "demo_truth.json").read_text())
+    *views, every = found["depth"]
+    assert [row["view"] for row in views] == [f"DJI_{number:04d}.JPG" for number in range(1, 41, 8)]
+    assert sum(row["pixels"] for row in views) == every["pixels"] > 0
+    assert 0.2 < every["within"] < 1.0
+    assert [row["pixels"] for row in found["scales"]] == ["142x105", "284x210", "568x420"]
+    assert [row.get("below") for row in found["scales"]] == [0.0, None, 0.0]
+    assert len(list(tmp_path.glob("*.depth.png"))) == 5
+
+
+def test_path_frames_finds_what_hangs_before_the_camera(opened: OpenedRun, tmp_path: Path) -> None:
+    cameras = [opened.camera(view) for view in opened.views[:3]]
+    rows = measure_path(opened, cameras, 5, tmp_path)
+    assert len(list(tmp_path.glob("frame_*.png"))) == 5 and (tmp_path / "sheet.png").is_file()
+    assert all(row["places"] > 100 for row in rows[1:])
+    gaussians, sky = opened.model
+    place = cameras[1].centre() + 0.1 * opened.median_depth(cameras[1]).mean() * cameras[1].cam_from_world[2, :3]
+    blob = Gaussians.empty(1, gaussians.sh_degree)
+    blob.means = torch.from_numpy(place[None].astype(np.float32))
+    blob.log_scales[:] = float(np.log(0.02 * opened.median_depth(cameras[1]).mean()))
+    blob.opacity_logits[:] = 6.0
+    both = {name: torch.cat([tensor, blob.tensors()[name]]) for name, tensor in gaussians.tensors().items()}
+    haunted = replace(opened, model=(Gaussians(**both), sky))
+    worse = measure_path(haunted, cameras, 5, tmp_path)
+    assert 2 in summary(worse)["crossing"]
+    assert 2 not in summary(rows)["crossing"]

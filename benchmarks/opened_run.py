@@ -1,0 +1,99 @@
+"""A run's OUT opened for looking: its splat as it was trained to be rendered, its photos, and which were held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from splatpipe.pipeline import raster
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.session import load_run
+from splatpipe.pipeline.engine.store import Part, open_store
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import View, load_views, split_views
+from splatpipe.pipeline.scene.images import Pixels, reduced_camera
+from splatpipe.pipeline.scene.panorama import read_panorama
+from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages.evaluate import Model, as_trained, render_pixels
+
+STAGES = ("ingest", "georef", "undistort", "train")
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedRun:
+    """What a run left.
+
+    Attributes:
+        out: Its OUT.
+        photos_dir: The user's photos.
+        parts: The stages' named parts.
+        model: The splat and its sky, if it has one.
+        options: How it was trained to be rendered.
+        megapixels: Limit of the size that it was trained at; None for the dataset's.
+        views: All registered photos.
+        held_out: Names of those that it was not trained on.
+    """
+
+    out: Path
+    photos_dir: Path
+    parts: dict[str, Part]
+    model: Model = field(repr=False)
+    options: raster.RenderOptions
+    megapixels: float | None
+    views: list[View]
+    held_out: list[str]
+
+    def camera(self, view: View) -> Camera:
+        """A view's, at the size of training."""
+        return reduced_camera(view.camera, self.megapixels)
+
+    def picture(self, camera: Camera) -> Pixels:
+        """A render as `evaluate` makes it, (h, w, 3) RGB, 8 bits."""
+        return render_pixels(self.model, camera, self.options)
+
+    def median_depth(self, camera: Camera) -> Float32[np.ndarray, "h w"]:
+        """Of a render, (h, w) float32, world units along the view axis; 0 where there is no surface."""
+        options = raster.RenderOptions(
+            sh_degree=0, antialias=self.options.antialias, near=self.options.near, depth=True
+        )
+        with torch.no_grad():
+            return np.asarray(raster.render(self.model[0], camera, options).median_depth.numpy())
+
+
+def open_run(out: Path) -> OpenedRun:
+    """Read what a run left, up to training at least.
+
+    Raises:
+        UsageError: if it is not there, or there are several and it is not clear which is meant.
+    """
+    photos_dir, table = load_run(out)
+    store = open_store(out, create=False)
+    parts: dict[str, Part] = {}
+    for stage in STAGES:
+        found = store.artifacts(stage)
+        if len(found) != 1:
+            raise UsageError(
+                f"{out} holds {len(found)} artifacts of {stage}, not one.",
+                hint=f"Run to the end of training, or drop what is stale: splatpipe clean {out}",
+            )
+        parts |= found[0].parts
+    gaussians = read_splat(parts["train.model"].path)
+    options, megapixels = as_trained(parts["train.plan"].path, gaussians)
+    views = load_views(parts["undistort.dataset"].path)
+    rule = table["evaluate"]
+    names = [view.camera.name for view in views]
+    _, held_out = split_views(names, rule["every"], rule["views"])
+    sky = read_panorama(parts["train.sky"].path) if "train.sky" in parts else None  # runs of before there were skies
+    return OpenedRun(out, photos_dir, parts, (gaussians, sky), options, megapixels, views, held_out)
+
+
+def write_png(path: Path, pixels: Pixels) -> None:
+    """RGB, 8 bits."""
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, ::-1]))
+    assert done, path
+    path.write_bytes(data.tobytes())

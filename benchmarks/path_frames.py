@@ -1,0 +1,214 @@
+"""Frames along a smooth path between a run's photos, to look at: ``path_frames.py OUT --frames 120 --save FOLDER``.
+
+Rendered as `evaluate` does it, at the size of training, with the first photo's intrinsics. Leaves PNG frames, a contact
+sheet, and:
+
+- each frame's mean luminance and the step from the frame before, in 8-bit steps as all here;
+- the same places in consecutive frames, found through the median depths of both: the median difference of their colours
+  (with that of resampling), and of their luminance with its sign, in which texture cancels: a change of exposure;
+- the share of a frame that is nearer than half the depth of the nearest sparse points of the two photos around, as the
+  frame would see them: something hangs before the camera. And the frame's median depth over those photos' smaller one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float64
+from opened_run import OpenedRun, open_run, write_png
+from smooth_path import nearest_first, path
+from tables import Row, print_table
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.consistency import AGREEMENT
+from splatpipe.pipeline.scene.dataset import load_points_and_tracks
+from splatpipe.pipeline.scene.images import Pixels
+from splatpipe.stages.threads import same_bits
+
+LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, of coded values
+EVERY_PX = 3  # places of a frame that are followed into the next, both ways
+NEAREST = 0.02  # quantile of the sparse points' depths: a few points are wrong
+IN_THE_AIR = 0.5  # of the nearest points' depth: the sparse cloud has holes, but not so deep
+LARGEST_IN_THE_AIR = 0.01  # of a frame: more of it counts as a floater that crosses
+MUCH_NEARER = 0.7  # of the smaller median depth of the two photos around
+SHEET_COLUMNS, SHEET_FRAMES, SHEET_WIDTH = 6, 48, 300
+SHOWN = 8  # frames in the table; all are in the JSON
+
+COLUMNS = {
+    "frame": "frame:",
+    "between": "between:",
+    "luminance": "luminance:.1f",
+    "step": "step:+.2f",
+    "same places: colour": "colour:.2f",
+    "exposure": "exposure:+.2f",
+    "places": "places:,",
+    "median depth / photos'": "depth_ratio:.2f",
+    "in the air": "in_the_air:.4f",
+}
+
+
+Depth = Float[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A camera, its render, and the median depth of that."""
+
+    camera: Camera
+    pixels: Pixels
+    depth: Depth
+
+
+def same_places(
+    camera: Camera, depth: Depth, following: Camera, following_depth: Depth
+) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
+    """Pixels of a frame and of the next that show the same places, by the median depths of both."""
+    rows, columns = (part.ravel() for part in np.mgrid[1 : camera.height : EVERY_PX, 1 : camera.width : EVERY_PX])
+    z = depth[rows, columns].astype(np.float64)
+    here = np.stack([columns + 0.5, rows + 0.5], axis=1)[z > 0.0]
+    z = z[z > 0.0]
+    rays = np.append((here - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((len(here), 1)), axis=1)
+    world = (z[:, None] * rays - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
+    ahead = world @ following.cam_from_world[2, :3] + following.cam_from_world[2, 3]
+    here, world, ahead = here[ahead > 0.0], world[ahead > 0.0], ahead[ahead > 0.0]
+    there = following.project(world)
+    inside = ((there >= 1.0) & (there <= [following.width - 1.0, following.height - 1.0])).all(axis=1)
+    here, there, ahead = here[inside], there[inside], ahead[inside]
+    column, row = there.astype(np.int64).T
+    agree = np.abs(following_depth[row, column] / ahead - 1.0) < AGREEMENT
+    return here[agree], there[agree]
+
+
+def change(frame: Frame, following: Frame) -> Row:
+    """What changes from a frame to the next in the places that both show; 8-bit steps."""
+    here, there = same_places(frame.camera, frame.depth, following.camera, following.depth)
+    if len(here) == 0:
+        return {"places": 0}
+    column, row = here.astype(np.int64).T
+    x, y = (part.astype(np.float32) - np.float32(0.5) for part in there.T)
+    shape = (-(-len(x) // 1024), 1024)  # OpenCV takes maps of fewer than 32,768 rows
+    sampled = cv2.remap(following.pixels, np.resize(x, shape), np.resize(y, shape), cv2.INTER_LINEAR)
+    colours = sampled.reshape(-1, 3)[: len(x)]
+    step = colours.astype(np.float64) - frame.pixels[row, column]
+    return {
+        "places": len(here),
+        "colour": float(np.median(np.abs(step).mean(axis=1))),
+        "exposure": float(np.median(step @ LUMA)),
+    }
+
+
+class Surroundings:
+    """What the photos say of how near things are."""
+
+    def __init__(self, run: OpenedRun, cameras: Sequence[Camera]) -> None:
+        points, tracks = load_points_and_tracks(run.parts["undistort.dataset"].path)
+        self.seen = [points.xyz[tracks[camera.name]] for camera in cameras]
+        self.medians = [_median(run.median_depth(camera)) for camera in cameras]
+
+    def look(self, frame: Frame, index: int) -> Row:
+        """How near a frame's things are, between photo ``index`` and the next."""
+        points = np.vstack(self.seen[index : index + 2])
+        z = points @ frame.camera.cam_from_world[2, :3] + frame.camera.cam_from_world[2, 3]
+        points, z = points[z > 0.0], z[z > 0.0]
+        pixels = frame.camera.project(points)
+        z = z[((pixels >= 0.0) & (pixels <= [frame.camera.width, frame.camera.height])).all(axis=1)]
+        limit = IN_THE_AIR * float(np.quantile(z, NEAREST)) if z.size else 0.0
+        photos = [median for median in self.medians[index : index + 2] if median is not None]
+        median = _median(frame.depth)
+        return {
+            "depth_ratio": median / min(photos) if photos and median is not None else None,
+            "in_the_air": float(((frame.depth > 0.0) & (frame.depth < limit)).mean()),
+        }
+
+
+def _median(depth: Depth) -> float | None:
+    surface = depth[depth > 0.0]
+    return float(np.median(surface)) if surface.size else None
+
+
+def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder: Path) -> list[Row]:
+    """Render and write the frames and their contact sheet; a row a frame."""
+    surroundings = Surroundings(run, cameras)
+    rows: list[Row] = []
+    small: list[Pixels] = []
+    before: Frame | None = None
+    for number, (place, camera) in enumerate(path(cameras, frames)):
+        frame = Frame(camera, run.picture(camera), run.median_depth(camera))
+        index = min(int(place), len(cameras) - 2)
+        names = " ".join(Path(photo.name).stem for photo in cameras[index : index + 2])
+        row: Row = {"frame": number, "between": names, "luminance": float((frame.pixels @ LUMA).mean())}
+        if before is not None:
+            row |= {"step": row["luminance"] - rows[-1]["luminance"]} | change(before, frame)
+        rows.append(row | surroundings.look(frame, index))
+        write_png(folder / f"frame_{number:04d}.png", frame.pixels)
+        height = max(1, round(SHEET_WIDTH * camera.height / camera.width))
+        small.append(np.asarray(cv2.resize(frame.pixels, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)))
+        before = frame
+    chosen = [small[k] for k in np.unique(np.linspace(0, frames - 1, min(frames, SHEET_FRAMES)).round().astype(int))]
+    chosen += [np.zeros_like(small[0])] * (-len(chosen) % SHEET_COLUMNS)
+    lines = [np.hstack(chosen[k : k + SHEET_COLUMNS]) for k in range(0, len(chosen), SHEET_COLUMNS)]
+    write_png(folder / "sheet.png", np.vstack(lines))
+    return rows
+
+
+def summary(rows: Sequence[Row]) -> Row:
+    """What a path's rows come to."""
+    followed = [row for row in rows if row.get("places")]
+    crossing = [
+        row["frame"]
+        for row in rows
+        if row["in_the_air"] > LARGEST_IN_THE_AIR or (row["depth_ratio"] or math.inf) < MUCH_NEARER
+    ]
+    return {
+        "frames": len(rows),
+        "largest_step": max((abs(row["step"]) for row in rows[1:]), default=None),
+        "largest_exposure": max((abs(row["exposure"]) for row in followed), default=None),
+        "median_colour": float(np.median([row["colour"] for row in followed])) if followed else None,
+        "largest_colour": max((row["colour"] for row in followed), default=None),
+        "largest_in_the_air": max(row["in_the_air"] for row in rows),
+        "crossing": crossing,
+    }
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("out", type=Path, help="OUT of a run, up to training at least")
+    options.add_argument("--frames", type=int, default=120)
+    options.add_argument("--order", choices=("name", "nearest"), default="name", help="of the photos along the path")
+    options.add_argument("--save", type=Path, default=Path("out/path_frames"), help="folder for frames and figures")
+    options.add_argument("--threads", type=int, default=1)
+    arguments = options.parse_args()
+    if arguments.frames < 2:
+        options.error("a path has two frames at least")
+    try:
+        run = open_run(arguments.out)
+        cameras = [run.camera(view) for view in run.views]  # in name order: that of the flight
+        if arguments.order == "nearest":
+            cameras = nearest_first(cameras)
+        arguments.save.mkdir(parents=True, exist_ok=True)
+        with same_bits(arguments.threads):
+            rows = measure_path(run, cameras, arguments.frames, arguments.save)
+    except SplatpipeError as error:
+        options.exit(error.exit_code, f"{error.message} {error.hint}\n")
+    result = summary(rows)
+    worst = sorted(rows, key=lambda row: max(abs(row.get("exposure", 0.0)), 100.0 * row["in_the_air"]), reverse=True)
+    print_table("the frames that stand out most", worst[:SHOWN], COLUMNS)
+    print("\n".join(f"{name.replace('_', ' ')}: {_text(value)}" for name, value in result.items()))
+    text = json.dumps({"summary": result, "frames": rows}, indent=1)
+    (arguments.save / "path_frames.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _text(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    main()
