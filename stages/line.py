@@ -132,7 +132,7 @@ class TrainConfig(StageConfig):
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
     filter_3d: bool = False
     """3D smoothing filter (Mip-Splatting): no Gaussian finer than the photos could show; for close-up views."""
-    background: Literal["black", "white", "random"] = "black"
+    background: Literal["black", "white", "random"] = "random"
     """What is behind the Gaussians in training; `random` (a colour an iteration) forbids holes."""
     coarse_levels: Annotated[int, Field(ge=0, le=4)] = 0
     """Start with photos halved this many times and double them on the way: faster, a little smoother."""
@@ -317,7 +317,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=4,
+    version=5,
     config=EvaluateConfig,
     reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
     parts={"metrics": "metrics.json", "views": "views"},

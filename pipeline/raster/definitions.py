@@ -20,6 +20,8 @@ TRANSMITTANCE_MIN = 1e-4
 """The Gaussian that would take a pixel's transmittance below this is not blended, and ends the pixel."""
 MEDIAN_TRANSMITTANCE = 0.5
 """The median depth is that of the Gaussian that takes the transmittance down to this."""
+MEDIAN_SHIFT_MAX = 0.5
+"""Share of its centre's depth by which that may differ from it: what is so long is no surface."""
 BLUR_PX2 = 0.3
 """Added to the variances on screen: no Gaussian is thinner than about a pixel (EWA's low-pass filter)."""
 FRUSTUM_MARGIN = 0.3
@@ -69,7 +71,9 @@ class Render:
         colour: Red, green, blue with the background, not clamped at 1.
         alpha: 1 - the transmittance that is left.
         depth_sum: Σ z α T, z along the view axis, world units.
-        median_depth: z of the Gaussian that takes T down to 0.5, world units; 0 where none does. No gradient.
+        median_depth: z at which the pixel's ray is deepest in the Gaussian that takes T down to 0.5, world units; 0
+            where none does. No gradient. Not the centre's z: a wall is made of Gaussians several pixels wide. As by
+            Zhang et al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting" (2024): linear in the place on the screen.
         visible: Gaussians whose ellipse (alpha ≥ 1/255) reaches the picture.
         radii: Three standard deviations along the longer axis on screen, pixels; 0 where not visible. No gradient.
     """

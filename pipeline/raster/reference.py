@@ -25,6 +25,7 @@ from splatpipe.pipeline.raster.definitions import (
     MAX_QUAT_NORM2,
     MAX_SCREEN_PX,
     MAX_VARIANCE_PX2,
+    MEDIAN_SHIFT_MAX,
     MEDIAN_TRANSMITTANCE,
     QUAT_EPSILON,
     RADIUS_SIGMAS,
@@ -49,6 +50,7 @@ class Splats:
         depths: z in the camera, world units.
         covariances: xx, xy, yy with the blur, px².
         determinants: Of the covariances.
+        depth_slopes: By how much the depth at which a ray is deepest in the Gaussian grows over a pixel, along x and y.
         opacities: At the centre, compensated in the anti-aliased variant.
         colours: Red, green, blue, ≥ 0.
         usable: False where anything is not finite, behind the near plane, or beyond the limits.
@@ -58,6 +60,7 @@ class Splats:
     depths: Float[Tensor, " n"]
     covariances: Float[Tensor, "n 3"]
     determinants: Float[Tensor, " n"]
+    depth_slopes: Float[Tensor, "n 2"]
     opacities: Float[Tensor, " n"]
     colours: Float[Tensor, "n 3"]
     usable: Bool[Tensor, " n"]
@@ -161,6 +164,11 @@ def project(
     determinants = sharp + BLUR_PX2 * (xx + yy) + BLUR_PX2**2
     covariances = torch.stack([xx + BLUR_PX2, xy, yy + BLUR_PX2], -1)
 
+    row_z = torch.einsum("j,njk->nk", pose[2, :3], axes)  # of the depth, as row_x and row_y of x and y on the screen
+    zx, zy = (row_z * row_x).sum(-1), (row_z * row_y).sum(-1)
+    slopes_x, slopes_y = (yy + BLUR_PX2) * zx - xy * zy, (xx + BLUR_PX2) * zy - xy * zx
+    depth_slopes = torch.stack([slopes_x, slopes_y], -1) / determinants[:, None]  # Σ'⁻¹ (zx, zy)
+
     opacities = torch.sigmoid(gaussians.opacity_logits)
     if options.antialias:
         opacities = opacities * torch.sqrt((sharp / determinants).clamp_min(COMPENSATION_MIN))
@@ -179,7 +187,7 @@ def project(
         & (colours.abs() <= MAX_COLOUR).all(-1)
         & (opacities >= ALPHA_MIN)
     )
-    return Splats(means2d, z, covariances, determinants, opacities, colours.clamp_min(0.0), usable)
+    return Splats(means2d, z, covariances, determinants, depth_slopes, opacities, colours.clamp_min(0.0), usable)
 
 
 def visible_splats(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
@@ -220,6 +228,7 @@ def render_reference(
             splats.depths,
             splats.covariances,
             splats.determinants,
+            splats.depth_slopes,
             splats.opacities,
             splats.colours,
         )
@@ -250,6 +259,7 @@ def _blend_rows(
     depths: Float[Tensor, " n"],
     covariances: Float[Tensor, "n 3"],
     determinants: Float[Tensor, " n"],
+    depth_slopes: Float[Tensor, "n 2"],
     opacities: Float[Tensor, " n"],
     colours: Float[Tensor, "n 3"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -277,5 +287,7 @@ def _blend_rows(
     colour = torch.einsum("nrw,nc->rwc", weights, colours) + left[..., None] * background
     depth_sum = torch.einsum("nrw,n->rw", weights, depths)
     passes = (before > MEDIAN_TRANSMITTANCE) & (after <= MEDIAN_TRANSMITTANCE)
-    median_depth = torch.where(passes, depths[:, None, None], 0.0).sum(0)
+    beyond = depth_slopes[:, 0, None, None] * dx + depth_slopes[:, 1, None, None] * dy
+    most = MEDIAN_SHIFT_MAX * depths[:, None, None]
+    median_depth = torch.where(passes, depths[:, None, None] + beyond.clamp(-most, most), 0.0).sum(0)
     return colour, 1.0 - left, depth_sum, median_depth

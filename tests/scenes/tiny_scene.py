@@ -24,6 +24,7 @@ POINT_NOISE = 0.03  # world units; the model is two units across
 # No technique that is on by default: what a test of one technique alone begins with.
 PLAIN: dict[str, object] = {
     "antialias": False,
+    "background": "black",
     "sky": "off",
     "prune_free_space": 0,
     "dropout": 0.0,

@@ -17,6 +17,7 @@ constexpr float kLog2AlphaMax = -0.014499569695115089f;
 constexpr float kLog2AlphaMin = -7.994353436858858f;
 constexpr float kTransmittanceMin = 1e-4f;
 constexpr float kMedianTransmittance = 0.5f;
+constexpr float kMedianShiftMax = 0.5f;
 constexpr float kBlurPx2 = 0.3f;
 constexpr float kFrustumMargin = 0.3f;
 constexpr float kCompensationMin = 2.5e-5f;
@@ -74,11 +75,11 @@ struct alignas(64) Splat {
     float log2_opacity;
     float colour[3];
     float depth;
-    float slope;    // -b / a: the ellipse's chord in row dy has its middle at slope dy
-    float inv_a;    // and the half-length inv_a sqrt(reach - v^2)
-    float reach;    // u^2 + v^2 <= reach is where alpha >= 1/255
-    float rows_dy;  // dy of the ellipse's rightmost point; the leftmost's is its negative
-    uint32_t unused[2];
+    float slope;             // -b / a: the ellipse's chord in row dy has its middle at slope dy
+    float inv_a;             // and the half-length inv_a sqrt(reach - v^2)
+    float reach;             // u^2 + v^2 <= reach is where alpha >= 1/255
+    float rows_dy;           // dy of the ellipse's rightmost point; the leftmost's is its negative
+    float depth_u, depth_v;  // by u and v, the depth at which a pixel's ray is deepest in the Gaussian
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 

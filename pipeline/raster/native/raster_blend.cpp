@@ -73,6 +73,12 @@ struct TileSplat {
         const Floats u = u_of(block), v = v_of(block);
         return fnma(u, u, fnma(v, v, log2_opacity));
     }
+    // Where the pixels' rays are deepest in the Gaussian. One so long that this is far from its centre is no surface.
+    SPLAT_METHOD Floats depth(const Splat& s, int block) const {
+        const Floats beyond = fma(fill(s.depth_u), u_of(block), fill(s.depth_v) * v_of(block));
+        const Floats most = fill(kMedianShiftMax * s.depth);
+        return fill(s.depth) + min(max(beyond, fill(0.0f) - most), most);
+    }
 };
 
 // The chords of a splat's ellipse in the rows of a tile: columns first..last, where `crossed`.
@@ -198,10 +204,11 @@ SPLAT_INLINE void blend_blocks(const TileSplat& splat, const Splat& s, BlockMask
         add_to(canvas->blue + at, weight[k], fill(s.colour[2]));
         store(canvas->transmittance + at, select(blended[k], after[k], before[k]));
         if (kDepth) {
-            const Floats depth = fill(s.depth), half = fill(kMedianTransmittance);
-            add_to(canvas->depth + at, weight[k], depth);
+            add_to(canvas->depth + at, weight[k], fill(s.depth));
+            const Floats half = fill(kMedianTransmittance);
             const Mask passes = both(blended[k], both(less(half, before[k]), at_most(after[k], half)));
-            if (any(passes)) store(canvas->median + at, select(passes, depth, load(canvas->median + at)));
+            if (any(passes))
+                store(canvas->median + at, select(passes, splat.depth(s, block[k]), load(canvas->median + at)));
         }
         const Mask ended = without(met[k], blended[k]);
         if (__builtin_expect(any(ended), 0)) end_pixels(canvas, block[k], bits(ended), pair);

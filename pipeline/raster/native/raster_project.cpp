@@ -72,15 +72,15 @@ SPLAT_INLINE Vec3 colour_of(const View& view, const Floats* sh, const Vec3& dir,
 
 SPLAT_INLINE Mask within(Floats x, float limit) { return both(at_most(x, fill(limit)), at_most(fill(-limit), x)); }
 
-// Splat's fields as vectors, in the order of the struct up to rows_dy, then the first and last tile rows.
-constexpr int kFields = 16;
+// Splat's fields as vectors, in the order of the struct, then the first and last tile rows.
+constexpr int kFields = 18;
 
 SPLAT_INLINE Mask make_splats(const View& view, const Projection& p, const Vec3& colour, float (*fields)[kLanes],
                               float* radii) {
     const Floats x = fill(view.fx) * p.point.x * p.inv_z + fill(view.cx);
     const Floats y = fill(view.fy) * p.point.y * p.inv_z + fill(view.cy);
     const Floats k = fill(kHalfLog2E), reach = p.log2_opacity - fill(kLog2AlphaMin), zero = fill(0.0f);
-    const Floats a = sqrt(k * p.yy / p.det), slope = p.xy / p.yy;
+    const Floats a = sqrt(k * p.yy / p.det), slope = p.xy / p.yy, c = sqrt(k / p.yy), inv_k = fill(1.0f / kHalfLog2E);
     const Floats spread = sqrt(max(reach, zero) / k);  // Mahalanobis distance at which alpha = 1/255
     const Floats half_x = spread * sqrt(p.xx), half_y = spread * sqrt(p.yy), half = fill(0.5f);
     Mask visible = both(p.usable, both(within(x, kMaxScreenPx), within(y, kMaxScreenPx)));
@@ -96,7 +96,7 @@ SPLAT_INLINE Mask make_splats(const View& view, const Projection& p, const Vec3&
                                     y,
                                     a,
                                     -a * slope,
-                                    sqrt(k / p.yy),
+                                    c,
                                     p.log2_opacity,
                                     max(colour.x, zero),
                                     max(colour.y, zero),
@@ -106,6 +106,8 @@ SPLAT_INLINE Mask make_splats(const View& view, const Projection& p, const Vec3&
                                     fill(1.0f) / a,
                                     reach,
                                     spread * p.xy / sqrt(p.xx),
+                                    inv_k * a * (p.zx - slope * p.zy),
+                                    inv_k * c * p.zy,
                                     select(no_row, fill(1.0f), floor(row0 * tile)),
                                     select(no_row, zero, floor(row1 * tile))};
     for (int i = 0; i < kFields; ++i) store(fields[i], values[i]);

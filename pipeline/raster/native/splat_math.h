@@ -41,6 +41,7 @@ struct Projection {
     Vec3 jw0, jw1;                    // rows of J W
     Vec3 scale, row0, row1;           // row0, row1: of B
     Floats xx, xy, yy;                // Σ', with the blur
+    Floats zx, zy;                    // covariances of the depth and the place on the screen
     Vec3 normal;                      // row0 x row1
     Floats sharp, det;                // det without and with the blur
     Floats opacity;                   // without compensation
@@ -89,6 +90,8 @@ SPLAT_INLINE Projection project_lanes(const View& view, const Lanes& in) {
     p.row1 = times(p.jw1.x * p.r0 + p.jw1.y * p.r1 + p.jw1.z * p.r2, p.scale);
     const Floats xx = dot(p.row0, p.row0), yy = dot(p.row1, p.row1), blur = fill(kBlurPx2);
     p.xx = xx + blur, p.xy = dot(p.row0, p.row1), p.yy = yy + blur;
+    const Vec3 row2 = times(w2.x * p.r0 + w2.y * p.r1 + w2.z * p.r2, p.scale);
+    p.zx = dot(row2, p.row0), p.zy = dot(row2, p.row1);
     p.normal = cross(p.row0, p.row1);
     p.sharp = dot(p.normal, p.normal);
     p.det = p.sharp + blur * (xx + yy) + fill(kBlurPx2 * kBlurPx2);
