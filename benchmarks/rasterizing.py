@@ -66,7 +66,7 @@ def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iterati
     frame.forward(
         tuple(tensor.detach().contiguous() for tensor in gaussians.tensors().values()),
         (np.ascontiguousarray(camera.cam_from_world, np.float64), (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
-        (sh_degree_at(options, iteration), options.antialias, plan.near, loop.background(options, iteration)),
-        (torch.empty(h, w, 3), torch.empty(h, w), None, None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
+        (sh_degree_at(options, iteration), options.antialias, plan.near, 0.0, loop.background(options, iteration)),
+        (torch.empty(h, w, 3), torch.empty(h, w), None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
     )
     return int(frame.contributing_pairs())

@@ -193,6 +193,8 @@ class TrainConfig(StageConfig):
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
     depth_weight: NonNegativeFloat = 0.0
     """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training."""
+    spread_weight: NonNegativeFloat = 0.0
+    """Weight of the spread of the depths along a pixel's ray in the loss: layers become one surface. Tried: 0.02."""
     sh_limit: bool = False
     """Hold the degree of each Gaussian's colour to what the photos that saw it can tell by number and angles."""
     max_anisotropy: NonNegativeFloat = 0.0

@@ -41,7 +41,7 @@ def weighted(scene: Gaussians, camera: Camera, options: RenderOptions, backend: 
     result = render(scene, camera, options, backend=backend, camera_probe=probe)  # type: ignore[arg-type]
     generator = torch.Generator().manual_seed(5)
     total = torch.zeros((), dtype=scene.means.dtype)
-    for picture in (result.colour, result.alpha, result.depth_sum):
+    for picture in (result.colour, result.alpha, result.depth_sum, result.depth_square_sum):
         total = total + (picture * torch.randn(picture.shape, generator=generator)).sum()
     return total
 

@@ -25,6 +25,8 @@ from random_scene import random_camera, random_scene
 # Tolerances of float32 against float64.
 COLOUR = 1e-5  # sums of up to 60 rounded terms of size 1
 DEPTH = 1e-4  # the same, of depths up to 10
+SQUARES = ("depth_square_sum", 10.0 * DEPTH)  # of depths up to ten from the origin
+
 GRADIENT = 3e-5  # L2 over all Gaussians, relative: sums over a hundred pixels, through divisions by 1 - alpha
 THIN_GRADIENT = 1e-3  # the same where the covariance's eigenvalues are 10^6 apart, 3e-7 · √10^6 relative
 NO_GRADIENT = 1e-6  # what is smaller is rounding, or of a Gaussian far below a pixel
@@ -58,7 +60,8 @@ def evaluate(
     result = render(scene, camera, options, backend=backend, means2d_probe=probe)  # type: ignore[arg-type]
     generator = torch.Generator().manual_seed(5)
     total = torch.zeros((), dtype=scene.means.dtype)
-    for picture in (result.colour, result.alpha[..., None], result.depth_sum[..., None]):
+    grey = (result.alpha, result.depth_sum, result.depth_square_sum)
+    for picture in (result.colour, *(each[..., None] for each in grey)):
         weights = torch.randn(picture.shape, generator=generator)
         total = total + (picture * weights * (1.0 if weight is None else weight[..., None])).sum()
     leaves = scene.tensors() | {"means2d": probe}
@@ -103,7 +106,7 @@ def compare(scene: Gaussians, camera: Camera, options: RenderOptions, gradient: 
     flipped |= (ours.median_depth - exact.median_depth).abs() > 0.01
     assert flipped.sum() <= FLIPPED
     same = ~flipped
-    for name, limit in (("colour", COLOUR), ("alpha", COLOUR), ("depth_sum", DEPTH), ("median_depth", DEPTH)):
+    for name, limit in (("colour", COLOUR), ("alpha", COLOUR), ("depth_sum", DEPTH), ("median_depth", DEPTH), SQUARES):
         error = (getattr(ours, name) - getattr(exact, name))[same].abs().max()
         assert error < limit, f"{name}: {error:.1e}"
     assert torch.equal(ours.visible, exact.visible)
@@ -119,7 +122,7 @@ def compare(scene: Gaussians, camera: Camera, options: RenderOptions, gradient: 
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("seed", range(3))
 def test_agrees_with_the_reference(seed: int, antialias: bool) -> None:
-    options = RenderOptions(3, background=(0.1, 0.5, 0.9), antialias=antialias, near=0.2)
+    options = RenderOptions(3, background=(0.1, 0.5, 0.9), antialias=antialias, near=0.2, depth_origin=3.0)
     compare(random_scene(seed), random_camera(seed), options)
 
 
@@ -144,11 +147,12 @@ def test_contributing_pairs_are_those_of_the_reference() -> None:
     scene.opacity_logits += 3.0  # so that pixels end
     camera, options = random_camera(11), RenderOptions(0, near=0.2)
     frame = _native.Frame()
-    tensors = [torch.empty(camera.height, camera.width, 3), torch.empty(camera.height, camera.width), None, None]
+    tensors = [torch.empty(camera.height, camera.width, 3), torch.empty(camera.height, camera.width), None]
     tensors += [torch.empty(len(scene)), torch.empty(len(scene), dtype=torch.uint8)]
     size, intrinsics = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
     view = (np.ascontiguousarray(camera.cam_from_world, np.float64), size, intrinsics)
-    frame.forward(tuple(scene.tensors().values()), view, (0, False, options.near, options.background), tuple(tensors))
+    how = (0, False, options.near, options.depth_origin, options.background)
+    frame.forward(tuple(scene.tensors().values()), view, how, tuple(tensors))
     # Every blended pair moves its pixel's alpha; the reference's alphas are found again one Gaussian at a time.
     assert frame.contributing_pairs() == pytest.approx(
         blended_pairs(scene.to(dtype=torch.float64), camera, options), rel=2e-3
@@ -255,7 +259,7 @@ def test_zero_quaternion_is_the_identity_without_gradient() -> None:
 
 
 def same_bits(a: Outcome, b: Outcome) -> bool:
-    pictures = ("colour", "alpha", "depth_sum", "median_depth", "visible", "radii")
+    pictures = ("colour", "alpha", "depth_sum", "depth_square_sum", "median_depth", "visible", "radii")
     return all(torch.equal(getattr(a.render, p), getattr(b.render, p)) for p in pictures) and all(
         torch.equal(a.gradients[name], b.gradients[name]) for name in a.gradients
     )
@@ -267,7 +271,8 @@ def test_a_render_keeps_its_instruction_set_for_its_gradient() -> None:
     leaves = scene.detach().clone().requires_grad_()
     result = render(leaves, camera, options, backend="native")
     generator = torch.Generator().manual_seed(5)
-    pictures = (result.colour, result.alpha[..., None], result.depth_sum[..., None])
+    grey = (result.alpha, result.depth_sum, result.depth_square_sum)
+    pictures = (result.colour, *(each[..., None] for each in grey))
     total = sum((picture * torch.randn(picture.shape, generator=generator)).sum() for picture in pictures)
     for other in _native.isas():
         _native.set_isa(other)
@@ -317,7 +322,7 @@ def test_a_render_without_depth_is_the_same_but_for_the_depth() -> None:
     expected = torch.autograd.grad(full.colour.sum() + full.alpha.sum(), scene.means)[0]
     for backend in ("native", "reference"):
         lean = render(scene, camera, RenderOptions(3, depth=False), backend=backend)  # type: ignore[arg-type]
-        for depth in (lean.depth_sum, lean.median_depth, lean.expected_depth):
+        for depth in (lean.depth_sum, lean.depth_square_sum, lean.median_depth, lean.expected_depth):
             assert depth.shape == full.alpha.shape
             assert (depth == 0).all()
         assert not lean.depth_sum.requires_grad

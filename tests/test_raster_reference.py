@@ -87,6 +87,7 @@ def test_nearer_gaussian_covers_the_farther_one_whatever_their_order() -> None:
         expected = torch.tensor([0.7, 0.0, 0.3 * 0.8], dtype=torch.float64)
         torch.testing.assert_close(result.colour[5, 7], expected, atol=1e-7, rtol=0)
         assert result.depth_sum[5, 7] == pytest.approx(0.7 * 3.0 + 0.3 * 0.8 * 6.0, abs=EXACT)
+        assert result.depth_square_sum[5, 7] == pytest.approx(0.7 * 9.0 + 0.3 * 0.8 * 36.0, abs=20.0 * EXACT)
         assert result.expected_depth[5, 7] == pytest.approx((0.7 * 3.0 + 0.24 * 6.0) / 0.94, abs=EXACT)
         assert result.median_depth[5, 7] == 3.0
         assert result.median_depth[0, 0] == 0.0
@@ -154,13 +155,14 @@ def loss_of(scene: Gaussians, options: RenderOptions, probe: Tensor) -> Tensor:
     """A weighted sum of all that has a gradient."""
     generator = torch.Generator().manual_seed(5)
     result = render(scene, random_camera(), options, backend="reference", means2d_probe=probe)
-    pictures = (result.colour, result.alpha[..., None], result.depth_sum[..., None])
+    grey = (result.alpha, result.depth_sum, result.depth_square_sum)
+    pictures = (result.colour, *(each[..., None] for each in grey))
     return sum((p * torch.randn(p.shape, generator=generator, dtype=torch.float64)).sum() for p in pictures)  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize(("sh_degree", "antialias"), [(0, False), (1, False), (2, False), (3, False), (3, True)])
 def test_gradients_agree_with_finite_differences(sh_degree: int, antialias: bool) -> None:
-    options = RenderOptions(sh_degree, background=(0.3, 0.1, 0.6), antialias=antialias, near=0.2)
+    options = RenderOptions(sh_degree, background=(0.3, 0.1, 0.6), antialias=antialias, near=0.2, depth_origin=2.0)
     scene, probe = random_scene(sh_degree).requires_grad_(), torch.zeros(8, 2, dtype=torch.float64, requires_grad=True)
     tensors = scene.tensors() | {"probe": probe}
     gradients = torch.autograd.grad(loss_of(scene, options, probe), list(tensors.values()))

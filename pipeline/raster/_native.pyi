@@ -34,17 +34,17 @@ class Frame:
         self,
         parameters: Sequence[Tensor],
         camera: tuple[np.ndarray[Any, Any], tuple[int, int], tuple[float, float, float, float]],
-        options: tuple[int, bool, float, tuple[float, float, float]],
-        outputs: tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor],
+        options: tuple[int, bool, float, float, tuple[float, float, float]],
+        outputs: tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor] | None, Tensor, Tensor],
     ) -> None:
         """Render.
 
         Args:
             parameters: means (n, 3), log_scales (n, 3), quats (n, 4), opacity_logits (n,), sh (n, k, 3); float32.
             camera: cam_from_world (4, 4) float64; width, height; fx, fy, cx, cy in pixels.
-            options: SH degree, antialias, near plane, background.
-            outputs: Written: colour (h, w, 3), alpha (h, w), depth_sum and median_depth (h, w) or both None, radii (n,)
-                float32; visible (n,) uint8.
+            options: SH degree, antialias, near plane, origin of the squared depths, background.
+            outputs: Written: colour (h, w, 3), alpha (h, w); None, or depth_sum, depth_square_sum and median_depth
+                (h, w); radii (n,) float32; visible (n,) uint8.
 
         Raises:
             TooManyPairs, MemoryError: if the scene is too much.
@@ -64,7 +64,7 @@ class Frame:
 
         Args:
             parameters: Those that were rendered.
-            gradients: dL/d(colour), dL/d(alpha), dL/d(depth_sum); None for zero.
+            gradients: dL/d(colour), dL/d(alpha), dL/d(depth_sum), dL/d(depth_square_sum); None for zero.
             outputs: Written: gradients of the parameters, laid out like them.
             means2d: Written: dL/d(centres on screen), pixels (n, 2).
             magnitudes: Make that the sum of its absolute values over the pixels, x and y apart.

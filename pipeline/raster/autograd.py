@@ -82,7 +82,7 @@ class _Rasterize(torch.autograd.Function):
         n, h, w = len(parameters[0]), camera.height, camera.width
         colour = torch.empty(h, w, 3)
         alpha = torch.empty(h, w)
-        depths = (torch.empty(h, w), torch.empty(h, w)) if options.depth else (None, None)
+        depths = (torch.empty(h, w), torch.empty(h, w), torch.empty(h, w)) if options.depth else None
         radii, visible = torch.empty(n), torch.empty(n, dtype=torch.uint8)
         pose = np.ascontiguousarray(camera.cam_from_world, np.float64)
         frame = _native.Frame()
@@ -90,28 +90,36 @@ class _Rasterize(torch.autograd.Function):
             frame.forward(
                 parameters,
                 (pose, (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
-                (options.sh_degree, options.antialias, options.near, options.background),
-                (colour, alpha, *depths, radii, visible),
+                (options.sh_degree, options.antialias, options.near, options.depth_origin, options.background),
+                (colour, alpha, depths, radii, visible),
             )
         except (_native.TooManyPairs, MemoryError) as error:
             _refuse(error, n)
         visible = visible.view(torch.bool)
-        depth_sum, median_depth = (torch.zeros(()).expand(h, w) if depth is None else depth for depth in depths)
+        depth_sum, depth_square_sum, median_depth = depths or (torch.zeros(()).expand(h, w),) * 3
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(median_depth, visible, radii, *(() if options.depth else (depth_sum,)))
+        ctx.mark_non_differentiable(
+            median_depth, visible, radii, *(() if options.depth else (depth_sum, depth_square_sum))
+        )
         if any(ctx.needs_input_grad):
             ctx.frame = frame
             ctx.magnitudes = options.magnitudes
             ctx.buffers = buffers
             ctx.save_for_backward(*parameters)
-        return colour, alpha, depth_sum, median_depth, visible, radii
+        return colour, alpha, depth_sum, depth_square_sum, median_depth, visible, radii
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, colour: Tensor | None, alpha: Tensor | None, depth_sum: Tensor | None, *_: None
+        ctx: Any,
+        colour: Tensor | None,
+        alpha: Tensor | None,
+        depth_sum: Tensor | None,
+        depth_square_sum: Tensor | None,
+        *_: None,
     ) -> tuple[Tensor | None, ...]:
-        pictures = tuple(None if grad is None else grad.contiguous() for grad in (colour, alpha, depth_sum))
+        upstream = (colour, alpha, depth_sum, depth_square_sum)
+        pictures = tuple(None if grad is None else grad.contiguous() for grad in upstream)
         parameters = ctx.saved_tensors
         # New memory a pass where none was given: a second pass must not write over the gradients of the first.
         gradients = (ctx.buffers or GradientBuffers()).like(parameters)

@@ -51,7 +51,9 @@ class RenderOptions:
         antialias: Scale opacities by √(det Σ' / det(Σ' + 0.3 I)), floored: a Gaussian keeps its energy when the blur
             widens it ("Mip-Splatting", Yu et al. 2024, the 2D Mip filter).
         near: Gaussians nearer than this are skipped, world units along the view axis, > 0.
-        depth: Render depths, too; without, both are zeros and a render takes a fifth less.
+        depth: Render depths, too; without, all are zeros and a render takes a fifth less.
+        depth_origin: Depths are squared as their distance from it: float32 keeps little of the variance of a depth of
+            100 m else.
         magnitudes: The probe's gradient sums the pixels' absolute values, x and y apart, which do not cancel.
     """
 
@@ -60,6 +62,7 @@ class RenderOptions:
     antialias: bool = False
     near: float = 0.01
     depth: bool = True
+    depth_origin: float = 0.0
     magnitudes: bool = False
 
 
@@ -71,6 +74,7 @@ class Render:
         colour: Red, green, blue with the background, not clamped at 1.
         alpha: 1 - the transmittance that is left.
         depth_sum: Σ z α T, z along the view axis, world units.
+        depth_square_sum: Σ (z - depth_origin)² α T.
         median_depth: z at which the pixel's ray is deepest in the Gaussian that takes T down to 0.5, world units; 0
             where none does. No gradient. Not the centre's z: a wall is made of Gaussians several pixels wide. As by
             Zhang et al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting" (2024): linear in the place on the screen.
@@ -81,6 +85,7 @@ class Render:
     colour: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
     depth_sum: Float[Tensor, "h w"]
+    depth_square_sum: Float[Tensor, "h w"]
     median_depth: Float[Tensor, "h w"]
     visible: Bool[Tensor, " n"]
     radii: Float[Tensor, " n"]

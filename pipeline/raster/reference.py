@@ -221,7 +221,7 @@ def render_reference(
     background = torch.tensor(options.background, dtype=probe.dtype, device=probe.device)
     bands = []
     for top in range(0, camera.height, rows):
-        size = (top, min(top + rows, camera.height), camera.width, options.magnitudes)
+        size = (top, min(top + rows, camera.height), camera.width, options.magnitudes, options.depth_origin)
         values = (
             splats.means,
             probe,
@@ -233,10 +233,10 @@ def render_reference(
             splats.colours,
         )
         bands.append(checkpoint(_blend_rows, size, background, *values, use_reentrant=False, preserve_rng_state=False))
-    colour, alpha, depth_sum, median_depth = (torch.cat(parts) for parts in zip(*bands, strict=True))
+    colour, alpha, depth_sum, depth_square_sum, median_depth = (torch.cat(parts) for parts in zip(*bands, strict=True))
     if not options.depth:
-        depth_sum = median_depth = alpha.new_zeros(()).expand(alpha.shape)
-    return Render(colour, alpha, depth_sum, median_depth.detach(), visible, radii)
+        depth_sum = depth_square_sum = median_depth = alpha.new_zeros(()).expand(alpha.shape)
+    return Render(colour, alpha, depth_sum, depth_square_sum, median_depth.detach(), visible, radii)
 
 
 class _SumOfMagnitudes(torch.autograd.Function):
@@ -252,7 +252,7 @@ class _SumOfMagnitudes(torch.autograd.Function):
 
 
 def _blend_rows(
-    size: tuple[int, int, int, bool],
+    size: tuple[int, int, int, bool, float],
     background: Float[Tensor, " 3"],
     means: Float[Tensor, "n 2"],
     probe: Float[Tensor, "n 2"],
@@ -262,9 +262,9 @@ def _blend_rows(
     depth_slopes: Float[Tensor, "n 2"],
     opacities: Float[Tensor, " n"],
     colours: Float[Tensor, "n 3"],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows top..bottom of the picture: colour (r, w, 3), alpha, depth sum, median depth (r, w)."""
-    top, bottom, width, magnitudes = size
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Rows top..bottom of the picture: colour (r, w, 3), alpha, depth sum, of squares, median depth (r, w)."""
+    top, bottom, width, magnitudes, depth_origin = size
     ys = torch.arange(top, bottom, dtype=means.dtype, device=means.device) + 0.5
     xs = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
     shift = probe[:, None, None]  # (n, r, w, 2), or broadcast
@@ -286,8 +286,9 @@ def _blend_rows(
     left = after[-1] if len(after) else ones[0]  # (r, w)
     colour = torch.einsum("nrw,nc->rwc", weights, colours) + left[..., None] * background
     depth_sum = torch.einsum("nrw,n->rw", weights, depths)
+    depth_square_sum = torch.einsum("nrw,n->rw", weights, torch.square(depths - depth_origin))
     passes = (before > MEDIAN_TRANSMITTANCE) & (after <= MEDIAN_TRANSMITTANCE)
     beyond = depth_slopes[:, 0, None, None] * dx + depth_slopes[:, 1, None, None] * dy
     most = MEDIAN_SHIFT_MAX * depths[:, None, None]
     median_depth = torch.where(passes, depths[:, None, None] + beyond.clamp(-most, most), 0.0).sum(0)
-    return colour, 1.0 - left, depth_sum, median_depth
+    return colour, 1.0 - left, depth_sum, depth_square_sum, median_depth

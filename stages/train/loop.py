@@ -31,6 +31,7 @@ from splatpipe.stages.train.exposure import exposures_json
 from splatpipe.stages.train.exposure_grid import write_grids
 from splatpipe.stages.train.flatness import ends_at, is_flat, place_in_schedule, settled_from
 from splatpipe.stages.train.interrupts import deferred_interrupts
+from splatpipe.stages.train.layers import depth_origin, is_spread_counted, spread_loss
 from splatpipe.stages.train.memory import over_memory, without_growth
 from splatpipe.stages.train.plan import (
     Plan,
@@ -271,8 +272,10 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         photo = state.refinement.refined(photo, iteration, options)
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
     look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
-    settings = render_options(plan, iteration, look.magnitudes)
     place = place_in_schedule(plan, state.history.flat_at, iteration)
+    settings = render_options(plan, iteration, look.magnitudes)
+    if spread := is_spread_counted(options, place):
+        settings = replace(settings, depth=True, depth_origin=depth_origin(state.gaussians.means, photo.camera))
     probe = state.probe() if look.probe else None
     model = dropped(state.rendered_model(options), options, place)
     buffers = None if look.again else state.buffers
@@ -281,6 +284,8 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     )
     photometric, penalties, photo, shown = losses(state, plan, photo, rendered, settings.background)
     loss = with_depth(photometric, rendered, photo, options, place) + penalties
+    if spread:
+        loss = loss + options.spread_weight * spread_loss(rendered, settings.depth_origin, photo.camera)
     loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
     state.observe_directions(photo.camera)

@@ -70,7 +70,7 @@ splat::View view_of(int width, int height, int sh_count, const Options& options)
     const float margin_x = 0.5f * splat::kFrustumMargin * w, margin_y = 0.5f * splat::kFrustumMargin * h;
     view.ratio_min[0] = -(view.cx + margin_x) / view.fx, view.ratio_max[0] = (w - view.cx + margin_x) / view.fx;
     view.ratio_min[1] = -(view.cy + margin_y) / view.fy, view.ratio_max[1] = (h - view.cy + margin_y) / view.fy;
-    view.near_z = 0.2f;
+    view.near_z = 0.2f, view.depth_origin = 2.0f;
     const float background[] = {0.1f, 0.5f, 0.9f};
     std::copy(std::begin(background), std::end(background), view.background);
     view.sh_degree = options.sh_degree, view.sh_count = sh_count, view.antialias = options.antialias;
@@ -78,7 +78,7 @@ splat::View view_of(int width, int height, int sh_count, const Options& options)
 }
 
 std::vector<const std::vector<float>*> Outcome::pictures() const {
-    return {&colour, &alpha, &depth_sum, &median_depth, &radii};
+    return {&colour, &alpha, &depth_sum, &depth_square_sum, &median_depth, &radii};
 }
 
 std::vector<const std::vector<float>*> Outcome::gradients() const {
@@ -115,20 +115,21 @@ Outcome evaluate(splat::RasterFrame& frame, const Scene& scene, const splat::Vie
     const auto blank = [&](std::size_t size) { return std::vector<float>(size, unwritten); };
     Outcome out{};
     out.colour = blank(3 * pixels), out.alpha = blank(pixels);
-    out.depth_sum = blank(depths), out.median_depth = blank(depths);
+    out.depth_sum = blank(depths), out.depth_square_sum = blank(depths), out.median_depth = blank(depths);
     out.radii = blank(n), out.visible.assign(n, static_cast<std::uint8_t>(static_cast<int>(unwritten) & 255));
     frame.forward(view, scene.parameters(),
                   {out.colour.data(), out.alpha.data(), depth ? out.depth_sum.data() : nullptr,
-                   depth ? out.median_depth.data() : nullptr},
+                   depth ? out.depth_square_sum.data() : nullptr, depth ? out.median_depth.data() : nullptr},
                   out.radii.data(), out.visible.data());
     Random random(5);
     const std::vector<float> colour = random_weights(&random, 3 * pixels), alpha = random_weights(&random, pixels);
-    const std::vector<float> depth_sum = random_weights(&random, depths);
-    out.sum =
-        weighted_sum(out.colour, colour) + weighted_sum(out.alpha, alpha) + weighted_sum(out.depth_sum, depth_sum);
+    const std::vector<float> depth_sum = random_weights(&random, depths), squares = random_weights(&random, depths);
+    out.sum = weighted_sum(out.colour, colour) + weighted_sum(out.alpha, alpha) +
+              weighted_sum(out.depth_sum, depth_sum) + weighted_sum(out.depth_square_sum, squares);
     out.means = blank(3 * n), out.log_scales = blank(3 * n), out.quats = blank(4 * n), out.opacity_logits = blank(n);
     out.sh = blank(scene.sh.size()), out.means2d = blank(2 * n), out.magnitudes = blank(2 * n);
-    const splat::PictureGradients pictures = {colour.data(), alpha.data(), depth ? depth_sum.data() : nullptr};
+    const splat::PictureGradients pictures = {colour.data(), alpha.data(), depth ? depth_sum.data() : nullptr,
+                                              depth ? squares.data() : nullptr};
     splat::ParameterGradients gradients = {out.means.data(),
                                            out.log_scales.data(),
                                            out.quats.data(),

@@ -31,7 +31,7 @@ splat::View view_of(int width, int height, int sh_count, const Options& options)
 
 // A render, and the gradients of a sum of its pictures with random weights.
 struct Outcome {
-    std::vector<float> colour, alpha, depth_sum, median_depth, radii;
+    std::vector<float> colour, alpha, depth_sum, depth_square_sum, median_depth, radii;
     std::vector<std::uint8_t> visible;
     std::vector<float> means, log_scales, quats, opacity_logits, sh, means2d, magnitudes;
     double sum;

@@ -33,13 +33,15 @@ template <class T>
 using ParameterArrays = std::tuple<Grid<T>, Grid<T>, Grid<T>, Line<T>, Cube<T>>;
 // cam_from_world; width, height; fx, fy, cx, cy
 using CameraTuple = std::tuple<Pose, std::array<int, 2>, std::array<double, 4>>;
-// sh_degree, antialias, near, background
-using OptionsTuple = std::tuple<int, bool, double, std::array<double, 3>>;
-// colour, alpha, depth_sum, median_depth; radii, visible
-using OutputArrays = std::tuple<Cube<float>, Grid<float>, std::optional<Grid<float>>, std::optional<Grid<float>>,
-                                Line<float>, Line<uint8_t>>;
-using PictureGradientArrays =
-    std::tuple<std::optional<Cube<const float>>, std::optional<Grid<const float>>, std::optional<Grid<const float>>>;
+// sh_degree, antialias, near, depth_origin, background
+using OptionsTuple = std::tuple<int, bool, double, double, std::array<double, 3>>;
+// depth_sum, depth_square_sum, median_depth
+using DepthArrays = std::tuple<Grid<float>, Grid<float>, Grid<float>>;
+// colour, alpha; depths; radii, visible
+using OutputArrays = std::tuple<Cube<float>, Grid<float>, std::optional<DepthArrays>, Line<float>, Line<uint8_t>>;
+// colour, alpha, depth_sum, depth_square_sum
+using PictureGradientArrays = std::tuple<std::optional<Cube<const float>>, std::optional<Grid<const float>>,
+                                         std::optional<Grid<const float>>, std::optional<Grid<const float>>>;
 
 template <class T>
 T* checked(const Grid<T>& array, size_t rows, size_t columns, const char* name) {
@@ -97,11 +99,12 @@ void put_camera(const CameraTuple& camera, splat::View* view) {
 }
 
 void put_options(const OptionsTuple& options, size_t sh_count, splat::View* view) {
-    const auto& [degree, antialias, near_z, background] = options;
+    const auto& [degree, antialias, near_z, depth_origin, background] = options;
     if (degree < 0 || degree > 3 || sh_count > 16 || static_cast<size_t>((degree + 1) * (degree + 1)) > sh_count)
         throw nb::value_error("sh_degree");
     view->sh_degree = degree, view->sh_count = static_cast<int>(sh_count);
     view->antialias = antialias, view->near_z = static_cast<float>(near_z);
+    view->depth_origin = static_cast<float>(depth_origin);
     for (int c = 0; c < 3; ++c) view->background[c] = static_cast<float>(background[c]);
 }
 
@@ -114,11 +117,15 @@ class Frame {
         put_camera(camera, &view_);
         put_options(options, std::get<4>(arrays).shape(1), &view_);
         const size_t n = in.count, h = view_.height, w = view_.width;
-        const auto& [colour, alpha, depth_sum, median_depth, radii, visible] = outputs;
-        if (depth_sum.has_value() != median_depth.has_value()) throw nb::value_error("one depth without the other");
-        const splat::Pictures out = {checked(colour, h, w, "colour"), checked(alpha, h, w, "alpha"),
-                                     depth_sum ? checked(*depth_sum, h, w, "depth_sum") : nullptr,
-                                     median_depth ? checked(*median_depth, h, w, "median_depth") : nullptr};
+        const auto& [colour, alpha, depths, radii, visible] = outputs;
+        splat::Pictures out{};
+        out.colour = checked(colour, h, w, "colour"), out.alpha = checked(alpha, h, w, "alpha");
+        if (depths) {
+            const auto& [depth_sum, depth_square_sum, median_depth] = *depths;
+            out.depth_sum = checked(depth_sum, h, w, "depth_sum");
+            out.depth_square_sum = checked(depth_square_sum, h, w, "depth_square_sum");
+            out.median_depth = checked(median_depth, h, w, "median_depth");
+        }
         float* radii_out = checked(radii, n, "radii");
         uint8_t* visible_out = checked(visible, n, "visible");
         nb::gil_scoped_release release;
@@ -134,10 +141,11 @@ class Frame {
         const size_t n = in.count, k = view_.sh_count, h = view_.height, w = view_.width;
         if (in.count != count_ || std::get<4>(arrays).shape(1) != k)
             throw nb::value_error("not what forward() rendered");
-        const auto& [colour, alpha, depth_sum] = gradients;
-        const splat::PictureGradients pictures = {colour ? checked(*colour, h, w, "colour") : nullptr,
-                                                  alpha ? checked(*alpha, h, w, "alpha") : nullptr,
-                                                  depth_sum ? checked(*depth_sum, h, w, "depth_sum") : nullptr};
+        const auto& [colour, alpha, depth_sum, depth_square_sum] = gradients;
+        const splat::PictureGradients pictures = {
+            colour ? checked(*colour, h, w, "colour") : nullptr, alpha ? checked(*alpha, h, w, "alpha") : nullptr,
+            depth_sum ? checked(*depth_sum, h, w, "depth_sum") : nullptr,
+            depth_square_sum ? checked(*depth_square_sum, h, w, "depth_square_sum") : nullptr};
         const auto& [means, log_scales, quats, opacity_logits, sh] = outputs;
         const splat::ParameterGradients out = {checked(means, n, 3, "means"),
                                                checked(log_scales, n, 3, "log_scales"),

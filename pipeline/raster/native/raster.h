@@ -46,6 +46,7 @@ struct View {
     float centre[3];                    // of projection, world
     float ratio_min[2], ratio_max[2];   // x/z and y/z are clamped to these in the Jacobian
     float near_z;
+    float depth_origin;  // depths are squared as their distance from it, along the view axis
     float background[3];
     int sh_degree;  // that counts
     int sh_count;   // coefficients a channel that are stored, >= (sh_degree + 1)^2
@@ -111,13 +112,13 @@ struct FrameData {
     int32_t* pixel_end;    // (tiles, 256): number of the tile's pairs that the pixel looked at before it ended
 };
 
-// Pictures, row-major: (h, w, 3) and (h, w). Both depths, or neither (null).
+// Pictures, row-major: (h, w, 3) and (h, w). All depths, or none (null).
 struct Pictures {
-    float *colour, *alpha, *depth_sum, *median_depth;
+    float *colour, *alpha, *depth_sum, *depth_square_sum, *median_depth;
 };
 // Null for zero.
 struct PictureGradients {
-    const float *colour, *alpha, *depth_sum;
+    const float *colour, *alpha, *depth_sum, *depth_square_sum;
 };
 
 struct ProjectKernels {

@@ -135,7 +135,8 @@ SPLAT_INLINE BlockMask touched_blocks(const Splat& s, const TilePlace& at) {
 // A tile's pixels on their way from front to back. The transmittance of a pixel that has ended is kept as its negative.
 struct Canvas {
     alignas(64) float transmittance[kTilePixels], red[kTilePixels], green[kTilePixels], blue[kTilePixels];
-    alignas(64) float depth[kTilePixels], median[kTilePixels];
+    alignas(64) float depth[kTilePixels], depth_square[kTilePixels], median[kTilePixels];
+    float depth_origin;
     int32_t* end;
     BlockMask alive;
 };
@@ -146,7 +147,7 @@ void start(const TilePlace& at, int pairs, Canvas* canvas) {
     const Floats zero = fill(0.0f);
     for (int p = 0; p < kTilePixels; p += kLanes) {
         store(canvas->red + p, zero), store(canvas->green + p, zero), store(canvas->blue + p, zero);
-        store(canvas->depth + p, zero), store(canvas->median + p, zero);
+        store(canvas->depth + p, zero), store(canvas->depth_square + p, zero), store(canvas->median + p, zero);
         store(canvas->transmittance + p, fill(1.0f));
         for (int lane = 0; lane < kLanes; ++lane) canvas->end[p + lane] = pairs;
     }
@@ -204,7 +205,9 @@ SPLAT_INLINE void blend_blocks(const TileSplat& splat, const Splat& s, BlockMask
         add_to(canvas->blue + at, weight[k], fill(s.colour[2]));
         store(canvas->transmittance + at, select(blended[k], after[k], before[k]));
         if (kDepth) {
+            const float depth = s.depth - canvas->depth_origin;
             add_to(canvas->depth + at, weight[k], fill(s.depth));
+            add_to(canvas->depth_square + at, weight[k], fill(depth * depth));
             const Floats half = fill(kMedianTransmittance);
             const Mask passes = both(blended[k], both(less(half, before[k]), at_most(after[k], half)));
             if (any(passes))
@@ -232,7 +235,7 @@ SPLAT_INLINE void put_pixels(float* plane, int row, int column, Floats v) {
 
 // A tile's rows of the pictures, 16 pixels each.
 struct Row {
-    float *colour, *alpha, *depth_sum, *median_depth;
+    float *colour, *alpha, *depth_sum, *depth_square_sum, *median_depth;
 };
 
 SPLAT_INLINE void put_row(const View& view, const Canvas& canvas, int row, const Row& out) {
@@ -244,6 +247,7 @@ SPLAT_INLINE void put_row(const View& view, const Canvas& canvas, int row, const
         store(out.alpha + x, fill(1.0f) - left);
         if (!out.depth_sum) continue;
         store(out.depth_sum + x, get_pixels(canvas.depth, row, x));
+        store(out.depth_square_sum + x, get_pixels(canvas.depth_square, row, x));
         store(out.median_depth + x, get_pixels(canvas.median, row, x));
     }
 }
@@ -257,15 +261,17 @@ void put_pictures(const View& view, const TilePlace& at, const Canvas& canvas, c
     for (int row = 0; row < at.height; ++row) {
         const int64_t pixel = static_cast<int64_t>(at.top + row) * view.width + at.left;
         const Row to = {out.colour + 3 * pixel, out.alpha + pixel, depth ? out.depth_sum + pixel : nullptr,
-                        depth ? out.median_depth + pixel : nullptr};
+                        depth ? out.depth_square_sum + pixel : nullptr, depth ? out.median_depth + pixel : nullptr};
         if (at.width == kTile) {
             put_row(view, canvas, row, to);
             continue;
         }
-        float colour[3 * kTile], alpha[kTile], depth_sum[kTile], median_depth[kTile];
-        put_row(view, canvas, row, {colour, alpha, depth ? depth_sum : nullptr, median_depth});
+        float colour[3 * kTile], alpha[kTile], depth_sum[kTile], depth_square_sum[kTile], median_depth[kTile];
+        put_row(view, canvas, row, {colour, alpha, depth ? depth_sum : nullptr, depth_square_sum, median_depth});
         copy(to.colour, colour, 3 * at.width), copy(to.alpha, alpha, at.width);
-        if (depth) copy(to.depth_sum, depth_sum, at.width), copy(to.median_depth, median_depth, at.width);
+        if (!depth) continue;
+        copy(to.depth_sum, depth_sum, at.width), copy(to.depth_square_sum, depth_square_sum, at.width);
+        copy(to.median_depth, median_depth, at.width);
     }
 }
 
@@ -306,6 +312,7 @@ void blend_tile(const View& view, const FrameData& frame, int tile, const Pictur
     const int32_t pairs = static_cast<int32_t>(frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
     Canvas canvas;
     canvas.end = frame.pixel_end + static_cast<int64_t>(tile) * kTilePixels;
+    canvas.depth_origin = view.depth_origin;
     start(at, pairs, &canvas);
     if (out.depth_sum)
         walk<true>(frame, at, pairs, &canvas);
@@ -319,9 +326,12 @@ void blend_tile(const View& view, const FrameData& frame, int tile, const Pictur
 // A tile's pixels on their way back.
 struct BackCanvas {
     alignas(64) float transmittance[kTilePixels];  // behind the pair
-    // Σ w (c . dL/dC + z dL/dD) of the pairs behind, less T dL/dT of what is left behind all of them.
+    // Σ w (c . dL/dC + z dL/dD + (z - origin)² dL/dS) of the pairs behind, less T dL/dT of what is left behind all of
+    // them.
     alignas(64) float behind[kTilePixels];
-    alignas(64) float red[kTilePixels], green[kTilePixels], blue[kTilePixels], depth[kTilePixels];  // dL/d(pictures)
+    alignas(64) float red[kTilePixels], green[kTilePixels], blue[kTilePixels];  // dL/d(pictures)
+    alignas(64) float depth[kTilePixels], depth_square[kTilePixels];
+    float depth_origin;
     const int32_t* end;
 };
 
@@ -335,6 +345,7 @@ SPLAT_INLINE void get_row(const View& view, const PictureGradients& in, int64_t 
         put_pixels(canvas->green, row, x, green);
         put_pixels(canvas->blue, row, x, blue);
         put_pixels(canvas->depth, row, x, in.depth_sum ? load(in.depth_sum + pixel + x) : zero);
+        put_pixels(canvas->depth_square, row, x, in.depth_square_sum ? load(in.depth_square_sum + pixel + x) : zero);
         const Floats background =
             red * fill(view.background[0]) + green * fill(view.background[1]) + blue * fill(view.background[2]);
         put_pixels(canvas->behind, row, x, background - alpha);
@@ -348,13 +359,14 @@ void get_gradients(const View& view, const TilePlace& at, const PictureGradients
             get_row(view, in, pixel, row, canvas);
             continue;
         }
-        float colour[3 * kTile] = {}, alpha[kTile] = {}, depth_sum[kTile] = {};
+        float colour[3 * kTile] = {}, alpha[kTile] = {}, depth_sum[kTile] = {}, depth_square_sum[kTile] = {};
         if (row < at.height) {
             if (in.colour) copy(colour, in.colour + 3 * pixel, 3 * at.width);
             if (in.alpha) copy(alpha, in.alpha + pixel, at.width);
             if (in.depth_sum) copy(depth_sum, in.depth_sum + pixel, at.width);
+            if (in.depth_square_sum) copy(depth_square_sum, in.depth_square_sum + pixel, at.width);
         }
-        get_row(view, {colour, alpha, depth_sum}, 0, row, canvas);
+        get_row(view, {colour, alpha, depth_sum, depth_square_sum}, 0, row, canvas);
     }
 }
 
@@ -363,6 +375,7 @@ int32_t start_back(const View& view, const FrameData& frame, const TilePlace& at
                    BackCanvas* canvas) {
     const float* left = frame.transmittance + static_cast<int64_t>(at.index) * kTilePixels;
     canvas->end = frame.pixel_end + static_cast<int64_t>(at.index) * kTilePixels;
+    canvas->depth_origin = view.depth_origin;
     get_gradients(view, at, in, canvas);
     int32_t last = 0;
     for (int b = 0; b < kBlocks; ++b) {
@@ -404,8 +417,11 @@ SPLAT_INLINE void blend_blocks_backward(const TileSplat& splat, const Splat& s, 
         m->red = fma(weight[k], red, m->red), m->green = fma(weight[k], green, m->green);
         m->blue = fma(weight[k], blue, m->blue);
         if (kDepth) {
-            const Floats depth = load(canvas->depth + at);
-            value[k] = fma(fill(s.depth), depth, value[k]), m->depth = fma(weight[k], depth, m->depth);
+            const Floats depth = load(canvas->depth + at), square = load(canvas->depth_square + at);
+            const float from_origin = s.depth - canvas->depth_origin;
+            value[k] = fma(fill(s.depth), depth, value[k]);
+            value[k] = fma(fill(from_origin * from_origin), square, value[k]);
+            m->depth = fma(weight[k], fma(fill(2.0f * from_origin), square, depth), m->depth);
         }
     }
     for (int k = 0; k < kCount; ++k) {
@@ -465,9 +481,10 @@ void blend_tile_backward(const View& view, const FrameData& frame, int tile, con
     const TilePlace at = place_of(view, tile);
     BackCanvas canvas;
     const int32_t last = start_back(view, frame, at, in, &canvas);
-    if (in.depth_sum && magnitudes)
+    const bool depth = in.depth_sum || in.depth_square_sum;
+    if (depth && magnitudes)
         walk_back<true, true>(frame, at, last, &canvas);
-    else if (in.depth_sum)
+    else if (depth)
         walk_back<true, false>(frame, at, last, &canvas);
     else if (magnitudes)
         walk_back<false, true>(frame, at, last, &canvas);
