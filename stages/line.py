@@ -194,7 +194,7 @@ class TrainConfig(StageConfig):
     depth_weight: NonNegativeFloat = 0.0
     """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training."""
     spread_weight: NonNegativeFloat = 0.0
-    """Weight of the spread of the depths along a pixel's ray in the loss: layers become one surface. Tried: 0.02."""
+    """Weight of the spread of the depths along a pixel's ray in the loss: layers become one surface. Tried: 0.05."""
     sh_limit: bool = False
     """Hold the degree of each Gaussian's colour to what the photos that saw it can tell by number and angles."""
     max_anisotropy: NonNegativeFloat = 0.0

@@ -39,6 +39,7 @@ TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "sh_limit": True,
     "dropout": 0.2,
     "max_anisotropy": 5.0,
+    "spread_weight": 0.05,
     "prune_free_space": 2,
     "refine_cameras": "pose_focal",
     "robust": 0.1,

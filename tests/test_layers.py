@@ -1,0 +1,110 @@
+"""The spread of depths along a ray: what it measures, its gradient, and that training with it leaves one surface."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline import raster
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.dataset import load_views
+from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages import initialize, train
+from splatpipe.stages.line import InitializeConfig
+from splatpipe.stages.train.layers import FREE_PX, HALF_PX, depth_origin, is_spread_counted, spread_loss
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+FRONT = Camera("front", 24, 16, 30.0, 30.0, 12.0, 8.0, np.eye(4))
+
+
+def layers(depths: tuple[float, ...], opacity: float) -> Gaussians:
+    """Flat sheets that fill the picture, each as opaque as given all over."""
+    gaussians = Gaussians.empty(len(depths), 0)
+    gaussians.means = torch.tensor([[0.0, 0.0, depth] for depth in depths])
+    gaussians.log_scales = torch.log(torch.tensor([[30.0 * depth, 30.0 * depth, 1e-6] for depth in depths]))
+    gaussians.quats[:, 0] = 1.0
+    gaussians.opacity_logits = torch.full((len(depths),), float(torch.logit(torch.tensor(opacity))))
+    return gaussians
+
+
+def spread(gaussians: Gaussians, origin: float = 0.0, backend: str = "native") -> torch.Tensor:
+    options = raster.RenderOptions(0, depth_origin=origin)
+    rendered = raster.render(gaussians, FRONT, options, backend=backend)  # type: ignore[arg-type]
+    return spread_loss(rendered, origin, FRONT)
+
+
+def test_one_surface_has_none_and_two_that_shine_through_have_that_of_their_variance() -> None:
+    assert float(spread(layers((9.0,), 0.9), 9.0)) == pytest.approx(0.0, abs=1e-4)
+    two = layers((8.0, 12.0), 0.6)
+    first, second = 0.6, 0.4 * 0.6
+    mean = (8.0 * first + 12.0 * second) / (first + second)
+    variance = (64.0 * first + 144.0 * second) / (first + second) - mean**2
+    excess = variance / (mean / FRONT.fx) ** 2 - FREE_PX**2
+    assert float(spread(two, 10.0)) == pytest.approx(excess / (excess + HALF_PX**2), rel=1e-3)
+
+
+def test_little_is_free_and_much_counts_no_more_than_one() -> None:
+    pixel = 100.0 / FRONT.fx
+    assert float(spread(layers((100.0, 100.0 + pixel), 0.6), 100.0)) == 0.0
+    assert 0.95 < float(spread(layers((2.0, 900.0), 0.6), 100.0)) <= 1.0
+
+
+def test_far_away_float32_still_tells_it_with_an_origin() -> None:
+    far = layers((3000.0, 3000.0 + 1000.0), 0.6)  # ten pixels apart
+    origin = depth_origin(far.means, FRONT)
+    assert origin == pytest.approx(3500.0)
+    exact = float(spread(far.to(dtype=torch.float64), origin, "reference"))
+    assert 0.05 < exact < 0.95 and float(spread(far, origin)) == pytest.approx(exact, rel=1e-3)
+
+
+def test_gradient_agrees_with_finite_differences() -> None:
+    base = tiny_scene.true_model(12).to(dtype=torch.float64)
+    camera = tiny_scene.cameras()[0].scaled(18, 14)
+
+    def value(means: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
+        gaussians = replace(base, means=means, opacity_logits=logits)
+        options = raster.RenderOptions(0, depth_origin=3.0)
+        rendered = raster.render(gaussians, camera, options, backend="reference")
+        seen = rendered.alpha.detach() >= 0.2
+        alpha = torch.where(seen, rendered.alpha, 1.0)
+        mean = torch.where(seen, rendered.depth_sum, 0.0) / alpha - 3.0
+        variance = torch.where(seen, rendered.depth_square_sum, 0.0) / alpha - mean.square()
+        return torch.where(seen, variance, 0.0).mean()
+
+    leaves = (base.means.clone().requires_grad_(), (base.opacity_logits + 2.0).clone().requires_grad_())
+    assert torch.autograd.gradcheck(value, leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
+
+
+def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> None:
+    options = tiny_scene.plain(iterations=100, spread_weight=0.1)
+    assert not is_spread_counted(options, 20) and is_spread_counted(options, 21)
+    assert not is_spread_counted(tiny_scene.plain(iterations=100), 90)
+
+
+def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:
+    tiny_scene.write_dataset(tmp_path / "dataset")
+    parts = {"undistort.dataset": tmp_path / "dataset"}
+    initialize.run(InitializeConfig(), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())
+    parts |= {"initialize.splat": tmp_path / "init.ply"}
+    settings = {"evaluate.every": 4, "evaluate.views": ""}
+    found = []
+    for weight in (0.0, 0.05):
+        out = tmp_path / f"{weight}"
+        out.mkdir()
+        config = tiny_scene.plain(iterations=300, densify_gradient=1e-3, spread_weight=weight)
+        train.run(config, Inputs(parts, tmp_path, settings, Machine("cpu", 1)), out, tiny_scene.Recorder())
+        model, shares = read_splat(out / "model.ply"), []
+        for view in load_views(tmp_path / "dataset")[::4]:
+            origin = depth_origin(model.means, view.camera)
+            with torch.no_grad():
+                rendered = raster.render(model, view.camera, raster.RenderOptions(3, depth_origin=origin))
+            shares.append(float(spread_loss(rendered, origin, view.camera)))
+        found.append(sum(shares))
+    assert found[1] < 0.8 * found[0]
