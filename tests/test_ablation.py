@@ -120,7 +120,7 @@ def test_following_a_training_tells_how_far_its_end_is_below_its_best(dataset: P
         (["--variant", "front=sparse.min_model_size=4"], "would not act on this variant alone"),
         (["--variant", "easy=evaluate.every=2"], "would not act on this variant alone"),
         (["--variant", "base=train.antialias=true"], "cannot be a variant's name"),
-        (["--only", "nothing"], "There is no variant nothing. There are: published"),
+        (["--only", "nothing"], "There is no variant nothing. There are: defaults"),
         (["--base", "train.nonsense=1"], "Variant base: There is no option train.nonsense"),
         (["--data", "a/tiny", "b/tiny"], "Write --data NAME=PATH"),
     ],
