@@ -8,7 +8,7 @@ import signal
 import sys
 from pathlib import Path
 
-from splatpipe.pipeline.engine.config import parse_set, resolve
+from splatpipe.pipeline.engine.config import load_preset, parse_set, resolve
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine
@@ -23,7 +23,8 @@ def main(photos: str, out: str, stage: str, how: str, *assignments: str) -> None
                 os.killpg(os.getpgid(0), signal.SIGKILL)
             os.kill(os.getpid(), signal.SIGKILL)
 
-    config = resolve(LineConfig, [parse_set(text, LineConfig) for text in assignments])
+    # As the command resolves it.
+    config = resolve(LineConfig, [load_preset("standard"), *(parse_set(text, LineConfig) for text in assignments)])
     with open_session(Request(LINE, config, Path(photos), Path(out), Machine("cpu", 2)), die) as runner:
         runner.walk()
 

@@ -121,7 +121,7 @@ def test_cells_that_no_photo_shows_lie_between_their_neighbours() -> None:
 def empty_render(camera: Camera) -> Render:
     blank = torch.zeros(camera.height, camera.width)
     none = torch.zeros(0)
-    return Render(torch.zeros(camera.height, camera.width, 3), blank, blank, blank, none.bool(), none)
+    return Render(torch.zeros(camera.height, camera.width, 3), blank, blank, blank, blank, none.bool(), none)
 
 
 def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() -> None:
