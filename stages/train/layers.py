@@ -19,7 +19,7 @@ from splatpipe.stages.line import TrainConfig
 
 FIRST_SHARE = 0.2  # of the run, without it: the surface has to be found first
 LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth
-FREE_PX = 2.0  # standard deviation that costs nothing, pixels on the ground
+FREE_PX = 0.5  # standard deviation that costs nothing, pixels on the ground
 HALF_PX = 10.0  # beyond it at which half of the most is reached
 
 
