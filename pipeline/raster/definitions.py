@@ -73,11 +73,11 @@ class Render:
     Attributes:
         colour: Red, green, blue with the background, not clamped at 1.
         alpha: 1 - the transmittance that is left.
-        depth_sum: Σ z α T, z along the view axis, world units.
+        depth_sum: Σ z α T, z along the view axis where the pixel's ray is deepest in the Gaussian, world units. Not its
+            centre's: a wall is made of Gaussians several pixels wide. Linear in the place on the screen, as by Zhang et
+            al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting" (2024).
         depth_square_sum: Σ (z - depth_origin)² α T.
-        median_depth: z at which the pixel's ray is deepest in the Gaussian that takes T down to 0.5, world units; 0
-            where none does. No gradient. Not the centre's z: a wall is made of Gaussians several pixels wide. As by
-            Zhang et al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting" (2024): linear in the place on the screen.
+        median_depth: That z of the Gaussian that takes T down to 0.5; 0 where none does. No gradient.
         visible: Gaussians whose ellipse (alpha ≥ 1/255) reaches the picture.
         radii: Three standard deviations along the longer axis on screen, pixels; 0 where not visible. No gradient.
     """

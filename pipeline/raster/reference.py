@@ -285,10 +285,13 @@ def _blend_rows(
     weights = alphas * before
     left = after[-1] if len(after) else ones[0]  # (r, w)
     colour = torch.einsum("nrw,nc->rwc", weights, colours) + left[..., None] * background
-    depth_sum = torch.einsum("nrw,n->rw", weights, depths)
-    depth_square_sum = torch.einsum("nrw,n->rw", weights, torch.square(depths - depth_origin))
+    # The probe moves a Gaussian's colour and opacity, not its depth.
+    right, down = (xs[None, :] - means[:, None, 0])[:, None, :], (ys[None, :] - means[:, None, 1])[:, :, None]
+    at_centre = depths[:, None, None]
+    at_pixel = at_centre + depth_slopes[:, 0, None, None] * right + depth_slopes[:, 1, None, None] * down  # (n, r, w)
+    depth_sum = (weights * at_pixel).sum(0)
+    depth_square_sum = (weights * torch.square(at_pixel - depth_origin)).sum(0)
     passes = (before > MEDIAN_TRANSMITTANCE) & (after <= MEDIAN_TRANSMITTANCE)
-    beyond = depth_slopes[:, 0, None, None] * dx + depth_slopes[:, 1, None, None] * dy
-    most = MEDIAN_SHIFT_MAX * depths[:, None, None]
-    median_depth = torch.where(passes, depths[:, None, None] + beyond.clamp(-most, most), 0.0).sum(0)
+    least, most = (1.0 - MEDIAN_SHIFT_MAX) * at_centre, (1.0 + MEDIAN_SHIFT_MAX) * at_centre
+    median_depth = torch.where(passes, at_pixel.clamp(least, most), 0.0).sum(0)
     return colour, 1.0 - left, depth_sum, depth_square_sum, median_depth

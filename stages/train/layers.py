@@ -3,7 +3,7 @@
 The idea of the distortion loss of Barron et al., "Mip-NeRF 360" (CVPR 2022), as Huang et al., "2D Gaussian Splatting
 for Geometrically Accurate Radiance Fields" (SIGGRAPH 2024) have it for splats, there by the squared distances of all
 pairs along a ray: that sum is the variance of its depths, which two more pictures give (Σ z α T and Σ z² α T). Here
-what is less than a few pixels on the ground is free, for a wall seen at an angle has it, and what is much more counts
+what is less than a pixel on the ground is free, and what is much more counts
 no more than that: past a roof's edge a pixel rightly sees two depths.
 """
 
@@ -19,7 +19,7 @@ from splatpipe.stages.line import TrainConfig
 
 FIRST_SHARE = 0.2  # of the run, without it: the surface has to be found first
 LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth
-FREE_PX = 2.0  # standard deviation that costs nothing, pixels on the ground
+FREE_PX = 0.5  # standard deviation that costs nothing, pixels on the ground
 HALF_PX = 10.0  # beyond it at which half of the most is reached
 
 

@@ -33,7 +33,8 @@ constexpr int kTile = 16;  // pixels along a tile's side
 constexpr int kTilePixels = kTile * kTile;
 constexpr float kHalfLog2E = 0.72134752044448170f;  // exp(-x/2) = 2^(-kHalfLog2E x)
 constexpr uint32_t kCulled = 0xffffffffu;           // sort key of a Gaussian that is not visible
-constexpr int kSlotFloats = 12;                     // a pair's gradients: SplatGradient's fields in their order
+constexpr int kSlotFloats = 12;       // a pair's gradients: SplatGradient's fields in their order, those of depth apart
+constexpr int kDepthSlotFloats = 16;  // with depth_u and depth_v, and padding
 // How a camera may move, in its own frame: a point x goes to exp(rotation) x + translation, about the camera's centre;
 // then both focal lengths are multiplied by exp(log_focal). In this order.
 constexpr int kCameraFloats = 7;
@@ -107,7 +108,8 @@ struct FrameData {
     int32_t* pair_slot;   // (pairs): where the pair's gradient goes
     uint8_t*
         pair_blocks;  // (pairs, mask_bytes): the blocks of pixels that a pair was blended into, as the kernels like
-    float* slots;     // (pairs, kSlotFloats); only for the backward pass
+    float* slots;     // (pairs, slot_floats); only for the backward pass
+    int slot_floats;  // kDepthSlotFloats where depths have a gradient, else kSlotFloats
     float* transmittance;  // (tiles, 256): what is left behind everything
     int32_t* pixel_end;    // (tiles, 256): number of the tile's pairs that the pixel looked at before it ended
 };

@@ -73,11 +73,9 @@ struct TileSplat {
         const Floats u = u_of(block), v = v_of(block);
         return fnma(u, u, fnma(v, v, log2_opacity));
     }
-    // Where the pixels' rays are deepest in the Gaussian. One so long that this is far from its centre is no surface.
+    // Where the pixels' rays are deepest in the Gaussian.
     SPLAT_METHOD Floats depth(const Splat& s, int block) const {
-        const Floats beyond = fma(fill(s.depth_u), u_of(block), fill(s.depth_v) * v_of(block));
-        const Floats most = fill(kMedianShiftMax * s.depth);
-        return fill(s.depth) + min(max(beyond, fill(0.0f) - most), most);
+        return fma(fill(s.depth_u), u_of(block), fma(fill(s.depth_v), v_of(block), fill(s.depth)));
     }
 };
 
@@ -205,13 +203,16 @@ SPLAT_INLINE void blend_blocks(const TileSplat& splat, const Splat& s, BlockMask
         add_to(canvas->blue + at, weight[k], fill(s.colour[2]));
         store(canvas->transmittance + at, select(blended[k], after[k], before[k]));
         if (kDepth) {
-            const float depth = s.depth - canvas->depth_origin;
-            add_to(canvas->depth + at, weight[k], fill(s.depth));
-            add_to(canvas->depth_square + at, weight[k], fill(depth * depth));
+            const Floats depth = splat.depth(s, block[k]), from_origin = depth - fill(canvas->depth_origin);
+            add_to(canvas->depth + at, weight[k], depth);
+            add_to(canvas->depth_square + at, weight[k], from_origin * from_origin);
             const Floats half = fill(kMedianTransmittance);
             const Mask passes = both(blended[k], both(less(half, before[k]), at_most(after[k], half)));
-            if (any(passes))
-                store(canvas->median + at, select(passes, splat.depth(s, block[k]), load(canvas->median + at)));
+            if (any(passes)) {  // a Gaussian so long that its depth is far from its centre's is no surface
+                const Floats least = fill((1.0f - kMedianShiftMax) * s.depth),
+                             most = fill((1.0f + kMedianShiftMax) * s.depth);
+                store(canvas->median + at, select(passes, min(max(depth, least), most), load(canvas->median + at)));
+            }
         }
         const Mask ended = without(met[k], blended[k]);
         if (__builtin_expect(any(ended), 0)) end_pixels(canvas, block[k], bits(ended), pair);
@@ -389,7 +390,7 @@ int32_t start_back(const View& view, const FrameData& frame, const TilePlace& at
 
 // A pair's gradients, a lane a share.
 struct Moments {
-    Floats s, su, sv, suu, suv, svv, red, green, blue, depth, size_x, size_y;
+    Floats s, su, sv, suu, suv, svv, red, green, blue, depth, size_x, size_y, depth_u, depth_v;
 };
 
 template <bool kDepth, bool kMagnitudes, int kCount>
@@ -417,11 +418,14 @@ SPLAT_INLINE void blend_blocks_backward(const TileSplat& splat, const Splat& s, 
         m->red = fma(weight[k], red, m->red), m->green = fma(weight[k], green, m->green);
         m->blue = fma(weight[k], blue, m->blue);
         if (kDepth) {
-            const Floats depth = load(canvas->depth + at), square = load(canvas->depth_square + at);
-            const float from_origin = s.depth - canvas->depth_origin;
-            value[k] = fma(fill(s.depth), depth, value[k]);
-            value[k] = fma(fill(from_origin * from_origin), square, value[k]);
-            m->depth = fma(weight[k], fma(fill(2.0f * from_origin), square, depth), m->depth);
+            const Floats by_depth = load(canvas->depth + at), by_square = load(canvas->depth_square + at);
+            const Floats depth = splat.depth(s, block[k]), from_origin = depth - fill(canvas->depth_origin);
+            value[k] = fma(depth, by_depth, value[k]);
+            value[k] = fma(from_origin * from_origin, by_square, value[k]);
+            const Floats g = weight[k] * fma(from_origin + from_origin, by_square, by_depth);
+            m->depth = m->depth + g;
+            m->depth_u = fma(g, splat.u_of(block[k]), m->depth_u),
+            m->depth_v = fma(g, splat.v_of(block[k]), m->depth_v);
         }
     }
     for (int k = 0; k < kCount; ++k) {
@@ -449,30 +453,32 @@ SPLAT_INLINE void put_slot(const Moments& m, float* slot) {
         sum_lanes(m.blue, m.depth, m.size_x, m.size_y, slot + 8);
     else
         slot[8] = sum_lanes(m.blue), slot[9] = slot[10] = slot[11] = 0.0f;
+    if (kDepth) sum_lanes(m.depth_u, m.depth_v, fill(0.0f), fill(0.0f), slot + 12);
 }
 
 template <bool kDepth, bool kMagnitudes>
 SPLAT_INLINE void walk_back(const FrameData& frame, const TilePlace& at, int32_t last, BackCanvas* canvas) {
+    constexpr int kFloats = kDepth ? kDepthSlotFloats : kSlotFloats;
     const int64_t first = frame.tile_begin[at.index];
     const int32_t pairs = static_cast<int32_t>(frame.tile_begin[at.index + 1] - first);
     const int32_t *list = frame.pair_splat + first, *slots = frame.pair_slot + first;
     for (int32_t pair = last; pair < pairs; ++pair)
-        for (int f = 0; f < kSlotFloats; ++f) frame.slots[int64_t{slots[pair]} * kSlotFloats + f] = 0.0f;
+        for (int f = 0; f < kFloats; ++f) frame.slots[int64_t{slots[pair]} * kFloats + f] = 0.0f;
     const uint8_t* masks = frame.pair_blocks + first * kMaskBytes;
     for (int32_t pair = last - 1; pair >= 0; --pair) {
         if (pair >= kAhead) {
             __builtin_prefetch(frame.splats + list[pair - kAhead]);
-            __builtin_prefetch(frame.slots + int64_t{slots[pair - kAhead]} * kSlotFloats, 1);
+            __builtin_prefetch(frame.slots + int64_t{slots[pair - kAhead]} * kFloats, 1);
         }
         const Splat& s = frame.splats[list[pair]];
         BlockMask blocks = get_mask(masks, pair);
         const TileSplat splat(s, at);
         const Floats zero = fill(0.0f);
-        Moments m = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+        Moments m = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
         while (blocks & (blocks - 1))
             blend_blocks_backward<kDepth, kMagnitudes, 2>(splat, s, &blocks, pair, canvas, &m);
         if (blocks) blend_blocks_backward<kDepth, kMagnitudes, 1>(splat, s, &blocks, pair, canvas, &m);
-        put_slot<kDepth, kMagnitudes>(m, frame.slots + int64_t{slots[pair]} * kSlotFloats);
+        put_slot<kDepth, kMagnitudes>(m, frame.slots + int64_t{slots[pair]} * kFloats);
     }
 }
 

@@ -47,7 +47,8 @@ void RasterFrame::forward(const View& view, const Parameters& in, const Pictures
 }
 
 void RasterFrame::backward(const Parameters& in, const PictureGradients& gradients, const ParameterGradients& out) {
-    data_.slots = slots_.reserve(pairs_ * kSlotFloats);
+    data_.slot_floats = gradients.depth_sum || gradients.depth_square_sum ? kDepthSlotFloats : kSlotFloats;
+    data_.slots = slots_.reserve(pairs_ * data_.slot_floats);
     parallel_for(tile_count(view_), [&](int64_t tile) {
         blend_->blend_tile_backward(view_, data_, static_cast<int>(tile), gradients, out.magnitudes);
     });

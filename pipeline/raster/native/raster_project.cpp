@@ -192,11 +192,12 @@ int64_t find_spans(const View& view, int64_t begin, int64_t end, const FrameData
 }
 
 // The Gaussian's gradients on the screen: its slots, summed in their order.
+template <int kFloats>
 SPLAT_INLINE void sum_slots(const FrameData& frame, int64_t i, float (*sums)[kLanes], int lane) {
-    float sum[kSlotFloats] = {};
+    float sum[kFloats] = {};
     for (int64_t slot = frame.touched[i].slots; slot < frame.touched[i + 1].slots; ++slot)
-        for (int f = 0; f < kSlotFloats; ++f) sum[f] += frame.slots[slot * kSlotFloats + f];
-    for (int f = 0; f < kSlotFloats; ++f) sums[f][lane] = sum[f];
+        for (int f = 0; f < kFloats; ++f) sum[f] += frame.slots[slot * kFloats + f];
+    for (int f = 0; f < kFloats; ++f) sums[f][lane] = sum[f];
 }
 
 // dL/d(SH) from dL/d(colour), in place of the coefficients; returns dL/d(mean) through the direction.
@@ -260,8 +261,9 @@ void copy_rows(const GradientRows& from, int sh_row, int count, const ParameterG
     copy(to.opacity_logits, from.opacity_logits, 1), copy(to.means2d, from.means2d, 2), copy(to.sh, from.sh, sh_row);
 }
 
-// With or without the camera's gradient, each compiled apart: the one without is rounded as if there were no other.
-template <bool kCamera>
+// With or without the camera's gradient and that of depths, each compiled apart: the one without is rounded as if there
+// were no other.
+template <bool kCamera, bool kDepth>
 SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, int64_t begin, int64_t end,
                                       const FrameData& frame, const ParameterGradients& out) {
     Rows rows;
@@ -269,7 +271,8 @@ SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, in
     Floats camera[kCameraFloats], share[kCameraFloats];
     for (int f = 0; f < kCameraFloats; ++f) camera[f] = fill(0.0f);
     const int sh_row = view.sh_count * 3;
-    alignas(64) float sums[kSlotFloats][kLanes], touched[kLanes];
+    constexpr int kFloats = kDepth ? kDepthSlotFloats : kSlotFloats;
+    alignas(64) float sums[kFloats][kLanes], touched[kLanes];
     for (int64_t first = begin; first < end; first += kLanes) {
         const int valid = static_cast<int>(end - first < kLanes ? end - first : kLanes);
         if (frame.touched[first].slots == frame.touched[first + valid].slots) {
@@ -279,7 +282,7 @@ SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, in
         for (int lane = 0; lane < kLanes; ++lane) {
             const int64_t i = first + (lane < valid ? lane : 0);
             touched[lane] = lane < valid && frame.touched[i].slots < frame.touched[i + 1].slots ? 1.0f : 0.0f;
-            sum_slots(frame, i, sums, lane);
+            sum_slots<kFloats>(frame, i, sums, lane);
         }
         find_rows(in, sh_row, first, valid, &rows);
         const Lanes lanes = load_lanes(rows);
@@ -294,14 +297,16 @@ SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, in
                                  {load(sums[6]), load(sums[7]), load(sums[8])},
                                  load(sums[9]),
                                  load(sums[10]),
-                                 load(sums[11])};
+                                 load(sums[11]),
+                                 kDepth ? load(sums[kSlotFloats]) : fill(0.0f),
+                                 kDepth ? load(sums[kSlotFloats + 1]) : fill(0.0f)};
         const Projection p = project_lanes(view, lanes);
-        LanesGradient d = project_lanes_backward(view, p, g, out.magnitudes);
+        LanesGradient d = project_lanes_backward<kDepth>(view, p, g, out.magnitudes);
         const Vec3 by_direction = colour_backward(view, lanes.mean, g.colour, sh);
         d.mean = d.mean + by_direction;
         const Mask seen = less(fill(0.0f), load(touched));
         if (kCamera) {
-            camera_gradient(view, p, d, by_direction, share);
+            camera_gradient<kDepth>(view, p, d, by_direction, share);
             for (int f = 0; f < kCameraFloats; ++f) camera[f] = camera[f] + only(seen, share[f]);
         }
         const ParameterGradients here = rows_from(out, sh_row, first);
@@ -317,10 +322,15 @@ SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, in
 
 void project_backward(const View& view, const Parameters& in, int64_t begin, int64_t end, const FrameData& frame,
                       const ParameterGradients& out) {
-    if (out.camera)
-        project_backward_of<true>(view, in, begin, end, frame, out);
+    const bool depth = frame.slot_floats == kDepthSlotFloats;
+    if (out.camera && depth)
+        project_backward_of<true, true>(view, in, begin, end, frame, out);
+    else if (out.camera)
+        project_backward_of<true, false>(view, in, begin, end, frame, out);
+    else if (depth)
+        project_backward_of<false, true>(view, in, begin, end, frame, out);
     else
-        project_backward_of<false>(view, in, begin, end, frame, out);
+        project_backward_of<false, false>(view, in, begin, end, frame, out);
 }
 
 }  // namespace

@@ -39,7 +39,7 @@ struct Projection {
     Vec3 r0, r1, r2;                  // rows of the rotation matrix
     Floats qw, qx, qy, qz, inv_norm;  // unit quaternion
     Vec3 jw0, jw1;                    // rows of J W
-    Vec3 scale, row0, row1;           // row0, row1: of B
+    Vec3 scale, row0, row1, row2;     // row0, row1: of B; row2: the same of the depth
     Floats xx, xy, yy;                // Σ', with the blur
     Floats zx, zy;                    // covariances of the depth and the place on the screen
     Vec3 normal;                      // row0 x row1
@@ -90,8 +90,8 @@ SPLAT_INLINE Projection project_lanes(const View& view, const Lanes& in) {
     p.row1 = times(p.jw1.x * p.r0 + p.jw1.y * p.r1 + p.jw1.z * p.r2, p.scale);
     const Floats xx = dot(p.row0, p.row0), yy = dot(p.row1, p.row1), blur = fill(kBlurPx2);
     p.xx = xx + blur, p.xy = dot(p.row0, p.row1), p.yy = yy + blur;
-    const Vec3 row2 = times(w2.x * p.r0 + w2.y * p.r1 + w2.z * p.r2, p.scale);
-    p.zx = dot(row2, p.row0), p.zy = dot(row2, p.row1);
+    p.row2 = times(w2.x * p.r0 + w2.y * p.r1 + w2.z * p.r2, p.scale);
+    p.zx = dot(p.row2, p.row0), p.zy = dot(p.row2, p.row1);
     p.normal = cross(p.row0, p.row1);
     p.sharp = dot(p.normal, p.normal);
     p.det = p.sharp + blur * (xx + yy) + fill(kBlurPx2 * kBlurPx2);
@@ -172,8 +172,9 @@ SPLAT_INLINE Vec3 sh_direction_gradient(int degree, const Vec3& d, const Floats*
 struct SplatGradient {
     Floats s, su, sv, suu, suv, svv;  // sums over pixels of s = dL/d(ln alpha), times moments of (u, v)
     Vec3 colour;
-    Floats depth;
-    Floats size_x, size_y;  // sums over pixels of |s u| and |s (b u + c v)|
+    Floats depth;             // sum over pixels of dL/d(the depth there)
+    Floats size_x, size_y;    // sums over pixels of |s u| and |s (b u + c v)|
+    Floats depth_u, depth_v;  // of depth's terms times (u, v)
 };
 
 // dL/d(raw parameters), SH apart.
@@ -181,6 +182,7 @@ struct LanesGradient {
     Vec3 mean, log_scale;
     Floats qw, qx, qy, qz, logit, mean2d_x, mean2d_y;
     Vec3 point, jw0, jw1;     // by the point in the camera's frame, W held, and by the rows of J W
+    Vec3 w2;                  // by the last row of W through the depth's covariances alone; with depths only
     Floats pixel_x, pixel_y;  // mean2d, of magnitudes, too
 };
 
@@ -211,16 +213,48 @@ SPLAT_INLINE void rows_gradient(const Projection& p, const SplatGradient& in, Fl
     *drow1 = two * (gxy * p.row0 + gyy * p.row1) + s_sharp * cross(p.normal, p.row0);
 }
 
+// What the slant of the depth adds: at a pixel d from the centre it is z + cᵀ Q d, with Q = Σ'⁻¹ and c = (zx, zy). With
+// y = Q Σ g d = Aᵀ Σ g (u, v) / k and the slope q = Q c: dL/dc = y, dL/d(centre) = -q Σ g, dL/dΣ' = -(q yᵀ + y qᵀ) / 2.
+struct SlantGradient {
+    Vec3 row0, row1, row2;
+    Floats x, y;  // by the centre on the screen
+};
+
+SPLAT_INLINE SlantGradient slant_gradient(const Projection& p, const SplatGradient& in, Floats a, Floats b, Floats c) {
+    const Floats inv_k = fill(1.0f / kHalfLog2E), two = fill(2.0f), zero = fill(0.0f);
+    const Floats y_x = inv_k * a * in.depth_u, y_y = inv_k * (b * in.depth_u + c * in.depth_v);
+    const Floats u = inv_k * (a * p.zx + b * p.zy), v = inv_k * c * p.zy;
+    const Floats q_x = a * u, q_y = b * u + c * v;
+    const Floats gxx = zero - q_x * y_x, gyy = zero - q_y * y_y, gxy = fill(-0.5f) * (q_x * y_y + q_y * y_x);
+    return {two * (gxx * p.row0 + gxy * p.row1) + y_x * p.row2, two * (gxy * p.row0 + gyy * p.row1) + y_y * p.row2,
+            y_x * p.row0 + y_y * p.row1, zero - in.depth * q_x, zero - in.depth * q_y};
+}
+
 // The derivative of project_lanes, the mean's share through the colour apart. `magnitudes` is as in ParameterGradients.
+template <bool kDepth>
 SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projection& p, const SplatGradient& in,
                                                   bool magnitudes) {
     LanesGradient out;
     const Floats a = sqrt(fill(kHalfLog2E) * p.yy / p.det), b = -a * p.xy / p.yy, c = sqrt(fill(kHalfLog2E) / p.yy);
     Vec3 drow0, drow1;
     rows_gradient(p, in, a, b, c, &drow0, &drow1);
+    SlantGradient slant;
+    if (kDepth) {
+        slant = slant_gradient(p, in, a, b, c);
+        drow0 = drow0 + slant.row0, drow1 = drow1 + slant.row1;
+    }
     out.log_scale = times(drow0, p.row0) + times(drow1, p.row1);
     const Vec3 du0 = times(drow0, p.scale), du1 = times(drow1, p.scale);  // of J W R
-    quat_gradient(p, p.jw0.x * du0 + p.jw1.x * du1, p.jw0.y * du0 + p.jw1.y * du1, p.jw0.z * du0 + p.jw1.z * du1, &out);
+    Vec3 dr0 = p.jw0.x * du0 + p.jw1.x * du1, dr1 = p.jw0.y * du0 + p.jw1.y * du1;
+    Vec3 dr2 = p.jw0.z * du0 + p.jw1.z * du1;
+    if (kDepth) {
+        const Vec3 du2 = times(slant.row2, p.scale);
+        out.log_scale = out.log_scale + times(slant.row2, p.row2);
+        dr0 = dr0 + fill(view.rotation[6]) * du2, dr1 = dr1 + fill(view.rotation[7]) * du2;
+        dr2 = dr2 + fill(view.rotation[8]) * du2;
+        out.w2 = {dot(du2, p.r0), dot(du2, p.r1), dot(du2, p.r2)};
+    }
+    quat_gradient(p, dr0, dr1, dr2, &out);
     out.logit = in.s * (fill(1.0f) - p.opacity);
 
     const Floats inv_k = fill(1.0f / kHalfLog2E);
@@ -231,20 +265,22 @@ SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projec
     const Vec3 djw1 = {dot(du1, p.r0), dot(du1, p.r1), dot(du1, p.r2)};
     const Floats fx = fill(view.fx), fy = fill(view.fy), zero = fill(0.0f);
     Floats dinv_z = fx * dot(djw0, w0 - p.ratio_x * w2) + fy * dot(djw1, w1 - p.ratio_y * w2);
-    const Floats dratio_x = fx * out.mean2d_x + select(p.clamped_x, zero, -fx * p.inv_z * dot(djw0, w2));
-    const Floats dratio_y = fy * out.mean2d_y + select(p.clamped_y, zero, -fy * p.inv_z * dot(djw1, w2));
+    out.pixel_x = kDepth ? out.mean2d_x + slant.x : out.mean2d_x;
+    out.pixel_y = kDepth ? out.mean2d_y + slant.y : out.mean2d_y;
+    const Floats dratio_x = fx * out.pixel_x + select(p.clamped_x, zero, -fx * p.inv_z * dot(djw0, w2));
+    const Floats dratio_y = fy * out.pixel_y + select(p.clamped_y, zero, -fy * p.inv_z * dot(djw1, w2));
     dinv_z = dinv_z + dratio_x * p.point.x + dratio_y * p.point.y;
     const Floats dz = in.depth - p.inv_z * p.inv_z * dinv_z;
     out.mean = (dratio_x * p.inv_z) * w0 + (dratio_y * p.inv_z) * w1 + dz * w2;
     out.point = {dratio_x * p.inv_z, dratio_y * p.inv_z, dz};
     out.jw0 = djw0, out.jw1 = djw1;
-    out.pixel_x = out.mean2d_x, out.pixel_y = out.mean2d_y;
     if (magnitudes) out.mean2d_x = inv_k * a * in.size_x, out.mean2d_y = inv_k * in.size_y;
     return out;
 }
 
 // dL/d(camera), kCameraFloats, of one Gaussian a lane. `colour` is dL/d(mean) through the direction that its colour is
 // seen from: the camera's translation changes that, its rotation does not.
+template <bool kDepth>
 SPLAT_INLINE void camera_gradient(const View& view, const Projection& p, const LanesGradient& d, const Vec3& colour,
                                   Floats* out) {
     const Vec3 w0 = fill3(view.rotation), w1 = fill3(view.rotation + 3), w2 = fill3(view.rotation + 6);
@@ -253,7 +289,8 @@ SPLAT_INLINE void camera_gradient(const View& view, const Projection& p, const L
     const Floats m01 = fx_z * dot(d.jw0, w1), m02 = fx_z * dot(d.jw0, w2);
     const Floats m10 = fy_z * dot(d.jw1, w0), m12 = fy_z * dot(d.jw1, w2);
     const Floats m00 = fx_z * dot(d.jw0, w0), m11 = fy_z * dot(d.jw1, w1);
-    const Floats m20 = -(p.ratio_x * m00 + p.ratio_y * m10), m21 = -(p.ratio_x * m01 + p.ratio_y * m11);
+    Floats m20 = -(p.ratio_x * m00 + p.ratio_y * m10), m21 = -(p.ratio_x * m01 + p.ratio_y * m11);
+    if (kDepth) m20 = m20 + dot(d.w2, w0), m21 = m21 + dot(d.w2, w1);
     const Vec3 rotation = cross(p.point, d.point) + Vec3{m21 - m12, m02 - m20, m10 - m01};
     const Vec3 translation = d.point + Vec3{dot(w0, colour), dot(w1, colour), dot(w2, colour)};
     const Floats clamped_x = only(p.clamped_x, p.ratio_x * m02), clamped_y = only(p.clamped_y, p.ratio_y * m12);
