@@ -51,7 +51,7 @@ class RenderOptions:
         antialias: Scale opacities by √(det Σ' / det(Σ' + 0.3 I)), floored: a Gaussian keeps its energy when the blur
             widens it ("Mip-Splatting", Yu et al. 2024, the 2D Mip filter).
         near: Gaussians nearer than this are skipped, world units along the view axis, > 0.
-        depth: Render depths, too; without, all are zeros and a render takes a fifth less.
+        depth: Render depths, too; without, all are zeros and a render takes less time.
         depth_origin: Depths are squared as their distance from it: float32 keeps little of the variance of a depth of
             100 m else.
         magnitudes: The probe's gradient sums the pixels' absolute values, x and y apart, which do not cancel.

@@ -93,8 +93,7 @@ def _depths(
 
 def depth_weight_at(options: TrainConfig, iteration: int) -> float:
     """The weight at an iteration: exponential from `depth_weight` to a tenth of it at the schedule's end."""
-    fallen: float = LAST_WEIGHT ** min(1.0, iteration / options.iterations)
-    return options.depth_weight * fallen
+    return float(options.depth_weight * LAST_WEIGHT ** min(1.0, iteration / options.iterations))
 
 
 def with_depth(
