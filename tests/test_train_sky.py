@@ -103,9 +103,9 @@ def test_sky_that_the_user_drew_is_the_sky(scene: Path, tmp_path: Path) -> None:
     view = load_views(tmp_path / "dataset")[2]
     sky = SkyModel.begin([view], tmp_path / "dataset", 1)
     assert sky is not None
-    mask = sky.mask(view.camera)
-    assert mask is not None
-    np.testing.assert_array_equal(mask.numpy(), drawn > 0)
+    seen = sky.seen(view.camera)
+    assert seen is not None
+    np.testing.assert_array_equal(seen.mask.numpy(), drawn > 0)
 
 
 def test_cells_that_no_photo_shows_lie_between_their_neighbours() -> None:
@@ -131,14 +131,15 @@ def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() 
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
     photo = torch.full((60, 80, 3), 0.1)
     photo[:30] = torch.tensor([0.3, 0.5, 0.7])
+    seen = sky.seen(camera)
     for number in range(120):
-        composite = sky.composite(empty_render(camera), camera, BLACK, (0.1, 0.1, 0.1))
-        ((composite - photo).abs().mean() + sky.penalty(torch.zeros(photo.shape[:2]), camera, 1.0)).backward()
+        composite = sky.composite(empty_render(camera), camera, seen, BLACK, (0.1, 0.1, 0.1))
+        ((composite - photo).abs().mean() + sky.penalty(torch.zeros(photo.shape[:2]), seen, 1.0)).backward()
         sky.step(number / 120)
     with torch.no_grad():
-        seen = sky.panorama.behind(camera, (0.0, 0.0, 0.0))
-    assert float((seen - photo)[:24].abs().mean()) < 0.02
-    assert float(seen[-10:].mean()) > 0.4  # the dark wall below did not get into it
+        learnt = sky.panorama.behind(camera, (0.0, 0.0, 0.0))
+    assert float((learnt - photo)[:24].abs().mean()) < 0.02
+    assert float(learnt[-10:].mean()) > 0.4  # the dark wall below did not get into it
 
 
 def test_away_from_the_sky_nothing_shines_through_but_the_colour_given() -> None:
@@ -148,8 +149,8 @@ def test_away_from_the_sky_nothing_shines_through_but_the_colour_given() -> None
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
     rendered = replace(empty_render(camera), alpha=torch.full(mask.shape, 0.75))
     with torch.no_grad():
-        shown = sky.composite(rendered, camera, BLACK, (1.0, 0.0, 0.2))
-        unknown = sky.composite(rendered, replace(camera, name="without sky"), BLACK, (1.0, 0.0, 0.2))
+        shown = sky.composite(rendered, camera, sky.seen(camera), BLACK, (1.0, 0.0, 0.2))
+        unknown = sky.composite(rendered, camera, None, BLACK, (1.0, 0.0, 0.2))
     torch.testing.assert_close(shown[:63], torch.full((63, skies.WIDTH, 3), 0.125))
     torch.testing.assert_close(shown[64:120], torch.tensor([0.25, 0.0, 0.05]).expand_as(shown[64:120]))
     torch.testing.assert_close(unknown[:120], torch.full((120, skies.WIDTH, 3), 0.125))  # nothing is known of it
@@ -161,13 +162,13 @@ def test_penalty_is_the_mean_opacity_before_the_sky() -> None:
     mask[:60] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
     alpha = torch.rand(mask.shape, generator=torch.Generator().manual_seed(1)).requires_grad_()
-    loss = sky.penalty(alpha, camera, 0.5)
+    loss = sky.penalty(alpha, sky.seen(camera), 0.5)
     assert float(loss.detach()) == pytest.approx(0.5 * float(alpha.detach()[:60].sum()) / mask.size, rel=1e-5)
     loss.backward()
     assert alpha.grad is not None and torch.equal(alpha.grad != 0.0, torch.from_numpy(mask))
-    small = sky.mask(camera.scaled(80, 60))
-    assert small is not None and small[:15].all() and not small[15:].any()
-    assert sky.mask(skies.look(heading_deg=77.0)) is None
+    small = sky.seen(camera.scaled(80, 60))
+    assert small is not None and small.mask[:15].all() and not small.mask[15:].any()
+    assert sky.seen(skies.look(heading_deg=77.0)) is None
 
 
 def opacity_in_sky(scene: Path, model: Path) -> float:

@@ -319,8 +319,9 @@ def losses(
     options, shown, penalty = plan.options, rendered.colour, rendered.colour.new_zeros(())
     if state.sky is not None:
         elsewhere = random_colour(options, state.iteration + 1, ELSEWHERE)
-        shown = state.sky.composite(rendered, photo.camera, behind, elsewhere)
-        penalty = state.sky.penalty(rendered.alpha, photo.camera, options.sky_opacity_weight)
+        seen = state.sky.seen(photo.camera)
+        shown = state.sky.composite(rendered, photo.camera, seen, behind, elsewhere)
+        penalty = state.sky.penalty(rendered.alpha, seen, options.sky_opacity_weight)
     if state.exposure is not None:
         shown = state.exposure.shown(shown, photo.camera.name)
     if state.robust is not None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -40,6 +41,19 @@ LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour
 RGB = tuple[float, float, float]
 
 _COLOURS = "colours"
+
+
+@dataclass(frozen=True)
+class SeenSky:
+    """A photo's sky.
+
+    Attributes:
+        mask: Where it surely is.
+        around: The same and its surroundings.
+    """
+
+    mask: Bool[Tensor, "h w"]
+    around: Bool[Tensor, "h w"]
 
 
 class SkyModel(SideModel):
@@ -97,7 +111,9 @@ class SkyModel(SideModel):
         colours = first_colours(((photo(index), masks[index].unpacked()) for index in shown), up)
         return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
 
-    def composite(self, rendered: Render, camera: Camera, background: RGB, elsewhere: RGB) -> Float[Tensor, "h w 3"]:
+    def composite(
+        self, rendered: Render, camera: Camera, seen: SeenSky | None, background: RGB, elsewhere: RGB
+    ) -> Float[Tensor, "h w 3"]:
         """The render as the photo shows it: before the sky where that may be seen, before ``elsewhere`` where not.
 
         With the sky behind a wall, too, whatever of the wall is as bright as the sky would be left transparent.
@@ -105,42 +121,31 @@ class SkyModel(SideModel):
         Args:
             rendered: Over ``background``.
             camera: A training photo's.
+            seen: Its sky, from ``seen``.
             background: Stays behind everything below the horizon.
             elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
         """
         behind = self.panorama.behind(camera, background)
-        mask, around = self.mask(camera), self.mask(camera, RIM_PX)
-        if mask is None or around is None:
+        if seen is None:
             return laid_over(rendered.colour, rendered.alpha, background, behind.detach())
         flat = Panorama(self.panorama.up, behind.new_tensor(elsewhere).expand_as(self.panorama.colours))
-        behind = torch.where(mask[:, :, None], behind, behind.detach())
-        behind = torch.where(around[:, :, None], behind, flat.behind(camera, background))
+        behind = torch.where(seen.mask[:, :, None], behind, behind.detach())
+        behind = torch.where(seen.around[:, :, None], behind, flat.behind(camera, background))
         return laid_over(rendered.colour, rendered.alpha, background, behind)
 
-    def penalty(self, alpha: Float[Tensor, "h w"], camera: Camera, opacity_weight: float) -> Float[Tensor, ""]:
+    def penalty(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None, opacity_weight: float) -> Float[Tensor, ""]:
         """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness."""
         loss = SMOOTHNESS * roughness(self.panorama.colours)
-        mask = self.mask(camera)
-        return loss if mask is None else loss + opacity_weight * torch.where(mask, alpha, 0.0).mean()
+        return loss if seen is None else loss + opacity_weight * torch.where(seen.mask, alpha, 0.0).mean()
 
-    def mask(self, camera: Camera, rim: int = 0) -> Bool[Tensor, "h w"] | None:
-        """Where a photo surely shows the sky, at the size of ``camera``; None where it shows none.
-
-        Args:
-            camera: A training photo's.
-            rim: Its surroundings, too, so many pixels of ``WORK_MEGAPIXELS`` wide.
-        """
+    def seen(self, camera: Camera) -> SeenSky | None:
+        """The sky of a training photo at the size of ``camera``; None where it shows none."""
         found = self._masks.get(camera.name)
         if found is None:
             return None
         share = found.unpacked().astype(np.float32)
-        if rim:
-            share = np.asarray(cv2.dilate(share, np.ones((2 * rim + 1, 2 * rim + 1), np.uint8)))
-        if share.shape != (camera.height, camera.width):
-            shrinks = camera.height < share.shape[0]
-            way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-            share = np.asarray(cv2.resize(share, (camera.width, camera.height), interpolation=way), np.float32)
-        return torch.from_numpy(share > SURE)
+        wider = np.asarray(cv2.dilate(share, np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)))
+        return SeenSky(_surely(share, camera), _surely(wider, camera))
 
     def step(self, share: float) -> None:
         """Step the colours against their gradient, which is dropped.
@@ -151,6 +156,14 @@ class SkyModel(SideModel):
         rate = math.exp(math.log(FIRST_RATE) * (1.0 - share) + math.log(LAST_RATE) * share)
         self.descend({_COLOURS: rate})
         self.panorama.colours.detach().clamp_(0.0, 1.0)
+
+
+def _surely(share: Float32[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
+    if share.shape != (camera.height, camera.width):
+        shrinks = camera.height < share.shape[0]
+        way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        share = np.asarray(cv2.resize(share, (camera.width, camera.height), interpolation=way), np.float32)
+    return torch.from_numpy(share > SURE)
 
 
 def roughness(colours: Float[Tensor, "cells 3"]) -> Float[Tensor, ""]:
