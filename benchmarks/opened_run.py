@@ -58,11 +58,8 @@ class OpenedRun:
 
     def median_depth(self, camera: Camera) -> Float32[np.ndarray, "h w"]:
         """Of a render, (h, w) float32, world units along the view axis; 0 where there is no surface."""
-        options = raster.RenderOptions(
-            sh_degree=0, antialias=self.options.antialias, near=self.options.near, depth=True
-        )
         with torch.no_grad():
-            return np.asarray(raster.render(self.model[0], camera, options).median_depth.numpy())
+            return np.asarray(raster.render(self.model[0], camera, self.options.for_depths()).median_depth.numpy())
 
 
 def open_run(out: Path) -> OpenedRun:

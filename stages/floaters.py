@@ -74,9 +74,8 @@ def _look(
     flagged: Gaussians, camera: Camera, options: raster.RenderOptions
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, " 2"]]:
     """A view's median depth, and the light that reaches it: from the chosen Gaussians, and from all."""
-    plain = replace(options, sh_degree=0, background=(0.0, 0.0, 0.0), depth=True)
     with torch.no_grad():
-        rendered = raster.render(flagged, camera, plain)
+        rendered = raster.render(flagged, camera, options.for_depths())
     light = [part.numpy().sum(dtype=np.float64) for part in (rendered.colour[..., 0], rendered.alpha)]
     return rendered.median_depth.numpy(), np.array(light)
 

@@ -319,7 +319,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=5,
+    version=6,
     config=EvaluateConfig,
     reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
     parts={"metrics": "metrics.json", "views": "views"},

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.raster import RenderOptions
+from splatpipe.pipeline.raster import RenderOptions, render
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.floaters import measure_floaters
@@ -94,6 +94,19 @@ def test_haze_that_is_a_surface_for_one_view_alone_is_a_disagreement(dataset: Pa
     assert apart["share_above_5_percent"] * apart["pixels"] == pytest.approx(3 * 11, rel=0.4)
     assert apart["median"] < 1e-4
     assert alone["depth_disagreement"]["share_above_5_percent"] == 0.0
+
+
+def test_depth_of_an_antialiased_model_is_that_of_the_surface_however_fine_its_gaussians_are() -> None:
+    """Gaussians of a quarter of a pixel, one a pixel, before a wall: a sixth of the pixel's area, all of its ray."""
+    camera = Camera("photo", 40, 30, 100.0, 100.0, 20.0, 15.0, np.eye(4))
+    x, y = np.meshgrid(np.arange(40) + 0.5 - 20.0, np.arange(30) + 0.5 - 15.0)
+    fine = blob(np.stack((x.ravel(), y.ravel(), np.full(x.size, 100.0)), axis=1) * 0.03, 0.25 * 0.03, 0.95)
+    both = Gaussians.concat([fine, blob(np.array([[0.0, 0.0, 4.0]]), 4.0, 0.99)])
+    trained = RenderOptions(sh_degree=0, antialias=True)
+    with torch.no_grad():
+        through, seen = (render(both, camera, options).median_depth for options in (trained, trained.for_depths()))
+    torch.testing.assert_close(through, torch.full((30, 40), 4.0))
+    torch.testing.assert_close(seen, torch.full((30, 40), 3.0))
 
 
 def test_without_sparse_points_the_figures_are_not_known(tmp_path: Path) -> None:

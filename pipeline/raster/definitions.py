@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -64,6 +64,14 @@ class RenderOptions:
     depth: bool = True
     depth_origin: float = 0.0
     magnitudes: bool = False
+
+    def for_depths(self) -> RenderOptions:
+        """The same view for its depths alone: what the rays through the pixels' centres meet.
+
+        Not anti-aliased: a factor on opacity that stands for the part of a pixel's area that a small Gaussian covers
+        lets rays through what they hit, and the median depth then lies behind the surface.
+        """
+        return replace(self, sh_degree=0, background=(0.0, 0.0, 0.0), antialias=False, depth=True)
 
 
 @dataclass(frozen=True, eq=False)
