@@ -72,8 +72,8 @@ class UndistortConfig(StageConfig):
 class InitializeConfig(StageConfig):
     max_gaussians: PositiveInt = 1_000_000
     """At most this many sparse points become Gaussians, those seen in most photos first."""
-    opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.1
-    """Opacity at the start."""
+    opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
+    """Opacity at the start. Published: 0.1, from which walls stay a fog whose depth lies behind its front."""
     max_angle: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
     """Cap on a Gaussian's size for outliers, as a share of its distance to the nearest camera."""
     dense: Literal["off", "sweep"] = "off"
@@ -183,8 +183,8 @@ class TrainConfig(StageConfig):
     """Learning rate of colour (degree 0)."""
     lr_sh_rest_divisor: Annotated[float, Field(ge=1.0)] = 20.0
     """Higher degrees learn this many times slower."""
-    lr_opacity: PositiveFloat = 5e-2
-    """Learning rate of opacity logits."""
+    lr_opacity: PositiveFloat = 0.15
+    """Learning rate of opacity logits. Published: 0.05, at which surfaces become opaque too late."""
     lr_scales: PositiveFloat = 5e-3
     """Learning rate of log-scales."""
     lr_quats: PositiveFloat = 1e-3
