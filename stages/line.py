@@ -62,6 +62,13 @@ class SparseConfig(StageConfig):
 class GeorefConfig(StageConfig):
     max_position_error_m: PositiveFloat = 10.0
     """Photo positions further than this from the robust fit are named and left out of it."""
+    crs: Annotated[str, Field(max_length=500)] = "auto"
+    """CRS of coordinates that are read out: `EPSG:25832`, with heights `EPSG:25832+7837`, `+proj=…`, `WGS84 UTM 32N`.
+    Auto: the control file's, without one the capture's UTM zone."""
+    vertical: Annotated[str, Field(max_length=40)] = "auto"
+    """Vertical datum of the photos' heights: `ellipsoidal`, `EPSG:n` or `unknown`. Auto: what the files declare."""
+    approximate_crs: bool = False
+    """Take a CRS though the grid of its best way to WGS 84 is missing; what that costs is stated in `georef.json`."""
 
 
 class UndistortConfig(StageConfig):
