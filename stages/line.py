@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from splatpipe.pipeline.engine.stage import Stage, StageConfig
 
@@ -69,6 +69,19 @@ class GeorefConfig(StageConfig):
     """Vertical datum of the photos' heights: `ellipsoidal`, `EPSG:n` or `unknown`. Auto: what the files declare."""
     approximate_crs: bool = False
     """Take a CRS though the grid of its best way to WGS 84 is missing; what that costs is stated in `georef.json`."""
+
+    @field_validator("crs", "vertical")
+    @classmethod
+    def _is_known(cls, text: str, field: ValidationInfo) -> str:
+        if text.strip().lower() == "auto":
+            return "auto"
+        from splatpipe.pipeline.engine.errors import SplatpipeError
+        from splatpipe.pipeline.scene.crs_names import parse_crs, parse_vertical
+
+        try:
+            return parse_crs(text).text if field.field_name == "crs" else parse_vertical(text)
+        except SplatpipeError as error:
+            raise ValueError(f"{error.message.rstrip('.')}. {error.hint}".rstrip(".")) from error
 
 
 class UndistortConfig(StageConfig):

@@ -13,6 +13,7 @@ Heights are kept as they are stated: in metres, in the datum `Crs.vertical`. Onl
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -122,7 +123,8 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
     accuracy = float(best.accuracy) if best.accuracy is not None and best.accuracy >= 0.0 else None
     assumed = crs.text.startswith("+") and "datum" not in crs.text and "towgs84" not in crs.text
     note = "Its datum is not stated and taken for WGS 84." if assumed else ""
-    return Operation(best.description, accuracy, best.definition, bool(group.best_available), note, best)
+    name = re.sub(r" \+ axis order change \([^)]*\)|axis order change \([^)]*\) \+ ", "", best.description)
+    return Operation(name, accuracy, best.definition, bool(group.best_available), note, best)
 
 
 def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool = False) -> Located:
