@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from splatpipe.pipeline.engine.stage import Stage, StageConfig
+from splatpipe.pipeline.engine.stage import NamedFile, Stage, StageConfig
 
 PositiveInt = Annotated[int, Field(ge=1)]
 NonNegativeInt = Annotated[int, Field(ge=0)]
@@ -27,6 +27,9 @@ class IngestConfig(StageConfig):
     """Pictures whose longer side is shorter, in pixels, are left out: thumbnails and icons."""
     max_megapixels: Annotated[float, Field(gt=0.0, le=4000.0)] = 500.0
     """Larger pictures are left out undecoded: a small file can claim any size."""
+    positions: str = "auto"
+    """File of the photos' positions, over what these say: `geo.txt` (ODM) or a CSV with a header. `auto`: `geo.txt` or
+    `positions.csv` in the photo folder or beside it; `none`: only what the photos say."""
 
 
 class FeaturesConfig(StageConfig):
@@ -62,6 +65,9 @@ class SparseConfig(StageConfig):
 class GeorefConfig(StageConfig):
     max_position_error_m: PositiveFloat = 10.0
     """Photo positions further than this from the robust fit are named and left out of it."""
+    control: str = "auto"
+    """File of control and check points: `gcp_list.txt` (ODM) or a CSV with a header. `auto`: `gcp_list.txt` or
+    `control.csv` in the photo folder or beside it; `none`: no control."""
 
 
 class UndistortConfig(StageConfig):
@@ -246,9 +252,10 @@ INGEST = Stage(
     "ingest",
     version=1,
     config=IngestConfig,
-    reads=("source.photos",),
+    reads=("source.photos", "source.geo"),
     parts={"photos": "photos", "cameras": "cameras.json", "positions": "positions.json", "left_out": "left_out.json"},
     entry="splatpipe.stages.ingest:run",
+    files={"positions": NamedFile("source.geo", ("geo.txt", "positions.csv"))},
 )
 FEATURES = Stage(
     "features",
@@ -278,9 +285,10 @@ GEOREF = Stage(
     "georef",
     version=1,
     config=GeorefConfig,
-    reads=("sparse.model", "ingest.positions", "ingest.photos"),
+    reads=("sparse.model", "ingest.positions", "ingest.photos", "source.control"),
     parts={"frame": "frame.json", "model": "sparse/0"},
     entry="splatpipe.stages.georef:run",
+    files={"control": NamedFile("source.control", ("gcp_list.txt", "control.csv"))},
 )
 UNDISTORT = Stage(
     "undistort",
