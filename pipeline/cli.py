@@ -108,6 +108,7 @@ def _with_budgets(assignments: Sequence[str] | None, time_budget: str | None, ma
 
 def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
     from splatpipe.pipeline.engine.session import Request
+    from splatpipe.pipeline.engine.source import with_absolute_files
     from splatpipe.pipeline.engine.stage import Machine
     from splatpipe.stages.line import LINE
 
@@ -118,7 +119,8 @@ def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", 
         raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
         import splatpipe.pipeline.raster  # noqa: F401
-    return Request(LINE, config, photos, out, Machine(device, threads or available_cores(), began_s))
+    machine = Machine(device, threads or available_cores(), began_s)
+    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
 
 
 def available_cores() -> int:

@@ -58,7 +58,7 @@ class Line:
         return StageInputs(
             stage.name,
             stage.version,
-            section.model_dump(mode="json"),
+            section.model_dump(mode="json", exclude=set(stage.files)),
             {name: lookup(self.config, name) for name in stage.borrows},
             {name: parts[name].digest for name in stage.reads},
         )
