@@ -200,7 +200,7 @@ def in_crs(frame: Frame, asked: str, stated: str = "", approximate: bool = False
 
     Args:
         frame: Georeferenced; an arbitrary one stays as it is.
-        asked: `georef.crs`; ``auto`` for the control file's, or the UTM zone.
+        asked: `georef.crs`; ``auto`` for the control file's, or the UTM zone where its heights are not the frame's.
         stated: The control file's; empty without one.
         approximate: `georef.approximate_crs`.
 
@@ -209,8 +209,11 @@ def in_crs(frame: Frame, asked: str, stated: str = "", approximate: bool = False
     """
     if frame.origin is None:
         return frame
-    text = (stated or utm_of(frame.origin.latitude, frame.origin.longitude).text) if asked == AUTO else asked
-    placed = replace(frame, crs=parse_crs(text).text, approximate_crs=approximate)
+    crs = utm_of(frame.origin.latitude, frame.origin.longitude) if asked == AUTO else parse_crs(asked)
+    if asked == AUTO and stated:
+        theirs = parse_crs(stated)
+        crs = theirs if theirs.vertical == UNKNOWN or same_datum(theirs.vertical, frame.vertical_datum) else crs
+    placed = replace(frame, crs=crs.text, approximate_crs=approximate)
     open_world(placed)
     return placed
 
