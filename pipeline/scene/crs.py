@@ -139,6 +139,7 @@ def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool 
         SplatpipeError: as ``open_operation``, and if a point is not on the earth or far outside of the CRS's area.
     """
     latitude, longitude = _rough_place(points, crs)
+    _require_no_degrees(points, crs, latitude, longitude)
     operation = open_operation(crs, latitude, longitude, approximate)
     located = geodetic_by(operation, crs, points)
     for point, place in zip(points, located, strict=True):
@@ -266,6 +267,16 @@ def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
         stretch = max(abs(factors.meridional_scale - 1.0), abs(factors.parallel_scale - 1.0))
         if not stretch <= STRETCH:  # also where it is infinite or not a number
             raise SplatpipeError(f"{place} is not where {crs.text} is true to scale: another part of the earth.", hint)
+
+
+def _require_no_degrees(points: Float64[np.ndarray, "n 3"], crs: Crs, latitude: float, longitude: float) -> None:
+    """Refuse degrees that are stated as eastings and northings: those are metres from the false origin."""
+    like_degrees = bool((np.abs(points[:, :2]) <= [360.0, 90.0]).all()) and not crs.is_geographic
+    if like_degrees and crs.area is not None and _outside_km(crs.area, latitude, longitude) > 0.0:
+        raise SplatpipeError(
+            f"The coordinates look like degrees, and {crs.text} ({crs.name}) has none.",
+            "Name the CRS that they are in: EPSG:4326 for longitude and latitude of WGS 84.",
+        )
 
 
 def _outside_km(area: tuple[float, float, float, float], latitude: float, longitude: float) -> float:
