@@ -331,8 +331,8 @@ GEOREF = Stage(
     "georef",
     version=1,
     config=GeorefConfig,
-    reads=("sparse.model", "ingest.positions", "ingest.photos", "source.control"),
-    parts={"frame": "frame.json", "model": "sparse/0"},
+    reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
+    parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
     entry="splatpipe.stages.georef:run",
     files={"control": NamedFile("source.control", ("gcp_list.txt", "control.csv"))},
 )
