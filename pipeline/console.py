@@ -30,6 +30,7 @@ from splatpipe.pipeline.engine.runner import Standing
 from splatpipe.pipeline.engine.stage import JSON, Summary
 
 PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
+PLAIN_WIDTH = 120  # columns of a table in a log file
 POINTS_SHOWN = 40  # more are in metrics.json alone
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
@@ -197,10 +198,12 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
         return
     gsd = report.get("gsd_m")
     console = Console(file=sys.stderr, highlight=False)
+    if not console.is_terminal:
+        console.width = PLAIN_WIDTH
     console.print("\n[bold]Accuracy[/], root mean square in metres" + (f"; GSD {gsd:.4f} m" if gsd else ""))
     shown = Table(box=None, pad_edge=False)
-    for title in ("", "points", "east", "north", "up", "horizontal", "3D", "95 % horizontal", "95 % up"):
-        shown.add_column(title, justify="right" if title else "left")
+    for title in ("", "n", "east", "north", "up", "horiz.", "3D", "95 % horiz.", "95 % up"):
+        shown.add_column(title, justify="right" if title else "left", no_wrap=True)
     for title, table in groups:
         figures = [_metres(table.get(f"rmse_{name}_m")) for name in ("east", "north", "up", "horizontal", "3d")]
         bounds = [_bounds(table.get(f"interval_95_{name}_m")) for name in ("horizontal", "vertical")]
@@ -213,8 +216,8 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
 def _points_table(points: Sequence[Mapping[str, JSON]], splat: Mapping[str, Mapping[str, JSON]]) -> Table:
     """Residuals of each surveyed point: estimated less surveyed, metres."""
     table = Table(box=None, pad_edge=False)
-    for title in ("point", "", "photos", "east", "north", "up", "px", "splat east", "north", "up"):
-        table.add_column(title, justify="left" if title in ("point", "") else "right")
+    for title in ("point", "", "photos", "east", "north", "up", "px", "splat: east", "north", "up"):
+        table.add_column(title, justify="left" if title in ("point", "") else "right", overflow="fold")
     nothing = [None, None, None]
     for point in points:
         squares = [x * x + y * y for x, y in (seen.get("residual_px") or (0.0, 0.0) for seen in point["observations"])]
@@ -238,7 +241,7 @@ def _metres(value: float | None) -> str:
 
 
 def _bounds(interval: Sequence[float] | None) -> str:
-    return "–" if interval is None else f"{interval[0]:.3f} to {interval[1]:.3f}"
+    return "–" if interval is None else f"{interval[0]:.3f}–{interval[1]:.3f}"
 
 
 def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
