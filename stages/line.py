@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from splatpipe.pipeline.engine.stage import NamedFile, Stage, StageConfig
 
@@ -68,6 +68,52 @@ class GeorefConfig(StageConfig):
     control: str = "auto"
     """File of control and check points: `gcp_list.txt` (ODM) or a CSV with a header. `auto`: `gcp_list.txt` or
     `control.csv` in the photo folder or beside it; `none`: no control."""
+    crs: Annotated[str, Field(max_length=500)] = "auto"
+    """CRS of coordinates that are read out: `EPSG:25832`, with heights `EPSG:25832+7837`, `+proj=…`, `WGS84 UTM 32N`.
+    Auto: the control file's, without one the capture's UTM zone."""
+    vertical: Annotated[str, Field(max_length=40)] = "auto"
+    """Vertical datum of the photos' heights: `ellipsoidal`, `EPSG:n` or `unknown`. Auto: what the files declare."""
+    approximate_crs: bool = False
+    """Take a CRS though the grid of its best way to WGS 84 is missing; what that costs is stated in `georef.json`."""
+    pixel_origin: Literal["corner", "centre"] = "corner"
+    """What the pixel coordinates (0, 0) of marks mean: the top-left corner of the first pixel, or its centre."""
+    check_points: Annotated[str, Field(max_length=20_000)] = "auto"
+    """Points that take no part and tell the accuracy: names, separated by commas. `auto`: those that the file names so,
+    else, of six or more, every third; `none`: every point is control."""
+    control_sigma_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.02
+    """Horizontal standard deviation (each of two) of control points whose file states none; raised where they disagree
+    with each other by more."""
+    control_sigma_vertical_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.03
+    """The same of their heights."""
+    mark_sigma_px: Annotated[float, Field(ge=0.01, le=100.0)] = 0.5
+    """Standard deviation of a mark in a photo, pixels."""
+    adjust: Literal["auto", "off"] = "auto"
+    """`auto`: control enters a bundle adjustment; where it moves what the photos show by half a pixel or more, the bent
+    model is used. `off`: it only places the model."""
+
+    @field_validator("crs")
+    @classmethod
+    def _known_crs(cls, text: str) -> str:
+        return _known_name(text, "parse_crs")
+
+    @field_validator("vertical")
+    @classmethod
+    def _known_vertical(cls, text: str) -> str:
+        return _known_name(text, "parse_vertical")
+
+
+def _known_name(text: str, parser: str) -> str:
+    """``auto``, or what PROJ knows: told now, not after hours; PROJ itself is only loaded where something is named."""
+    if text.strip().lower() == "auto":
+        return "auto"
+    from splatpipe.pipeline.engine.errors import SplatpipeError
+    from splatpipe.pipeline.scene import crs_names
+
+    try:
+        known = getattr(crs_names, parser)(text)
+    except SplatpipeError as error:
+        raise ValueError(f"{error.message} {error.hint}".rstrip(".")) from error
+    return known if isinstance(known, str) else str(known.text)
 
 
 class UndistortConfig(StageConfig):
@@ -335,7 +381,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=1,
+    version=2,
     config=ExportConfig,
     reads=(
         "train.model",
@@ -350,13 +396,14 @@ EXPORT = Stage(
     ),
     parts={
         "splat": "splat.ply",
+        "georef": "georef.json",
         "cameras": "cameras.json",
         "metrics": "metrics.json",
         "sparse": "sparse.glb",
         "sky": "sky",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "cameras", "metrics", "sparse", "sky"),
+    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky"),
 )
 
 LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)

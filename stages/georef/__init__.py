@@ -7,6 +7,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.frames import save_frame
 from splatpipe.pipeline.scene.photos import load_photo_list
+from splatpipe.pipeline.scene.world import in_crs
 from splatpipe.stages.georef.gps import NoPlaceError, georeference, read_positions, tell
 from splatpipe.stages.georef.level import arbitrary_frame
 from splatpipe.stages.georef.model import copy_model, read_model
@@ -27,6 +28,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     used = 0
     try:
         frame, fit = georeference(model, positions, config.max_position_error_m)
+        frame = in_crs(frame, config.crs, approximate=config.approximate_crs)
         used = int(fit.inliers.sum())
         tell(frame, fit, model, positions, report)
     except NoPlaceError as error:
