@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from splatpipe.pipeline.engine.stage import NamedFile, Stage, StageConfig
 
@@ -90,6 +90,30 @@ class GeorefConfig(StageConfig):
     adjust: Literal["auto", "off"] = "auto"
     """`auto`: control enters a bundle adjustment; where it moves what the photos show by half a pixel or more, the bent
     model is used. `off`: it only places the model."""
+
+    @field_validator("crs")
+    @classmethod
+    def _known_crs(cls, text: str) -> str:
+        return _known_name(text, "parse_crs")
+
+    @field_validator("vertical")
+    @classmethod
+    def _known_vertical(cls, text: str) -> str:
+        return _known_name(text, "parse_vertical")
+
+
+def _known_name(text: str, parser: str) -> str:
+    """``auto``, or what PROJ knows: told now, not after hours; PROJ itself is only loaded where something is named."""
+    if text.strip().lower() == "auto":
+        return "auto"
+    from splatpipe.pipeline.engine.errors import SplatpipeError
+    from splatpipe.pipeline.scene import crs_names
+
+    try:
+        known = getattr(crs_names, parser)(text)
+    except SplatpipeError as error:
+        raise ValueError(f"{error.message} {error.hint}".rstrip(".")) from error
+    return known if isinstance(known, str) else str(known.text)
 
 
 class UndistortConfig(StageConfig):
@@ -357,7 +381,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=1,
+    version=2,
     config=ExportConfig,
     reads=(
         "train.model",
@@ -372,13 +396,14 @@ EXPORT = Stage(
     ),
     parts={
         "splat": "splat.ply",
+        "georef": "georef.json",
         "cameras": "cameras.json",
         "metrics": "metrics.json",
         "sparse": "sparse.glb",
         "sky": "sky",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "cameras", "metrics", "sparse", "sky"),
+    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky"),
 )
 
 LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)

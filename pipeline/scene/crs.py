@@ -13,6 +13,7 @@ Heights are kept as they are stated: in metres, in the datum `Crs.vertical`. Onl
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -122,7 +123,8 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
     accuracy = float(best.accuracy) if best.accuracy is not None and best.accuracy >= 0.0 else None
     assumed = crs.text.startswith("+") and "datum" not in crs.text and "towgs84" not in crs.text
     note = "Its datum is not stated and taken for WGS 84." if assumed else ""
-    return Operation(best.description, accuracy, best.definition, bool(group.best_available), note, best)
+    name = re.sub(r" \+ axis order change \([^)]*\)|axis order change \([^)]*\) \+ ", "", best.description)
+    return Operation(name, accuracy, best.definition, bool(group.best_available), note, best)
 
 
 def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool = False) -> Located:
@@ -137,6 +139,7 @@ def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool 
         SplatpipeError: as ``open_operation``, and if a point is not on the earth or far outside of the CRS's area.
     """
     latitude, longitude = _rough_place(points, crs)
+    _require_no_degrees(points, crs, latitude, longitude)
     operation = open_operation(crs, latitude, longitude, approximate)
     located = geodetic_by(operation, crs, points)
     for point, place in zip(points, located, strict=True):
@@ -264,6 +267,16 @@ def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
         stretch = max(abs(factors.meridional_scale - 1.0), abs(factors.parallel_scale - 1.0))
         if not stretch <= STRETCH:  # also where it is infinite or not a number
             raise SplatpipeError(f"{place} is not where {crs.text} is true to scale: another part of the earth.", hint)
+
+
+def _require_no_degrees(points: Float64[np.ndarray, "n 3"], crs: Crs, latitude: float, longitude: float) -> None:
+    """Refuse degrees that are stated as eastings and northings: those are metres from the false origin."""
+    like_degrees = bool((np.abs(points[:, :2]) <= [360.0, 90.0]).all()) and not crs.is_geographic
+    if like_degrees and crs.area is not None and _outside_km(crs.area, latitude, longitude) > 0.0:
+        raise SplatpipeError(
+            f"The coordinates look like degrees, and {crs.text} ({crs.name}) has none.",
+            "Name the CRS that they are in: EPSG:4326 for longitude and latitude of WGS 84.",
+        )
 
 
 def _outside_km(area: tuple[float, float, float, float], latitude: float, longitude: float) -> float:

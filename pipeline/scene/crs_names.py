@@ -136,7 +136,7 @@ def _from_epsg(code: str, heights: str | None) -> Crs:
         authority = upper.to_authority()
         vertical, unit_m = (f"EPSG:{authority[1]}" if authority else UNKNOWN), _height_unit(upper)
     elif len(crs.axis_info) == 3 and not crs.is_geocentric:
-        vertical, unit_m = ELLIPSOIDAL, float(crs.axis_info[2].unit_conversion_factor)
+        vertical = ELLIPSOIDAL
     elif crs.is_projected:  # who measures eastings in feet means heights in feet
         unit_m = float(crs.axis_info[0].unit_conversion_factor)
     text, name = f"EPSG:{int(code)}", crs.name

@@ -13,10 +13,11 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.crs import parse_crs, parse_vertical
+from splatpipe.pipeline.scene.crs import parse_vertical
 from splatpipe.pipeline.scene.frames import Frame, save_frame
 from splatpipe.pipeline.scene.photos import Photo, load_photo_list
 from splatpipe.pipeline.scene.sparse_model import write_model
+from splatpipe.pipeline.scene.world import in_crs
 from splatpipe.stages.georef.accuracy import Placed, accuracy_json, control_json, no_control
 from splatpipe.stages.georef.blunders import gsd_m
 from splatpipe.stages.georef.control import ByControl, Capture, place_by_control
@@ -81,13 +82,10 @@ def _by_positions(config: GeorefConfig, model: SparseModel, positions: Positions
 
 def _declared(frame: Frame, config: GeorefConfig, controlled: ByControl | None) -> Frame:
     """The frame with the CRS and the vertical datum that were declared."""
-    crs = controlled.survey.crs.text if controlled is not None else ""
-    if config.crs != "auto":
-        crs = parse_crs(config.crs).text
-    vertical = frame.vertical_datum
     if controlled is None and config.vertical != "auto":
-        vertical = parse_vertical(config.vertical)
-    return replace(frame, crs=crs, approximate_crs=config.approximate_crs, vertical_datum=vertical)
+        frame = replace(frame, vertical_datum=parse_vertical(config.vertical))
+    stated = controlled.survey.crs.text if controlled is not None else ""
+    return in_crs(frame, config.crs, stated, config.approximate_crs)
 
 
 def _focal_priors(path: Path, model: SparseModel, photos: Mapping[str, Photo]) -> dict[int, float]:
