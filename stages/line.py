@@ -373,9 +373,17 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=5,
+    version=6,
     config=EvaluateConfig,
-    reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
+    reads=(
+        "train.model",
+        "train.plan",
+        "train.sky",
+        "undistort.dataset",
+        "georef.frame",
+        "georef.control",
+        "georef.accuracy",
+    ),
     parts={"metrics": "metrics.json", "views": "views"},
     entry="splatpipe.stages.evaluate:run",
 )

@@ -82,9 +82,9 @@ def _by_positions(config: GeorefConfig, model: SparseModel, positions: Positions
 
 def _declared(frame: Frame, config: GeorefConfig, controlled: ByControl | None) -> Frame:
     """The frame with the CRS and the vertical datum that were declared."""
+    stated = controlled.survey.crs.text if controlled is not None else ""
     if controlled is None and config.vertical != "auto":
         frame = replace(frame, vertical_datum=parse_vertical(config.vertical))
-    stated = controlled.survey.crs.text if controlled is not None else ""
     return in_crs(frame, config.crs, stated, config.approximate_crs)
 
 
