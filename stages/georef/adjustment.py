@@ -23,15 +23,13 @@ from jaxtyping import Float64
 from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity
 from splatpipe.stages.georef.place import Stations
 
-MEDIAN_OF_RAYLEIGH = 1.17741  # median of the length of a 2D normal vector
 LEAST_SIGMA_PX = 0.1
-ROBUST = 2.385  # Cauchy's scale in sigmas: 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 UNBOUND_M = 1e4  # sigma of a height that nobody measured
 FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
 DISTORTION_SIGMA = 0.2  # of a distortion coefficient about what SfM found
 MOST_DENSE = 60  # photos up to which the reduced system is solved densely
 MOST_ITERATIONS = 100
-FUNCTION_TOLERANCE = 1e-8
+FUNCTION_TOLERANCE = 1e-6
 ROUNDS = 10  # of reweighting
 
 
@@ -105,7 +103,7 @@ def adjust(
         )
     )
     sigma = feature_sigma(model)
-    adjuster = _features(model, sigma)
+    adjuster = _features(model)
     problem = adjuster.problem
     blocks = _Blocks(problem, sigma)
     places = np.array([target.start for target in targets], dtype=np.float64).reshape(-1, 3)
@@ -126,7 +124,7 @@ def adjust(
 
 
 def feature_sigma(model: pycolmap.Reconstruction) -> float:
-    """Standard deviation of the features' coordinates by the median of their residuals, pixels."""
+    """Standard deviation of the features' coordinates by their residuals, pixels."""
     errors = []
     for number in sorted(model.reg_image_ids()):
         image = model.images[number]
@@ -137,11 +135,11 @@ def feature_sigma(model: pycolmap.Reconstruction) -> float:
         xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
         shown = camera.img_from_cam(xyz @ pose.rotation.matrix().T + pose.translation)
         errors.append(np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1))
-    if not errors:
-        return LEAST_SIGMA_PX
-    together = np.concatenate(errors)
-    together = together[np.isfinite(together)]
-    return max(float(np.median(together)) / MEDIAN_OF_RAYLEIGH, LEAST_SIGMA_PX) if len(together) else LEAST_SIGMA_PX
+    squares = np.concatenate([np.zeros(0), *errors]) ** 2
+    squares = squares[np.isfinite(squares)]
+    unknowns = 3 * model.num_points3D() + 6 * len(model.reg_image_ids())
+    degrees = max(2 * len(squares) - unknowns, 1)
+    return max(math.sqrt(float(squares.sum()) / degrees), LEAST_SIGMA_PX)
 
 
 class _Blocks:
@@ -203,11 +201,9 @@ class _StationCost(pyceres.CostFunction):  # type: ignore[misc]
         return True
 
 
-def _features(model: pycolmap.Reconstruction, sigma_px: float) -> Any:
+def _features(model: pycolmap.Reconstruction) -> Any:
     """COLMAP's bundle adjuster of all photos, with no gauge: control is it."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = ROBUST * sigma_px
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.scene.alignment import Correspondences, SimilarityFit, robust_similarity
+from splatpipe.pipeline.scene.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.scene.frames import Frame
 from splatpipe.pipeline.scene.geodesy import Origin
+from splatpipe.stages.georef.flights import bound, flights_json, shared_errors, tell_flights_apart, unbound
 from splatpipe.stages.georef.level import Positions, direction_prior
 from splatpipe.stages.georef.model import SparseModel
 
@@ -23,6 +25,7 @@ MIN_POSITIONS = 3
 ORIGIN_DIGITS = 5  # degrees: a metre; the origin then stays where it is when some photos come or go
 MAX_SIGMA_SCALE = 0.2  # a scale known less well is no scale
 MAX_SIGMA_ROTATION_RAD = math.radians(20.0)
+SWAPPED_NOISE = 0.5  # of the residuals: what fits twice as well with swapped coordinates has them swapped
 NADIR_PITCH_DEG = -60.0
 HEIGHT_TOLERANCE = 0.1  # of the height above ground, against what the drone measured
 NAMES_SHOWN = 10
@@ -47,17 +50,64 @@ def georeference(model: SparseModel, positions: Positions, max_error_m: float) -
     sigmas = np.array([[r["sigma_horizontal_m"]] * 2 + [r["sigma_vertical_m"]] for r in records], dtype=np.float64)
     origin = _origin(geodetic)
     points = Correspondences(model.centres[chosen], origin.enu_from_geodetic(geodetic), sigmas)
+    points = replace(points, shared=shared_errors(records, sigmas))
     prior, prior_note = direction_prior(model, positions)
+    try:
+        if points.shared is not None:
+            points = _bound(points, max_error_m)
+        fit = _fit(points, max_error_m, prior)
+    except NoPlaceError:
+        _require_unswapped(points, geodetic, max_error_m, math.inf)
+        raise
+    if fit.noise > 1.0:
+        _require_unswapped(points, geodetic, max_error_m, fit.noise)
+    wrong = [name for name in model.names if name in positions.wrong]
+    left_out = [name for name, inlier in zip(names, fit.inliers, strict=True) if not inlier]
+    note = f"From the positions of {len(names) - len(left_out)} photos"
+    note += f"; the rotation that they leave free is from {prior_note}." if fit.used_prior else "."
+    residuals = {**_residuals(names, fit), "flights": flights_json(records, points, fit)}
+    return Frame("enu", fit.similarity, origin, "unknown", residuals, tuple(sorted(left_out + wrong)), note), fit
+
+
+def _bound(points: Correspondences, max_error_m: float) -> Correspondences:
+    """Which flights are apart, from a fit in which each has any offset; none where that determines nothing."""
+    try:
+        return bound(points, robust_similarity(unbound(points), max_error_m))
+    except ValueError:
+        return points
+
+
+def _fit(points: Correspondences, max_error_m: float, prior: DirectionPrior) -> SimilarityFit:
     try:
         fit = robust_similarity(points, max_error_m, prior)
     except ValueError as error:
         raise NoPlaceError(f"the positions do not fit the model ({error})") from error
-    _require_determined(fit, len(names))
-    left_out = tuple(name for name, inlier in zip(names, fit.inliers, strict=True) if not inlier)
-    note = f"From the positions of {len(names) - len(left_out)} photos"
-    note += f"; the rotation that they leave free is from {prior_note}." if fit.used_prior else "."
-    residuals = _residuals(names, fit)
-    return Frame("enu", fit.similarity, origin, "unknown", residuals, left_out, note), fit
+    _require_determined(fit, len(points))
+    return fit
+
+
+def _require_unswapped(
+    points: Correspondences, geodetic: Float64[np.ndarray, "n 3"], max_error_m: float, noise: float
+) -> None:
+    """Refuse positions that fit far better with latitude and longitude swapped; a flat flight fits both ways a little.
+
+    Args:
+        points: The cameras, and their positions as stated.
+        geodetic: The latter, as latitude and longitude (degrees) and height (metres).
+        max_error_m: As for the fit.
+        noise: What the residuals of the positions as stated are, over their sigmas.
+    """
+    swapped = geodetic[:, [1, 0, 2]]
+    if np.abs(swapped[:, 0]).max() > 90.0:
+        return
+    target = _origin(swapped).enu_from_geodetic(swapped)
+    try:
+        fit = robust_similarity(replace(points, target=target), max_error_m)
+        _require_determined(fit, len(points))
+    except (ValueError, NoPlaceError):
+        return
+    if fit.noise < SWAPPED_NOISE * noise:
+        raise NoPlaceError("the photo positions fit only with latitude and longitude swapped: correct them")
 
 
 def _require_determined(fit: SimilarityFit, positions: int) -> None:
@@ -111,6 +161,7 @@ def _rms(residuals: Float64[np.ndarray, "n k"]) -> float:
 
 def tell(frame: Frame, fit: SimilarityFit, model: SparseModel, positions: Positions, report: Reporter) -> None:
     """Warn of what is wrong with the positions, or weak about the fit."""
+    tell_flights_apart(frame.residuals["flights"], report)
     if frame.left_out:
         shown = ", ".join(frame.left_out[:NAMES_SHOWN])
         more = f" and {len(frame.left_out) - NAMES_SHOWN} more" if len(frame.left_out) > NAMES_SHOWN else ""
@@ -159,6 +210,6 @@ def read_positions(path: Path) -> Positions:
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
         by_name = {record["name"]: record for record in value["positions"]}
-        return Positions(by_name, value.get("orientations", {}))
+        return Positions(by_name, value.get("orientations", {}), value.get("wrong", {}))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(f"The positions {path} cannot be read: {error}", "Run with --rerun ingest.") from error

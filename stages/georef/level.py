@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,10 +32,17 @@ UP_SIGMA_RAD = math.radians(5.0)
 
 @dataclass(frozen=True)
 class Positions:
-    """``positions.json``: records by photo name, and EXIF orientations where they are not 1."""
+    """``positions.json``.
+
+    Attributes:
+        by_name: Records by photo name.
+        orientations: EXIF orientations by photo name where they are not 1.
+        wrong: Why a photo's position counts as none, by photo name.
+    """
 
     by_name: Mapping[str, Mapping[str, Any]]
     orientations: Mapping[str, int]
+    wrong: Mapping[str, str] = field(default_factory=dict)
 
 
 def arbitrary_frame(model: SparseModel, positions: Positions, reason: str) -> Frame:
