@@ -191,9 +191,9 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
         points: Of `control.json`.
     """
     splat = report.get("splat") or {"tables": {}, "points": []}
-    groups = [(title, (report.get("tables") or {}).get(name)) for name, title in GROUPS.items()]
-    groups += [(f"splat at {GROUPS[name]}", splat["tables"].get(name)) for name in ("control", "check")]
-    groups = [(title, table) for title, table in groups if table]
+    found = [(title, (report.get("tables") or {}).get(name)) for name, title in GROUPS.items()]
+    found += [(f"splat at {GROUPS[name]}", splat["tables"].get(name)) for name in ("control", "check")]
+    groups = [(title, table) for title, table in found if table is not None]
     if not groups:
         return
     gsd = report.get("gsd_m")

@@ -167,7 +167,8 @@ def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Fram
 def _splat(
     points: Sequence[Surveyed], places: Mapping[str, list[dict[str, Any]]], held_out: set[str]
 ) -> dict[str, Any]:
-    told, residuals = [], {"control": [], "check": []}
+    told: list[dict[str, Any]] = []
+    residuals: dict[str, list[Float64[np.ndarray, " 3"]]] = {"control": [], "check": []}
     for point in points:
         found = places[point.name]
         entry: dict[str, Any] = {"name": point.name, "role": point.role, "estimated_m": None, "residual_m": None}

@@ -105,7 +105,7 @@ def ply_comments(frame: Frame, antialias: bool) -> list[str]:
     return [
         *comments,
         "frame: local east north up, metres",
-        f"origin: {where} (latitude longitude in degrees, height in metres, WGS 84 / EPSG:4979)",
+        f"origin: {where} (latitude longitude in degrees, WGS 84; height in metres, in the vertical datum)",
         f"vertical datum: {frame.vertical_datum}",
         f"crs: {frame.crs or utm_of(origin.latitude, origin.longitude).text} (see georef.json)",
     ]
