@@ -192,7 +192,7 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
     """
     splat = report.get("splat") or {"tables": {}, "points": []}
     found = [(title, (report.get("tables") or {}).get(name)) for name, title in GROUPS.items()]
-    found += [(f"splat at {GROUPS[name]}", splat["tables"].get(name)) for name in ("control", "check")]
+    found += [(f"splat at {name}", splat["tables"].get(name)) for name in ("control", "check")]
     groups = [(title, table) for title, table in found if table is not None]
     if not groups:
         return
@@ -201,8 +201,8 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
     console.print("\n[bold]Accuracy[/], root mean square in metres" + (f"; GSD {gsd:.4f} m" if gsd else ""))
-    shown = Table(box=None, pad_edge=False)
-    for title in ("", "n", "east", "north", "up", "horiz.", "3D", "95 % horiz.", "95 % up"):
+    shown = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # within 80 columns
+    for title in ("", "n", "east", "north", "up", "horiz.", "3D", "95 % horiz", "95 % up"):
         shown.add_column(title, justify="right" if title else "left", no_wrap=True)
     for title, table in groups:
         figures = [_metres(table.get(f"rmse_{name}_m")) for name in ("east", "north", "up", "horizontal", "3d")]
@@ -211,11 +211,14 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
     console.print(shown)
     if 0 < len(points) <= POINTS_SHOWN:
         console.print(_points_table(points, {point["name"]: point for point in splat["points"]}))
+        for point in points:
+            if point.get("why"):
+                console.print(f"{point['name']}: {point['why']}.", markup=False, soft_wrap=True)
 
 
 def _points_table(points: Sequence[Mapping[str, JSON]], splat: Mapping[str, Mapping[str, JSON]]) -> Table:
     """Residuals of each surveyed point: estimated less surveyed, metres."""
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for title in ("point", "", "photos", "east", "north", "up", "px", "splat: east", "north", "up"):
         table.add_column(title, justify="left" if title in ("point", "") else "right", overflow="fold")
     nothing = [None, None, None]
@@ -224,10 +227,9 @@ def _points_table(points: Sequence[Mapping[str, JSON]], splat: Mapping[str, Mapp
         marked = [seen for seen in point["observations"] if seen.get("residual_px")]
         pixels = f"{(sum(squares) / len(marked)) ** 0.5:.2f}" if marked else "–"
         own = splat.get(point["name"], {}).get("residual_m") or nothing
-        why = f" ({point['why']})" if point.get("why") else ""
         table.add_row(
             Text(str(point["name"])),
-            Text(str(point["role"]).replace("_", " ") + why),
+            Text(str(point["role"]).replace("_", " ")),
             str(len(point["observations"])),
             *(_metres(value) for value in point.get("residual_m") or nothing),
             pixels,

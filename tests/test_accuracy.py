@@ -233,3 +233,23 @@ def test_the_table_is_what_its_names_say() -> None:
     low, high = table["interval_95_horizontal_m"]
     assert low == pytest.approx(table["rmse_horizontal_m"] * math.sqrt(6 / 14.4494), abs=2e-5)
     assert high == pytest.approx(table["rmse_horizontal_m"] * math.sqrt(6 / 1.2373), abs=2e-5)
+
+
+def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixture[str]) -> None:
+    from splatpipe.pipeline.console import show_accuracy
+
+    check = accuracy_table(np.array([[0.012, -0.034, 0.056], [0.01, 0.02, np.nan]]))
+    report = {"gsd_m": 0.0312, "tables": {"gps": None, "control": None, "check": check}, "splat": None}
+    seen = {"photo": "a.jpg", "residual_px": [3.0, 4.0]}
+    point = {"name": "P[1]", "role": "check", "residual_m": [0.012, -0.034, 0.056], "observations": [seen]}
+    left = {"name": "P2", "role": "left_out", "why": "one mark", "residual_m": None, "observations": []}
+    show_accuracy(report, [point, left])
+    shown = capsys.readouterr().err
+    assert "GSD 0.0312 m" in shown and "photo positions" not in shown and "P2: one mark." in shown
+    row = next(line for line in shown.splitlines() if line.startswith("check points"))
+    assert row.split()[2:6] == ["2", "0.011", "0.028", "0.056"]
+    row = next(line for line in shown.splitlines() if line.startswith("P[1]"))
+    assert row.split() == ["P[1]", "check", "1", "0.012", "-0.034", "0.056", "5.00", "–", "–", "–"]
+    assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80
+    show_accuracy({}, [])
+    assert capsys.readouterr().err == ""
