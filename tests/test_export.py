@@ -166,6 +166,12 @@ def test_georef_json_places_the_exported_cameras(exported: Path) -> None:
     assert (positions >= low - 1e-3).all() and (positions <= high + 1e-3).all()
 
 
+def test_the_crs_and_its_operation_are_told(inputs: Inputs, tmp_path: Path) -> None:
+    recorder = tiny_scene.Recorder()
+    export.run(ExportConfig(), inputs, tmp_path, recorder)
+    assert "EPSG:32634" in recorder.notes[0] and "good to 0 m" in recorder.notes[0] and "unknown" in recorder.notes[0]
+
+
 def test_broken_gaussians_stay_out_of_the_file(inputs: Inputs, tmp_path: Path) -> None:
     model = read_splat(inputs["train.model"])
     model.quats[0] = 0.0
