@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.scene.confidence import rmse_interval
+from splatpipe.pipeline.scene.accuracy import accuracy_table
 from splatpipe.pipeline.scene.photos import Photo
 from splatpipe.pipeline.scene.similarity import Similarity
 from splatpipe.stages.georef.model import SparseModel
@@ -79,12 +79,12 @@ def accuracy_json(survey: Survey | None, site: Site | None, placed: Placed, gsd:
     if site is not None and len(site.stations):
         stations = site.stations
         centres = placed.world_from_model.apply(placed.model.centres[stations.indices])
-        table = error_table(centres + placed.offsets[stations.group] - site.station_enu)
+        table = accuracy_table(centres + placed.offsets[stations.group] - site.station_enu)
         flights = [
             {"flight": number, "photos": int((stations.group == k).sum()), "offset_m": placed.offsets[k].tolist()}
             for k, number in enumerate(stations.flights)
         ]
-        tables["gps"] = {**table, "flights": flights}
+        tables["gps"] = None if table is None else {**table, "flights": flights}
     if survey is not None and site is not None:
         for role in ("control", "check"):
             errors = [
@@ -96,41 +96,8 @@ def accuracy_json(survey: Survey | None, site: Site | None, placed: Placed, gsd:
                 for k, point in enumerate(survey.points)
                 if point.role == role and point.found is not None
             ]
-            if errors:
-                tables[role] = error_table(np.array(errors))
+            tables[role] = accuracy_table(np.array(errors, dtype=np.float64).reshape(-1, 3))
     return {"gsd_m": gsd, "tables": tables}
-
-
-def error_table(errors: Float64[np.ndarray, "n 3"]) -> dict[str, JSON]:
-    """RMSE and means of errors east, north, up (NaN where a height is not known), metres.
-
-    The intervals hold the standard deviation of a coordinate with 95 %, taking the errors for independent and normal:
-    of the horizontal, each of two coordinates.
-    """
-    east, north, up = (errors[:, axis][np.isfinite(errors[:, axis])] for axis in range(3))
-    whole = errors[np.isfinite(errors).all(axis=1)]
-    flat = np.concatenate([east, north])
-    return {
-        "count": len(errors),
-        "rmse_east_m": _rms(east),
-        "rmse_north_m": _rms(north),
-        "rmse_up_m": _rms(up),
-        "rmse_horizontal_m": _rms(np.hypot(east, north)),
-        "rmse_3d_m": _rms(np.linalg.norm(whole, axis=1)),
-        "interval_95_horizontal_m": _interval(flat),
-        "interval_95_vertical_m": _interval(up),
-        "mean_m": [float(each.mean()) if len(each) else None for each in (east, north, up)],
-        "flights": [],
-    }
-
-
-def _rms(values: Float64[np.ndarray, " n"]) -> float | None:
-    return float(np.sqrt((values**2).mean())) if len(values) else None
-
-
-def _interval(values: Float64[np.ndarray, " n"]) -> list[float] | None:
-    rms = _rms(values)
-    return None if rms is None else list(rmse_interval(rms, len(values)))
 
 
 def _listed(values: Float64[np.ndarray, " 3"], known: Sequence[bool] | np.ndarray) -> list[float | None]:

@@ -28,7 +28,7 @@ UNBOUND_M = 1e4  # sigma of a height that nobody measured
 FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
 DISTORTION_SIGMA = 0.2  # of a distortion coefficient about what SfM found
 MOST_DENSE = 60  # photos up to which the reduced system is solved densely
-MOST_ITERATIONS = 100
+MOST_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6
 ROUNDS = 10  # of reweighting
 
@@ -150,7 +150,7 @@ class _Blocks:
         self.sigma_px = sigma_px
         self.kept: list[object] = []
 
-    def add(self, cost: Any, parameters: list[Float64[np.ndarray, " k"]]) -> None:
+    def add(self, cost: Any, parameters: list[Float64[np.ndarray, " _"]]) -> None:
         self.kept += [cost, *parameters]
         self.problem.add_residual_block(cost, None, parameters)
 

@@ -166,10 +166,11 @@ def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report:
     if done is None:
         return result
     if factor > 1.0:
+        worth = factor * float(np.median(result.site.targets.sigmas[_chosen(survey), 0]))
         report.warning(
-            f"The control points disagree with each other and the photos by {factor:.1f} times their standard"
-            " deviations, which are raised by that.",
-            "Were they measured with a hand-held receiver? State what they are worth: --set georef.control_sigma_m=…",
+            f"The control points agree with each other and the photos to {worth:.2f} m only, {factor:.1f} times what"
+            " they are stated or taken to be worth: their standard deviations are raised by that.",
+            "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… says what they are worth.",
         )
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
     result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor)
