@@ -36,6 +36,7 @@ from splatpipe.stages.line import GeorefConfig
 BENT_PX = 0.5  # what control has to move the photos' content by, root mean square, for the model to be worth bending
 QUIET = 2.0  # times the stated sigmas: control that is off by no more keeps them
 STRAINED = 4.0  # control that an adjustment leaves so many sigmas off is wrong
+STRAY = 0.1  # of a focal length from its prior: worth a warning
 LONELY = 3.0  # and alone with it where the others are quieter without it by this
 ROUNDS = 4  # of adjustment, each with the control that the one before showed to be wrong or less accurate
 
@@ -172,6 +173,7 @@ def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report:
             " they are stated or taken to be worth: their standard deviations are raised by that.",
             "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… says what they are worth.",
         )
+    _tell_lens(done, capture, report)
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
     result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor)
     if moved < BENT_PX:
@@ -188,6 +190,24 @@ def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report:
     ]
     placed = Placed(model, world_from_model, done.offsets)
     return replace(result, survey=survey.with_points(points), placed=placed, bent=bent)
+
+
+def _tell_lens(done: Adjusted, capture: Capture, report: Reporter) -> None:
+    """Warn of focal lengths that nothing tells, and of those that control takes far from what the metadata say."""
+    for number, camera in sorted(done.reconstruction.cameras.items()):
+        prior = capture.focal_priors.get(number)
+        if number in done.held:
+            report.warning(
+                f"Neither the photos nor the control tell the focal length (to {done.focal_sigmas[number]:.1%}):"
+                " it stays within 3 % of what the metadata say.",
+                "Add control at another height, or oblique photos, for heights to be trusted.",
+            )
+        elif prior is not None and abs(camera.mean_focal_length() / prior - 1.0) > STRAY:
+            report.warning(
+                f"Control takes the focal length from {prior:.0f} to {camera.mean_focal_length():.0f} pixels,"
+                " more than 10 % from what the metadata say.",
+                "Was it another lens, or are the photos cropped? Check heights against known ones.",
+            )
 
 
 def _noise(normed: Float64[np.ndarray, " n"], coordinates: Int64[np.ndarray, " n"]) -> float:
