@@ -17,7 +17,7 @@ import pycolmap
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.dataset import some
-from splatpipe.pipeline.scene.focal import UNOBSERVED, focal_sigmas
+from splatpipe.pipeline.scene.focal import UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.scene.sparse_model import write_model
 from splatpipe.stages.line import SparseConfig
@@ -27,7 +27,7 @@ Model: TypeAlias = pycolmap.Reconstruction
 LEAST_SHARE = 0.1  # of the photos; a model of fewer is an accident
 ENOUGH_SHARE = 0.5  # below it a second attempt is worth its time
 STRAY = 0.1  # of a focal length from its prior: worth a warning
-STRAY_UNOBSERVED = 0.03  # worth holding it where the photos cannot tell it
+STRAY_UNOBSERVED = 0.03  # which it may have where the photos cannot tell it
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,9 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         held = _map(inputs, config, again, out, report)
         if _registered(held) >= _registered(models):
             attempt, models = again, held
+            used = {models[0].images[number].camera_id for number in models[0].reg_image_ids()}
+            focals = {number: priors[number].mean_focal_length() for number in used}
+            adjust_within(models[0], focals, STRAY_UNOBSERVED)
     model = canonical(models[0], np.load(inputs["features.colours"]), _keypoint_counts(database))
     write_model(model, out / "sparse" / "0")
     summary = _summary(model, models[1:], names, priors, attempt)
@@ -244,6 +247,6 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
             )
     if summary["focal_held"]:
         report.warning(
-            "Photos of flat ground from one height cannot tell the focal length: that of the metadata was kept.",
+            "Photos of flat ground from one height cannot tell the focal length: it is held to 3 % of the metadata's.",
             hint="Add oblique photos, or a second height, for heights to be trusted.",
         )

@@ -9,6 +9,7 @@ width. That tells them apart on real captures: 0.01 to 0.07 % where photos are o
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ import pycolmap
 
 UNOBSERVED = 0.01  # relative standard deviation from which on the photos do not tell a focal length
 PRINCIPAL_POINT_SIGMA = 0.01  # of the width
+MOST_DENSE = 60  # photos up to which the reduced system is solved densely
+MOST_ITERATIONS = 60
+FUNCTION_TOLERANCE = 1e-6
 EXTRA_SIGMA = 0.2  # of a distortion coefficient: no lens has more
 
 
@@ -48,6 +52,49 @@ def focal_sigmas(model: pycolmap.Reconstruction) -> dict[int, float]:
         kept.append(prior)
         adjuster.problem.add_residual_block(prior, None, [camera.params])
     return posterior_focal_sigmas(copy, adjuster.problem)
+
+
+def adjust_within(model: pycolmap.Reconstruction, focals: Mapping[int, float], share: float) -> None:
+    """Adjust a model in place, its focal lengths free within a share of what the metadata say; on one thread.
+
+    Args:
+        model: Whose scale and place may change.
+        focals: Focal lengths of the metadata, pixels, by COLMAP's camera id.
+        share: They may differ by.
+    """
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in sorted(model.reg_image_ids()):
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(pycolmap.BundleAdjustmentOptions(), config, model)
+    for number, focal in sorted(focals.items()):
+        keep_near(adjuster.problem, model.cameras[number], focal, share)
+    pyceres.solve(solver_options(len(model.reg_image_ids())), adjuster.problem, pyceres.SolverSummary())
+    model.update_point_3d_errors()
+
+
+def keep_near(problem: Any, camera: pycolmap.Camera, focal_px: float, share: float) -> None:
+    """Start a problem's focal length at what the metadata say, and let it differ by a share of that."""
+    params = camera.params
+    if problem.has_parameter_block(params):
+        for index in camera.focal_length_idxs():
+            params[index] = focal_px
+            problem.set_parameter_lower_bound(params, index, (1.0 - share) * focal_px)
+            problem.set_parameter_upper_bound(params, index, (1.0 + share) * focal_px)
+
+
+def solver_options(photos: int) -> Any:
+    """Ceres' for a bundle adjustment of so many photos: one thread, and the same bits again."""
+    options = pyceres.SolverOptions()
+    options.num_threads = 1
+    options.linear_solver_type = (
+        pyceres.LinearSolverType.DENSE_SCHUR if photos <= MOST_DENSE else pyceres.LinearSolverType.SPARSE_SCHUR
+    )
+    options.max_num_iterations = MOST_ITERATIONS
+    options.function_tolerance = FUNCTION_TOLERANCE
+    options.minimizer_progress_to_stdout = False
+    options.logging_type = pyceres.LoggingType.SILENT
+    return options
 
 
 def posterior_focal_sigmas(model: pycolmap.Reconstruction, problem: Any) -> dict[int, float]:

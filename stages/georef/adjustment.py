@@ -20,7 +20,7 @@ import pycolmap
 import pycolmap.cost_functions
 from jaxtyping import Float64
 
-from splatpipe.pipeline.scene.focal import UNOBSERVED, posterior_focal_sigmas
+from splatpipe.pipeline.scene.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
 from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity
 from splatpipe.stages.georef.place import Stations
 
@@ -28,9 +28,6 @@ LEAST_SIGMA_PX = 1.0  # of features: they err together, in one photo, by lens an
 UNBOUND_M = 1e4  # sigma of a height that nobody measured
 FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
 DISTORTION_SIGMA = 0.2  # of a distortion coefficient about what SfM found
-MOST_DENSE = 60  # photos up to which the reduced system is solved densely
-MOST_ITERATIONS = 60
-FUNCTION_TOLERANCE = 1e-6
 ROUNDS = 10  # of reweighting
 
 
@@ -114,12 +111,13 @@ def adjust(
         blocks.add_target(model, place, target)
     offsets = _add_stations(blocks, model, stations)
     _add_lens(blocks, model, focal_priors)
-    pyceres.solve(_options(model), problem, pyceres.SolverSummary())
+    pyceres.solve(solver_options(len(model.reg_image_ids())), problem, pyceres.SolverSummary())
     focal_sigmas = posterior_focal_sigmas(model, problem)
     held = [n for n, focal in focal_priors.items() if focal_sigmas.get(n, 0.0) > UNOBSERVED]
     if held:
-        _hold_focals(blocks, model, {number: focal_priors[number] for number in held})
-        pyceres.solve(_options(model), problem, pyceres.SolverSummary())
+        for number in held:
+            keep_near(problem, model.cameras[number], focal_priors[number], FOCAL_SIGMA)
+        pyceres.solve(solver_options(len(model.reg_image_ids())), problem, pyceres.SolverSummary())
     normed = np.array(
         [
             math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())
@@ -246,30 +244,6 @@ def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Map
         for index in camera.extra_params_idxs():
             sigmas[index] = DISTORTION_SIGMA
         blocks.add_prior(params, mean, sigmas)
-
-
-def _hold_focals(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Mapping[int, float]) -> None:
-    """Keep focal lengths within 3 % of what the metadata say: nothing else tells them."""
-    for number, focal in sorted(focal_priors.items()):
-        params = model.cameras[number].params
-        for index in model.cameras[number].focal_length_idxs():
-            params[index] = focal
-            blocks.problem.set_parameter_lower_bound(params, index, (1.0 - FOCAL_SIGMA) * focal)
-            blocks.problem.set_parameter_upper_bound(params, index, (1.0 + FOCAL_SIGMA) * focal)
-
-
-def _options(model: pycolmap.Reconstruction) -> Any:
-    options = pyceres.SolverOptions()
-    options.num_threads = 1
-    dense = len(model.reg_image_ids()) <= MOST_DENSE
-    options.linear_solver_type = (
-        pyceres.LinearSolverType.DENSE_SCHUR if dense else pyceres.LinearSolverType.SPARSE_SCHUR
-    )
-    options.max_num_iterations = MOST_ITERATIONS
-    options.function_tolerance = FUNCTION_TOLERANCE
-    options.minimizer_progress_to_stdout = False
-    options.logging_type = pyceres.LoggingType.SILENT
-    return options
 
 
 def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> float:
