@@ -27,7 +27,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     report.progress(1, 2, "fitting the positions", "steps")
     used = 0
     try:
-        frame, fit = georeference(model, positions, config.max_position_error_m)
+        frame, fit = georeference(model, positions, config.max_position_error_m, config.vertical)
         frame = in_crs(frame, config.crs, approximate=config.approximate_crs)
         used = int(fit.inliers.sum())
         tell(frame, fit, model, positions, report)
