@@ -221,6 +221,32 @@ def stage(
 
 
 @app.command()
+def georef(
+    out: OutArgument,
+    gcp: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Control points: gcp_list.txt or CSV; auto, or none. Else as before."),
+    ] = None,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Place a finished run anew: other control points, another CRS. What does not change is reused."""
+    from splatpipe.pipeline.engine.config import known
+    from splatpipe.pipeline.engine.session import load_run
+    from splatpipe.stages.line import LineConfig
+
+    with Ending(out, as_json) as done:
+        photos, table = load_run(out)
+        control = [] if gcp is None else [{"georef": {"control": gcp}}]
+        resolved = _overrides(None, assignments, None).resolve(known(LineConfig, table), *control)
+        with _Session(_request(photos, out, resolved, device, threads)) as runner:
+            done.outcome = runner.outcome
+            runner.walk()
+
+
+@app.command()
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Say what is there, what is stale and why."""
     from splatpipe.pipeline.console import show_standings

@@ -35,7 +35,7 @@ Facts = dict[str, Any]
 FRUSTUM_PER_SPACING = 0.35  # depth of a drawn frustum over the distance to the next camera: they do not overlap
 FRUSTUM_COLOUR = (255, 140, 0, 255)
 GLTF_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # +Z up to glTF's +Y up
-VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy")
+VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy", "pyproj")
 
 
 def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -214,6 +214,7 @@ def collect_metrics(inputs: Inputs, plan: Facts, points: Points, registered: int
         "test_views": measured["test_views"],
         **measured["mean"],
         "floaters": measured["floaters"],
+        "accuracy": measured["accuracy"],
         "per_view": measured["per_view"],
         "seed": plan["options"]["seed"],
         "device": train.get("device"),

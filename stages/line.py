@@ -332,8 +332,8 @@ GEOREF = Stage(
     "georef",
     version=1,
     config=GeorefConfig,
-    reads=("sparse.model", "ingest.positions", "ingest.photos", "source.control"),
-    parts={"frame": "frame.json", "model": "sparse/0"},
+    reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
+    parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
     entry="splatpipe.stages.georef:run",
     files={"control": NamedFile("source.control", ("gcp_list.txt", "control.csv"))},
 )
@@ -374,9 +374,17 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=5,
+    version=6,
     config=EvaluateConfig,
-    reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
+    reads=(
+        "train.model",
+        "train.plan",
+        "train.sky",
+        "undistort.dataset",
+        "georef.frame",
+        "georef.control",
+        "georef.accuracy",
+    ),
     parts={"metrics": "metrics.json", "views": "views"},
     entry="splatpipe.stages.evaluate:run",
 )

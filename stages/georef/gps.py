@@ -15,7 +15,6 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
-from splatpipe.pipeline.scene.crs_names import parse_vertical
 from splatpipe.pipeline.scene.frames import Frame
 from splatpipe.pipeline.scene.geodesy import Origin
 from splatpipe.stages.georef.flights import (
@@ -43,16 +42,8 @@ class NoPlaceError(Exception):
     """The positions do not determine the frame; the text is the reason, a sentence without its full stop."""
 
 
-def georeference(
-    model: SparseModel, positions: Positions, max_error_m: float, vertical: str = "auto"
-) -> tuple[Frame, SimilarityFit]:
-    """The frame from positions.
-
-    Args:
-        model: The sparse model.
-        positions: What ingest found.
-        max_error_m: Positions further than this from the fit take no part in it.
-        vertical: The heights' datum, where it is declared; `auto` for what the positions declare.
+def georeference(model: SparseModel, positions: Positions, max_error_m: float) -> tuple[Frame, SimilarityFit]:
+    """The frame from positions, in the vertical datum that these declare.
 
     Raises:
         NoPlaceError: if they do not determine one.
@@ -82,7 +73,7 @@ def georeference(
     note = f"From the positions of {len(names) - len(left_out)} photos"
     note += f"; the rotation that they leave free is from {prior_note}." if fit.used_prior else "."
     residuals = {**_residuals(names, fit), "flights": flights_json(records, points, fit)}
-    datum = declared_datum(records, points) if vertical == "auto" else parse_vertical(vertical)
+    datum = declared_datum(records, points)
     return Frame("enu", fit.similarity, origin, datum, residuals, tuple(sorted(left_out + wrong)), note), fit
 
 
