@@ -239,7 +239,13 @@ def _quiet_group(source: pyproj.CRS, latitude: float, longitude: float) -> Trans
     area = AreaOfInterest(longitude - AROUND_DEG, south, longitude + AROUND_DEG, north)
     with warnings.catch_warnings():  # that a grid is missing: it is told by an error of our own
         warnings.simplefilter("ignore", UserWarning)
-        return TransformerGroup(source, WGS84_3D, always_xy=True, area_of_interest=area, allow_ballpark=False)
+        return TransformerGroup(
+            source,
+            WGS84_3D,
+            always_xy=True,
+            area_of_interest=area,  # type: ignore[arg-type]  # pyproj's stub has a class of its own for it
+            allow_ballpark=False,
+        )
 
 
 def _rough_place(points: Float64[np.ndarray, "n 3"], crs: Crs) -> tuple[float, float]:

@@ -104,6 +104,18 @@ def parse_vertical(text: str) -> str:
     return f"EPSG:{int(match[1])}"
 
 
+def checked(text: str, kind: str) -> str:
+    """The shortest statement of a CRS (``kind`` is ``crs``) or of a vertical datum, for a configuration's validator.
+
+    Raises:
+        ValueError: if it is none, with the hint.
+    """
+    try:
+        return parse_crs(text).text if kind == "crs" else parse_vertical(text)
+    except SplatpipeError as error:
+        raise ValueError(f"{error.message} {error.hint}".rstrip(".")) from error
+
+
 def utm_of(latitude: float, longitude: float) -> Crs:
     """The UTM zone (WGS 84) of a place, by EPSG's bounds of 6°; beyond 84° N and 80° S the polar stereographic UPS."""
     if latitude > 84.0 or latitude < -80.0:
