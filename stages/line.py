@@ -288,6 +288,7 @@ INGEST = Stage(
     reads=("source.photos", "source.geo"),
     parts={"photos": "photos", "cameras": "cameras.json", "positions": "positions.json", "left_out": "left_out.json"},
     entry="splatpipe.stages.ingest:run",
+    borrows=("georef.approximate_crs",),
     files={"positions": NamedFile("source.geo", ("geo.txt", "positions.csv"))},
 )
 FEATURES = Stage(

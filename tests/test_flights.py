@@ -141,3 +141,24 @@ def test_swapped_latitude_and_longitude_of_all_photos_is_told(tmp_path: Path) ->
     frame, _, warnings = georef(scene, tmp_path)
     assert frame.kind == "arbitrary"
     assert any("latitude and longitude swapped" in warning for warning in warnings)
+
+
+def test_the_frame_has_the_datum_that_its_leading_positions_declare(tmp_path: Path) -> None:
+    scene = two_flights((0.0, 0.0, 47.0))
+    for index, record in enumerate(scene.positions):
+        record["vertical"] = "ellipsoidal" if index >= 24 else "unknown"
+        if index >= 24:
+            record |= {"sigma_horizontal_m": 0.2, "sigma_vertical_m": 0.3}
+    frame, _, _ = georef(scene, tmp_path)
+    assert frame.vertical_datum == "ellipsoidal"
+    assert frame.residuals["flights"][1]["apart"] == [False, False]
+    lifted = errors_m(frame, scene)
+    np.testing.assert_allclose(lifted, 47.0, atol=1.0)
+
+
+def test_a_declared_datum_comes_before_what_photos_declare(tmp_path: Path) -> None:
+    scene = survey(grid())
+    for record in scene.positions:
+        record["vertical"] = "ellipsoidal"
+    frame, _, _ = georef(scene, tmp_path, vertical="EPSG:5773")
+    assert frame.vertical_datum == "EPSG:5773"

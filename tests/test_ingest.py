@@ -75,11 +75,12 @@ class Result:
         return decode_mask(self.photos[name], self.out / "photos")
 
 
-def ingest(folder: Path, threads: int = 2, out: str = "out", **options: object) -> Result:
+def ingest(folder: Path, threads: int = 2, out: str = "out", geo: Path | None = None, **options: object) -> Result:
     target = folder.parent / out
     target.mkdir()
     notes = Notes()
-    summary = run(IngestConfig(**options), Inputs({}, folder, {}, Machine(threads=threads)), target, notes)
+    inputs = Inputs({"source.geo": geo or folder.parent / "no-geo.txt"}, folder, {}, Machine(threads=threads))
+    summary = run(IngestConfig(**options), inputs, target, notes)
     return Result(summary, target, folder, notes.warnings)
 
 

@@ -84,7 +84,7 @@ def accuracy_json(survey: Survey | None, site: Site | None, placed: Placed, gsd:
             {"flight": number, "photos": int((stations.group == k).sum()), "offset_m": placed.offsets[k].tolist()}
             for k, number in enumerate(stations.flights)
         ]
-        tables["gps"] = {**(table or {}), "flights": flights}
+        tables["gps"] = None if table is None else {**table, "flights": flights}
     if survey is not None and site is not None:
         for role in ("control", "check"):
             errors = [
@@ -96,8 +96,7 @@ def accuracy_json(survey: Survey | None, site: Site | None, placed: Placed, gsd:
                 for k, point in enumerate(survey.points)
                 if point.role == role and point.found is not None
             ]
-            if errors:
-                tables[role] = accuracy_table(np.array(errors))
+            tables[role] = accuracy_table(np.array(errors, dtype=np.float64).reshape(-1, 3))
     return {"gsd_m": gsd, "tables": tables}
 
 

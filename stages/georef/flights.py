@@ -12,6 +12,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.scene.alignment import Correspondences, Shared, SimilarityFit, offset_step_sigmas
+from splatpipe.pipeline.scene.crs_names import UNKNOWN
 
 LEAST_PHOTOS = 3  # of a flight with an offset of its own; fewer say nothing about it
 APART_SIGMAS = 3.0  # flights that differ by more do not differ by their receivers' errors: another datum, another base
@@ -44,6 +45,18 @@ def reference_flight(points: Correspondences) -> int:
     counts = points.shared.membership().sum(axis=1)
     accuracy = np.linalg.norm(points.shared.sigmas, axis=1)
     return int(np.lexsort((-counts, accuracy))[0])
+
+
+def declared_datum(records: Sequence[Mapping[str, Any]], points: Correspondences) -> str:
+    """The vertical datum that the positions which set the frame's heights declare; ``unknown`` where they do not agree.
+
+    These are the reference flight's, where there are several.
+    """
+    leading = np.ones(len(records), dtype=bool)
+    if points.shared is not None:
+        leading = points.shared.group == reference_flight(points)
+    datums = {record.get("vertical", UNKNOWN) for record, leads in zip(records, leading, strict=True) if leads}
+    return str(datums.pop()) if len(datums) == 1 else UNKNOWN
 
 
 def unbound(points: Correspondences) -> Correspondences:

@@ -17,7 +17,14 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.scene.frames import Frame
 from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.stages.georef.flights import bound, flights_json, shared_errors, tell_flights_apart, unbound
+from splatpipe.stages.georef.flights import (
+    bound,
+    declared_datum,
+    flights_json,
+    shared_errors,
+    tell_flights_apart,
+    unbound,
+)
 from splatpipe.stages.georef.level import Positions, direction_prior
 from splatpipe.stages.georef.model import SparseModel
 
@@ -36,7 +43,7 @@ class NoPlaceError(Exception):
 
 
 def georeference(model: SparseModel, positions: Positions, max_error_m: float) -> tuple[Frame, SimilarityFit]:
-    """The frame from positions.
+    """The frame from positions, in the vertical datum that these declare.
 
     Raises:
         NoPlaceError: if they do not determine one.
@@ -66,7 +73,8 @@ def georeference(model: SparseModel, positions: Positions, max_error_m: float) -
     note = f"From the positions of {len(names) - len(left_out)} photos"
     note += f"; the rotation that they leave free is from {prior_note}." if fit.used_prior else "."
     residuals = {**_residuals(names, fit), "flights": flights_json(records, points, fit)}
-    return Frame("enu", fit.similarity, origin, "unknown", residuals, tuple(sorted(left_out + wrong)), note), fit
+    datum = declared_datum(records, points)
+    return Frame("enu", fit.similarity, origin, datum, residuals, tuple(sorted(left_out + wrong)), note), fit
 
 
 def _bound(points: Correspondences, max_error_m: float) -> Correspondences:

@@ -30,8 +30,9 @@ from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
 from splatpipe.stages.ingest.convert import convert_photo, save_png, scale_of
 from splatpipe.stages.ingest.duplicates import split_duplicates
 from splatpipe.stages.ingest.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
-from splatpipe.stages.ingest.positions import DATUM_STEP_M, PositionList, positions_json, read_positions
+from splatpipe.stages.ingest.positions import DATUM_STEP_M, NOWHERE, PositionList, positions_json, read_positions
 from splatpipe.stages.ingest.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan, scan_folder
+from splatpipe.stages.ingest.stated import FilePlace, read_places
 from splatpipe.stages.line import IngestConfig
 
 MIN_PHOTOS = 2
@@ -90,7 +91,8 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         others = [entry.name for entry in left_out]
         masked = _mask(_MASKS, root, photos, others, opacity, work)
         skies = _mask(_SKIES, root, photos, others, {}, work)
-    positions = read_positions(photos)
+    places = _places(inputs, photos, report)
+    positions = read_positions(photos, places)
     _tell_positions(positions, report)
     if colmap_model(inputs.photos_dir) is None:  # a given model has its calibration
         _tell_focal(groups, report)
@@ -239,10 +241,39 @@ def _tell_left_out(left_out: Sequence[LeftOut], report: Reporter) -> None:
         report.warning(f"Left out: {_names(names)} {reason}.")
 
 
+def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) -> Mapping[str, FilePlace]:
+    """What the file of positions says, where there is one."""
+    path = inputs["source.geo"]
+    if not path.is_file():
+        return {}
+    approximate = bool(inputs.settings.get("georef.approximate_crs", False))
+    places = read_places(path, [photo.name for photo in photos], approximate=approximate)
+    report.note(f"{path.name}: positions of {len(places.by_name)} of {len(photos)} photos, in {places.note}.")
+    if places.unknown:
+        report.warning(
+            f"{path.name} names photos that are not there, or twice: {_names(places.unknown)}.",
+            "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
+        )
+    others = [photo.name for photo in photos if photo.name not in places.by_name and photo.exif.gps is not None]
+    if others:
+        report.warning(
+            f"{path.name} does not name {_names(others)}: their own positions count, as a flight of its own.",
+            "Add them to the file if it has better ones.",
+        )
+    return places.by_name
+
+
 def _tell_positions(positions: PositionList, report: Reporter) -> None:
     if positions.impossible:
         report.warning(
             f"The position is none that can be on Earth: {_names(positions.impossible)}.",
+            "These photos take part without their position.",
+        )
+    elsewhere = [f"{_shown(name)} {why}" for name, why in positions.wrong.items() if why != NOWHERE]
+    if elsewhere:
+        more = f"; and {len(elsewhere) - NAMES_SHOWN} more" if len(elsewhere) > NAMES_SHOWN else ""
+        report.warning(
+            f"Positions that cannot be right: {'; '.join(elsewhere[:NAMES_SHOWN])}{more}.",
             "These photos take part without their position.",
         )
     step = positions.altitude_step_m
