@@ -605,6 +605,23 @@ def test_positions_angles_and_sigmas_are_read(folder: Path) -> None:
     assert (found["float.jpg"]["rtk"], found["float.jpg"]["sigma_horizontal_m"]) == ("float", 0.5)
 
 
+def test_the_file_of_positions_counts_and_says_so(folder: Path, tmp_path: Path) -> None:
+    save(folder / "c.jpg", 3, exif=drone_exif(gps_of(46.5, -91.5, 198.5)))
+    geo = tmp_path / "geo.txt"
+    geo.write_text("EPSG:4326\na.jpg -91.5001 46.5001 199 0 0 0 0.02 0.03\nz.jpg -91.5 46.5 199\n")
+    result = ingest(folder, geo=geo)
+    found = {str(record["name"]): record for record in result.json("positions.json")["positions"]}
+    assert (found["a.jpg"]["source"], found["c.jpg"]["source"]) == ("file", "exif")
+    assert found["a.jpg"]["flight"] != found["c.jpg"]["flight"]
+    assert (found["a.jpg"]["latitude"], found["a.jpg"]["sigma_horizontal_m"]) == (pytest.approx(46.5001), 0.02)
+    assert (result.summary["position_sources"], result.summary["sigma_sources"]) == (
+        ["exif", "file"],
+        ["default", "file"],
+    )
+    assert any("not there, or twice: z.jpg" in warning for warning in result.warnings)
+    assert any("does not name c.jpg" in warning for warning in result.warnings)
+
+
 def test_impossible_positions_are_left_out_and_named(folder: Path) -> None:
     save(folder / "zero.jpg", 3, exif=drone_exif(gps_of(0.0, 0.0, 0.0)))
     save(folder / "north.jpg", 4, exif=drone_exif(gps_of(91.0, 10.0, 0.0)))

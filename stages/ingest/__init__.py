@@ -105,7 +105,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "left_out": len(left_out),
         "cameras": len(groups),
         "focal_sources": sorted({group.focal_source for group in groups}),
-        "positions": len(positions.positions),
+        **_accuracy(positions),
         "masks": len(masked),
         "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
@@ -261,6 +261,21 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
             "Add them to the file if it has better ones.",
         )
     return places.by_name
+
+
+def _accuracy(positions: PositionList) -> dict[str, JSON]:
+    """How many positions there are, in how many flights, from where, and how accurate they count as."""
+    stated = positions.positions
+    if not stated:
+        return {"positions": 0}
+    return {
+        "positions": len(stated),
+        "position_sources": sorted({each.source for each in stated}),
+        "flights": len({each.flight for each in stated}),
+        "sigma_horizontal_m": float(np.median([each.sigma_horizontal_m for each in stated])),
+        "sigma_vertical_m": float(np.median([each.sigma_vertical_m for each in stated])),
+        "sigma_sources": sorted({each.sigma_source for each in stated}),
+    }
 
 
 def _tell_positions(positions: PositionList, report: Reporter) -> None:

@@ -139,8 +139,8 @@ def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], di
     for photo in photos:
         exif = photo.exif
         focal_mm = round(exif.focal_mm, 2) if exif.focal_mm is not None else None
-        key = (exif.make, exif.model, photo.width, photo.height, focal_mm, exif.focal_35mm)
-        key += (photo.xmp.get("drone-dji:DewarpFlag") == "1",)
+        dewarped = photo.xmp.get("drone-dji:DewarpFlag") == "1"
+        key = (exif.make, exif.model, photo.width, photo.height, focal_mm, exif.focal_35mm, dewarped)
         members.setdefault(key, []).append(photo)
     groups = [_group(list(group)) for group in members.values()]
     index = {photo.name: number for number, group in enumerate(members.values()) for photo in group}
