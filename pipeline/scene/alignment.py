@@ -366,10 +366,10 @@ def _triples(points: Correspondences) -> np.ndarray:
 
 def _triples_of(indices: np.ndarray, most: int) -> np.ndarray:
     if math.comb(len(indices), 3) <= most:
-        return indices[np.array(list(itertools.combinations(range(len(indices)), 3)))]
+        return np.asarray(indices[np.array(list(itertools.combinations(range(len(indices)), 3)))])
     generator = np.random.Generator(np.random.PCG64(0))
     draws = [generator.choice(len(indices), 3, replace=False, shuffle=False) for _ in range(most)]
-    return indices[np.stack(draws)]
+    return np.asarray(indices[np.stack(draws)])
 
 
 def _closed_form(points: Correspondences, weights: Float64[np.ndarray, " n"]) -> Similarity:
