@@ -1,8 +1,8 @@
 """How accurate the splat itself is: surveyed points against where its own depth puts them.
 
 Each observed pixel of a surveyed point is unprojected at the trained model's rendered median depth; the median over the
-photos, a coordinate at a time, is compared with the survey. Photos that were held out of training speak where they see
-the point: the others' pixels were fitted.
+photos, a coordinate at a time, is compared with the survey. Photos that were held out of training speak alone where
+enough of them see the point: the others' pixels were fitted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from splatpipe.pipeline.scene.frames import Frame, load_frame
 from splatpipe.pipeline.scene.names import NameFinder
 
 ONE_SURFACE = 0.02  # of the depth, between neighbouring pixels: ground at a slant has less, an edge far more
+ENOUGH = 3  # held-out photos of a point: of two, a single floater moves the median by half of its distance
 DIGITS = 5  # of lengths in metres: a hundredth of a millimetre
 DepthMap = Float[np.ndarray, "h w"]
 
@@ -147,9 +148,9 @@ def depth_at(depth: DepthMap, pixel: Float64[np.ndarray, " 2"]) -> float | None:
 
 
 def _chosen(point: Surveyed, held_out: Sequence[str]) -> list[Observation]:
-    """Those in held-out photos; all of them where there are none."""
+    """Those in held-out photos; all of them where these are too few for a median."""
     unseen = [seen for seen in point.observations if seen.photo in set(held_out)]
-    return unseen or list(point.observations)
+    return unseen if len(unseen) >= ENOUGH else list(point.observations)
 
 
 def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Frame) -> list[dict[str, Any]]:
@@ -166,7 +167,8 @@ def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Fram
 def _splat(
     points: Sequence[Surveyed], places: Mapping[str, list[dict[str, Any]]], held_out: set[str]
 ) -> dict[str, Any]:
-    told, residuals = [], {"control": [], "check": []}
+    told: list[dict[str, Any]] = []
+    residuals: dict[str, list[Float64[np.ndarray, " 3"]]] = {"control": [], "check": []}
     for point in points:
         found = places[point.name]
         entry: dict[str, Any] = {"name": point.name, "role": point.role, "estimated_m": None, "residual_m": None}
@@ -175,7 +177,7 @@ def _splat(
             entry |= {"estimated_m": _rounded(estimated), "residual_m": _rounded(estimated - point.place_m)}
             if point.role in residuals:
                 residuals[point.role].append(estimated - point.place_m)
-        entry["held_out"] = bool(found) and found[0]["photo"] in held_out
+        entry["held_out"] = bool(found) and all(seen["photo"] in held_out for seen in found)
         entry["observations"] = [
             {
                 "photo": seen["photo"],

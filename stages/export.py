@@ -24,7 +24,7 @@ from splatpipe.pipeline.scene.dataset import Points, load_points, load_views
 from splatpipe.pipeline.scene.dome import sky_dome
 from splatpipe.pipeline.scene.frames import Frame, load_frame
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.georeference import georeference, scene_box
+from splatpipe.pipeline.scene.georeference import georeference, scene_box, told_in_a_line
 from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import ExportConfig
@@ -68,7 +68,10 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))
     centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
     box = scene_box(frame.world_from_model.apply(points.xyz), centres)
-    _write_json(out / "georef.json", georeference(frame, box))
+    placed = georeference(frame, box)
+    _write_json(out / "georef.json", placed)
+    if frame.origin is not None:
+        report.note(told_in_a_line(placed))
     report.progress(2, 3, "collecting the figures", "files")
     figures = collect_metrics(inputs, plan, points, len(cameras), len(gaussians))
     _write_json(out / "metrics.json", figures)
@@ -105,7 +108,7 @@ def ply_comments(frame: Frame, antialias: bool) -> list[str]:
     return [
         *comments,
         "frame: local east north up, metres",
-        f"origin: {where} (latitude longitude in degrees, height in metres, WGS 84 / EPSG:4979)",
+        f"origin: {where} (latitude longitude in degrees, WGS 84; height in metres, in the vertical datum)",
         f"vertical datum: {frame.vertical_datum}",
         f"crs: {frame.crs or utm_of(origin.latitude, origin.longitude).text} (see georef.json)",
     ]

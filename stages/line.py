@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
@@ -74,7 +74,8 @@ class GeorefConfig(StageConfig):
     vertical: Annotated[str, Field(max_length=40)] = "auto"
     """Vertical datum of the photos' heights: `ellipsoidal`, `EPSG:n` or `unknown`. Auto: what the files declare."""
     approximate_crs: bool = False
-    """Take a CRS though the grid of its best way to WGS 84 is missing; what that costs is stated in `georef.json`."""
+    """Take a CRS though the grid of its best way to WGS 84 is missing, or EPSG knows none from its (modern) datum; what
+    that costs is stated in `georef.json`."""
     pixel_origin: Literal["corner", "centre"] = "corner"
     """What the pixel coordinates (0, 0) of marks mean: the top-left corner of the first pixel, or its centre."""
     check_points: Annotated[str, Field(max_length=20_000)] = "auto"
@@ -91,29 +92,15 @@ class GeorefConfig(StageConfig):
     """`auto`: control enters a bundle adjustment; where it moves what the photos show by half a pixel or more, the bent
     model is used. `off`: it only places the model."""
 
-    @field_validator("crs")
+    @field_validator("crs", "vertical")
     @classmethod
-    def _known_crs(cls, text: str) -> str:
-        return _known_name(text, "parse_crs")
+    def _known(cls, text: str, field: Any) -> str:
+        """Told now, not after hours; PROJ is only loaded where something is named."""
+        if text.strip().lower() == "auto":
+            return "auto"
+        from splatpipe.pipeline.scene.crs_names import checked
 
-    @field_validator("vertical")
-    @classmethod
-    def _known_vertical(cls, text: str) -> str:
-        return _known_name(text, "parse_vertical")
-
-
-def _known_name(text: str, parser: str) -> str:
-    """``auto``, or what PROJ knows: told now, not after hours; PROJ itself is only loaded where something is named."""
-    if text.strip().lower() == "auto":
-        return "auto"
-    from splatpipe.pipeline.engine.errors import SplatpipeError
-    from splatpipe.pipeline.scene import crs_names
-
-    try:
-        known = getattr(crs_names, parser)(text)
-    except SplatpipeError as error:
-        raise ValueError(f"{error.message} {error.hint}".rstrip(".")) from error
-    return known if isinstance(known, str) else str(known.text)
+        return checked(text, str(field.field_name))
 
 
 class UndistortConfig(StageConfig):

@@ -15,6 +15,7 @@ import pytest
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Summary
 from splatpipe.pipeline.scene.confidence import chi_squared_cdf, chi_squared_quantile, rmse_interval
+from splatpipe.pipeline.scene.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.scene.frames import load_frame
 from splatpipe.stages.georef import run
 from splatpipe.stages.line import GeorefConfig
@@ -214,6 +215,7 @@ def test_doming_of_a_wrong_lens_is_straightened_by_control(tmp_path: Path) -> No
     assert horizontal < result.gsd_m
     focal = pycolmap.Reconstruction(result.out / "sparse" / "0").cameras[1].params[0]
     assert focal == pytest.approx(LENS[0], rel=0.01)
+    assert result.summary["focal_held"] == []
 
 
 def made_up(model: pycolmap.Reconstruction) -> list[Row]:
@@ -231,6 +233,46 @@ def made_up(model: pycolmap.Reconstruction) -> list[Row]:
         if photo["name"] in NADIR and 0.0 < pixel[0] < 1200.0 and 0.0 < pixel[1] < 900.0:
             found.append(Row("Q1", place, photo["name"], pixel))
     return found
+
+
+def test_blunder_that_doming_hides_is_found_by_the_adjustment(tmp_path: Path) -> None:
+    """A similarity misses every point by decimetres; the adjustment only the wrong one."""
+    domed = adjusted(true_model(NADIR), LENS[0] * 1.03, 0.0)
+    lines = [
+        replace(row, place=(*row.place[:2], row.place[2] + 0.5)) if row.name == "P05" else row
+        for row in rows(GROUND_AND_ROOF, NADIR)
+    ]
+    control = ("P01", "P03", "P05", "P07", "P16", "P08")
+    result = georef(
+        tmp_path, domed, gcp_list(lines), check_points=checks(*(n for n in GROUND_AND_ROOF if n not in control))
+    )
+    assert result.roles()["P05"] == "left_out"
+    assert [w for w in result.told.warnings if "Control point P05 is left out" in w and "field book" in w]
+    assert result.table("check")["rmse_up_m"] <= 1.5 * result.gsd_m
+
+
+def flat_nadir() -> pycolmap.Reconstruction:
+    """The nadir strips over ground without relief: a longer lens from higher up makes the same photos."""
+    return adjusted(true_model(NADIR, flat=True))
+
+
+def test_posterior_tells_which_photos_know_their_focal_length(whole: pycolmap.Reconstruction) -> None:
+    before = np.array(whole.cameras[1].params)
+    assert focal_sigmas(whole)[1] < 0.1 * UNOBSERVED
+    assert focal_sigmas(flat_nadir())[1] > UNOBSERVED
+    np.testing.assert_array_equal(whole.cameras[1].params, before)
+
+
+def test_focal_length_that_nothing_tells_is_held_near_the_metadata(tmp_path: Path) -> None:
+    """Control on the flat ground does not tell it either; the metadata say 853 pixels, the model 10 % more."""
+    flat = adjusted(true_model(NADIR, flat=True), LENS[0] * 1.1, LENS[3])
+    ground = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08")
+    result = georef(tmp_path, flat, gcp_list(rows(ground, NADIR)), check_points="none")
+    assert [w for w in result.told.warnings if "tell the focal length" in w]
+    assert result.summary["focal_held"] == [1]
+    if result.summary["model_bent"]:
+        focal = pycolmap.Reconstruction(result.out / "sparse" / "0").cameras[1].params[0]
+        assert focal == pytest.approx(853.0, rel=0.031)
 
 
 def test_bent_model_is_the_same_bits_again(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,17 @@ def georeference(frame: Frame, box: Float64[np.ndarray, "2 3"]) -> dict[str, Any
         **_matrices(world, box),
         "lengths": _lengths(world),
     }
+
+
+def told_in_a_line(georeferenced: Mapping[str, Any]) -> str:
+    """In what CRS and by which operation, a sentence or two, of a `georef.json` that has an origin."""
+    crs, operation = georeferenced["crs"], georeferenced["crs"]["operation"]
+    accuracy = "of unknown accuracy" if operation["accuracy_m"] is None else f"good to {operation['accuracy_m']:g} m"
+    best = "" if operation["best"] else "; a better one lacks its grid"
+    return (
+        f"Coordinates are in {crs['id']} ({crs['name']}), by {operation['name']}, {accuracy}{best}. "
+        f"Vertical datum: {georeferenced['vertical']['name']}. {operation['note']}"
+    ).strip()
 
 
 def _crs(world: World) -> dict[str, Any]:

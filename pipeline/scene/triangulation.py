@@ -60,7 +60,7 @@ class Rays:
 
     def centres(self) -> Float64[np.ndarray, "n 3"]:
         """Of the cameras, in the world."""
-        return -np.einsum("nji,nj->ni", self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3])
+        return np.asarray(-np.einsum("nji,nj->ni", self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]))
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ class World:
         if self.heights == self.vertical or same_datum(self.heights, self.vertical):
             return np.zeros(len(geodetic))
         place = geodetic[:, 0], geodetic[:, 1]
-        return undulation(self.vertical, *place) - undulation(self.heights, *place)
+        return np.asarray(undulation(self.vertical, *place) - undulation(self.heights, *place))
 
     def placement(self, box: Float64[np.ndarray, "2 3"]) -> Placement:
         """Where the local frame is on the earth.

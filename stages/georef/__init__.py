@@ -159,6 +159,8 @@ def _summary(frame: Frame, controlled: ByControl | None, accuracy: JSON) -> Summ
             "points_left_out": roles.count("left_out"),
             "model_bent": controlled.bent is not None,
             "moved_px": controlled.moved_px,
+            "focal_held": list(controlled.focal_held),
+            "control_sigmas_times": controlled.sigma_factor,
             "tables": accuracy["tables"],
         }
     return summary

@@ -20,16 +20,14 @@ import pycolmap
 import pycolmap.cost_functions
 from jaxtyping import Float64
 
+from splatpipe.pipeline.scene.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
 from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity
 from splatpipe.stages.georef.place import Stations
 
-LEAST_SIGMA_PX = 0.1
+LEAST_SIGMA_PX = 1.0  # of features: they err together, in one photo, by lens and shutter; control should not
 UNBOUND_M = 1e4  # sigma of a height that nobody measured
 FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
 DISTORTION_SIGMA = 0.2  # of a distortion coefficient about what SfM found
-MOST_DENSE = 60  # photos up to which the reduced system is solved densely
-MOST_ITERATIONS = 60
-FUNCTION_TOLERANCE = 1e-6
 ROUNDS = 10  # of reweighting
 
 
@@ -61,9 +59,10 @@ class Adjusted:
         places: Of the targets.
         normed: Root mean square of each target's distance to where it is surveyed, over its sigmas.
         offsets: Of the flights' positions: stated less true.
-        feature_sigma_px: Of the features, from their residuals.
-        focal_sigmas: Standard deviation of each camera's focal length, relative, by COLMAP's camera id; empty where it
-            could not be told.
+        feature_sigma_px: That the features were given.
+        focal_sigmas: Standard deviation of each camera's focal length, relative, by COLMAP's camera id, as the photos
+            and control tell it.
+        held: Cameras whose focal length nothing tells, so that it stays near its prior.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -72,6 +71,7 @@ class Adjusted:
     offsets: Float64[np.ndarray, "k 3"]
     feature_sigma_px: float
     focal_sigmas: Mapping[int, float]
+    held: tuple[int, ...]
 
 
 def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
@@ -111,20 +111,25 @@ def adjust(
         blocks.add_target(model, place, target)
     offsets = _add_stations(blocks, model, stations)
     _add_lens(blocks, model, focal_priors)
-    pyceres.solve(_options(model), problem, pyceres.SolverSummary())
+    pyceres.solve(solver_options(len(model.reg_image_ids())), problem, pyceres.SolverSummary())
+    focal_sigmas = posterior_focal_sigmas(model, problem)
+    held = [n for n, focal in focal_priors.items() if focal_sigmas.get(n, 0.0) > UNOBSERVED]
+    if held:
+        for number in held:
+            keep_near(problem, model.cameras[number], focal_priors[number], FOCAL_SIGMA)
+        pyceres.solve(solver_options(len(model.reg_image_ids())), problem, pyceres.SolverSummary())
     normed = np.array(
         [
             math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())
             for p, t in zip(places, targets, strict=True)
         ]
     )
-    focal_sigmas = _focal_sigmas(model, problem, sigma)
     model.update_point_3d_errors()
-    return Adjusted(model, places, normed, offsets, sigma, focal_sigmas)
+    return Adjusted(model, places, normed, offsets, sigma, focal_sigmas, tuple(held))
 
 
 def feature_sigma(model: pycolmap.Reconstruction) -> float:
-    """Standard deviation of the features' coordinates by their residuals, pixels."""
+    """Standard deviation of the features' coordinates by their residuals, at least a pixel."""
     errors = []
     for number in sorted(model.reg_image_ids()):
         image = model.images[number]
@@ -239,35 +244,6 @@ def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Map
         for index in camera.extra_params_idxs():
             sigmas[index] = DISTORTION_SIGMA
         blocks.add_prior(params, mean, sigmas)
-
-
-def _options(model: pycolmap.Reconstruction) -> Any:
-    options = pyceres.SolverOptions()
-    options.num_threads = 1
-    dense = len(model.reg_image_ids()) <= MOST_DENSE
-    options.linear_solver_type = (
-        pyceres.LinearSolverType.DENSE_SCHUR if dense else pyceres.LinearSolverType.SPARSE_SCHUR
-    )
-    options.max_num_iterations = MOST_ITERATIONS
-    options.function_tolerance = FUNCTION_TOLERANCE
-    options.minimizer_progress_to_stdout = False
-    options.logging_type = pyceres.LoggingType.SILENT
-    return options
-
-
-def _focal_sigmas(model: pycolmap.Reconstruction, problem: Any, sigma_px: float) -> dict[int, float]:
-    """Relative standard deviations of the focal lengths, everything else unknown, by the adjustment's normal matrix."""
-    options = pycolmap.BACovarianceOptions()
-    options.params = pycolmap.BACovarianceOptionsParams.ALL
-    covariance = pycolmap.estimate_ba_covariance_from_problem(options, model, problem)
-    if covariance is None:
-        return {}
-    result = {}
-    for number, camera in sorted(model.cameras.items()):
-        block = covariance.get_other_params_cov(camera.params)
-        if block is not None:
-            result[number] = sigma_px * math.sqrt(max(float(block[0, 0]), 0.0)) / camera.mean_focal_length()
-    return result
 
 
 def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> float:

@@ -35,8 +35,10 @@ from splatpipe.stages.line import GeorefConfig
 
 BENT_PX = 0.5  # what control has to move the photos' content by, root mean square, for the model to be worth bending
 QUIET = 2.0  # times the stated sigmas: control that is off by no more keeps them
-STRAINED = 4.0  # control that an adjustment leaves so many sigmas off is wrong
-LONELY = 3.0  # and alone with it where the others are quieter without it by this
+STRAY = 0.1  # of a focal length from its prior: worth a warning
+SUSPICIOUS = 1.0  # with sigmas that are none too small, sound control stays well below
+LONELY = 3.0  # a point is off alone where the others are quieter without it by this
+SUSPECTS = 3  # points that are tried so, those with the largest residuals
 ROUNDS = 4  # of adjustment, each with the control that the one before showed to be wrong or less accurate
 
 
@@ -69,6 +71,7 @@ class ByControl:
         bent: It, where control bent it; None where the model stays as it was.
         moved_px: How far control moved what the photos show; None where nothing was adjusted.
         sigma_factor: What the control's stated or assumed sigmas were multiplied by.
+        focal_held: COLMAP's ids of cameras whose focal length neither photos nor control tell.
     """
 
     frame: Frame
@@ -78,6 +81,7 @@ class ByControl:
     bent: pycolmap.Reconstruction | None
     moved_px: float | None
     sigma_factor: float
+    focal_held: tuple[int, ...] = ()
 
 
 def place_by_control(
@@ -113,7 +117,8 @@ def place_by_control(
             result = _adjusted(result, capture, config, report)
         else:
             report.warning("A model with camera rigs is placed by control, but not adjusted to it.")
-    if result.bent is None and result.sigma_factor > 1.0:
+    if result.bent is None:  # with what the adjustment found of the control
+        observed = observed_in(site, result.survey, model, start[0].scale, config.mark_sigma_px)
         observed = with_sigmas_times(observed, result.sigma_factor)
         fit = fit_jointly(fit.similarity, observed, start[1])
         placed = Placed(model, fit.similarity, fit.offsets)
@@ -136,35 +141,69 @@ def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, confi
     return Frame("enu", fit.similarity, site.origin, vertical, residuals, left_out, note)
 
 
-def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report: Reporter) -> ByControl:
-    """The result with the model that an adjustment bends, where that moves what the photos show."""
-    survey, factor = result.survey, 1.0
-    done: Adjusted | None = None
-    for turn in range(ROUNDS):
-        chosen = _chosen(survey)
-        if len(chosen) < MIN_CONTROL:
-            break
-        done = _adjust(survey, chosen, factor, result, capture, config)
-        coordinates = np.array([3 if survey.points[k].surveyed.z is not None else 2 for k in chosen])
-        noise = _noise(done.normed, coordinates)
-        if turn == ROUNDS - 1 or noise <= QUIET:
-            break
-        strained = _strained(done, coordinates)
-        if strained is None:
-            factor *= noise
+@dataclass(frozen=True)
+class _Settled:
+    """An adjustment with the control that it believes."""
+
+    survey: Survey
+    done: Adjusted
+    factor: float
+    noise: float
+
+
+def _settle(result: ByControl, capture: Capture, config: GeorefConfig, report: Reporter) -> _Settled:
+    """Adjust until the control agrees: without a point that alone is off, else with larger sigmas."""
+    best = _try(result.survey, 1.0, result, capture, config)
+    for _ in range(ROUNDS):
+        better = _without_one(best, result, capture, config) if best.noise > SUSPICIOUS else None
+        if better is None:
+            if best.noise <= QUIET:
+                break
+            best = _try(best.survey, best.factor * best.noise, result, capture, config)
             continue
-        point = survey.points[chosen[strained]]
-        off = float(np.linalg.norm(done.places[strained] - result.site.targets.enu[chosen[strained]]))
+        index, off, best = better
+        point = best.survey.points[index]
         report.warning(
-            f"Control point {point.name} is left out: the adjustment keeps it {off:.2f} m from where it is surveyed,"
-            f" {done.normed[strained]:.0f} times its standard deviation.",
+            f"Control point {point.name} is left out: adjusted to the others, the photos have it {off:.2f} m from where"
+            " it is surveyed.",
             "Compare its coordinates and its marks with the field book, correct the file, and run again.",
         )
-        points = list(survey.points)
-        points[chosen[strained]] = point.left_out(f"the adjustment keeps it {off:.2f} m from where it is surveyed")
-        survey = survey.with_points(points)
-    if done is None:
-        return result
+    return best
+
+
+def _try(survey: Survey, factor: float, result: ByControl, capture: Capture, config: GeorefConfig) -> _Settled:
+    chosen = _chosen(survey)
+    done = _adjust(survey, chosen, factor, result, capture, config)
+    coordinates = np.array([3 if survey.points[k].surveyed.z is not None else 2 for k in chosen], dtype=np.int64)
+    return _Settled(survey, done, factor, _noise(done.normed, coordinates))
+
+
+def _without_one(
+    settled: _Settled, result: ByControl, capture: Capture, config: GeorefConfig
+) -> tuple[int, float, _Settled] | None:
+    """The point without which the others agree, how far it is off then, and the adjustment; None if there is none."""
+    chosen = _chosen(settled.survey)
+    if len(chosen) <= MIN_CONTROL:
+        return None
+    for worst in np.argsort(-settled.done.normed, kind="stable")[:SUSPECTS].tolist():
+        index = chosen[worst]
+        points = list(settled.survey.points)
+        points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
+        rest = _try(settled.survey.with_points(points), settled.factor, result, capture, config)
+        if rest.noise <= settled.noise / LONELY:
+            model = model_of(rest.done.reconstruction, capture.photos)
+            found = locate(settled.survey.points[index], model, capture.photos, config.mark_sigma_px).found
+            if found is not None:
+                known = np.isfinite(result.site.targets.sigmas[index])
+                off = float(np.linalg.norm((found.xyz - result.site.targets.enu[index])[known]))
+                return index, off, rest
+    return None
+
+
+def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report: Reporter) -> ByControl:
+    """The result with the model that an adjustment bends, where that moves what the photos show."""
+    settled = _settle(result, capture, config, report)
+    survey, done, factor = settled.survey, settled.done, settled.factor
     if factor > 1.0:
         worth = factor * float(np.median(result.site.targets.sigmas[_chosen(survey), 0]))
         report.warning(
@@ -172,8 +211,9 @@ def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report:
             " they are stated or taken to be worth: their standard deviations are raised by that.",
             "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… says what they are worth.",
         )
+    _tell_lens(done, capture, report)
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
-    result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor)
+    result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held)
     if moved < BENT_PX:
         return result
     report.note(f"Control moves what the photos show by {moved:.1f} px: the model is bent to it, and trained anew.")
@@ -190,19 +230,27 @@ def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report:
     return replace(result, survey=survey.with_points(points), placed=placed, bent=bent)
 
 
+def _tell_lens(done: Adjusted, capture: Capture, report: Reporter) -> None:
+    """Warn of focal lengths that nothing tells, and of those that control takes far from what the metadata say."""
+    for number, camera in sorted(done.reconstruction.cameras.items()):
+        prior = capture.focal_priors.get(number)
+        if number in done.held:
+            report.warning(
+                f"Neither the photos nor the control tell the focal length (to {done.focal_sigmas[number]:.1%}):"
+                " it stays within 3 % of what the metadata say.",
+                "Add control at another height, or oblique photos, for heights to be trusted.",
+            )
+        elif prior is not None and abs(camera.mean_focal_length() / prior - 1.0) > STRAY:
+            report.warning(
+                f"Control takes the focal length from {prior:.0f} to {camera.mean_focal_length():.0f} pixels,"
+                " more than 10 % from what the metadata say.",
+                "Was it another lens, or are the photos cropped? Check heights against known ones.",
+            )
+
+
 def _noise(normed: Float64[np.ndarray, " n"], coordinates: Int64[np.ndarray, " n"]) -> float:
     """Of control over its sigmas, by the degrees of freedom that a similarity leaves."""
     return math.sqrt(float((coordinates * normed**2).sum()) / max(int(coordinates.sum()) - SIMILARITY, 1))
-
-
-def _strained(done: Adjusted, coordinates: Int64[np.ndarray, " n"]) -> int | None:
-    """The one control point that is off where the others are not."""
-    worst = int(np.argmax(done.normed))
-    others = np.arange(len(coordinates)) != worst
-    if len(coordinates) <= MIN_CONTROL or done.normed[worst] <= STRAINED:
-        return None
-    alone = _noise(done.normed[others], coordinates[others]) < _noise(done.normed, coordinates) / LONELY
-    return worst if alone else None
 
 
 def _chosen(survey: Survey) -> list[int]:

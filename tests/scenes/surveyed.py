@@ -57,10 +57,15 @@ def surface_points(count: int, seed: int = 0) -> tuple[Array, Array]:
     return places, normals[chosen] / areas[chosen, None]
 
 
-def true_model(photos: Sequence[str] | None = None, points: int = 1500, seed: int = 0) -> pycolmap.Reconstruction:
-    """Exact cameras and points, their features seen with noise, in the true world."""
+def true_model(
+    photos: Sequence[str] | None = None, points: int = 1500, seed: int = 0, flat: bool = False
+) -> pycolmap.Reconstruction:
+    """Exact cameras and points, their features seen with noise, in the true world; or over flat ground alone."""
     rng = np.random.default_rng(seed)
     places, normals = surface_points(points, seed)
+    if flat:
+        places = np.column_stack([rng.uniform(-25.0, 25.0, (points, 2)), np.zeros(points)])
+        normals = np.tile([0.0, 0.0, 1.0], (points, 1))
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", LENS[0], WIDTH, HEIGHT)
     camera.params = list(LENS)
