@@ -108,6 +108,7 @@ def _with_budgets(assignments: Sequence[str] | None, time_budget: str | None, ma
 
 def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
     from splatpipe.pipeline.engine.session import Request
+    from splatpipe.pipeline.engine.source import with_absolute_files
     from splatpipe.pipeline.engine.stage import Machine
     from splatpipe.stages.line import LINE
 
@@ -118,7 +119,8 @@ def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", 
         raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
         import splatpipe.pipeline.raster  # noqa: F401
-    return Request(LINE, config, photos, out, Machine(device, threads or available_cores(), began_s))
+    machine = Machine(device, threads or available_cores(), began_s)
+    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
 
 
 def available_cores() -> int:
@@ -216,6 +218,32 @@ def stage(
         with _Session(request) as runner:
             done.outcome = runner.outcome
             runner.run_alone(name)
+
+
+@app.command()
+def georef(
+    out: OutArgument,
+    gcp: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Control points: gcp_list.txt or CSV; auto, or none. Else as before."),
+    ] = None,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Place a finished run anew: other control points, another CRS. What does not change is reused."""
+    from splatpipe.pipeline.engine.config import known
+    from splatpipe.pipeline.engine.session import load_run
+    from splatpipe.stages.line import LineConfig
+
+    with Ending(out, as_json) as done:
+        photos, table = load_run(out)
+        control = [] if gcp is None else [{"georef": {"control": gcp}}]
+        resolved = _overrides(None, assignments, None).resolve(known(LineConfig, table), *control)
+        with _Session(_request(photos, out, resolved, device, threads)) as runner:
+            done.outcome = runner.outcome
+            runner.walk()
 
 
 @app.command()

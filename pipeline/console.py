@@ -30,6 +30,9 @@ from splatpipe.pipeline.engine.runner import Standing
 from splatpipe.pipeline.engine.stage import JSON, Summary
 
 PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
+PLAIN_WIDTH = 120  # columns of a table in a log file
+POINTS_SHOWN = 40  # more are in metrics.json alone
+GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
 
 
@@ -178,6 +181,69 @@ def show_outputs(out: Path, seconds: float, ran: int, metrics: Mapping[str, JSON
         console.print(f"  {escape(str(path))}  [dim]{_bytes(size)}[/]", soft_wrap=True)
     if not ran:
         console.print(f"[dim]Change an option, or --rerun a stage, to do more. Results: {escape(str(out))}[/]")
+
+
+def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON]]) -> None:
+    """The accuracy report as a table on stderr, and the surveyed points if they are few; nothing where there is none.
+
+    Args:
+        report: `accuracy` of metrics.json, or `accuracy.json`.
+        points: Of `control.json`.
+    """
+    splat = report.get("splat") or {"tables": {}, "points": []}
+    found = [(title, (report.get("tables") or {}).get(name)) for name, title in GROUPS.items()]
+    found += [(f"splat at {name}", splat["tables"].get(name)) for name in ("control", "check")]
+    groups = [(title, table) for title, table in found if table is not None]
+    if not groups:
+        return
+    gsd = report.get("gsd_m")
+    console = Console(file=sys.stderr, highlight=False)
+    if not console.is_terminal:
+        console.width = PLAIN_WIDTH
+    console.print("\n[bold]Accuracy[/], root mean square in metres" + (f"; GSD {gsd:.4f} m" if gsd else ""))
+    shown = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # within 80 columns
+    for title in ("", "n", "east", "north", "up", "horiz.", "3D", "95 % horiz", "95 % up"):
+        shown.add_column(title, justify="right" if title else "left", no_wrap=True)
+    for title, table in groups:
+        figures = [_metres(table.get(f"rmse_{name}_m")) for name in ("east", "north", "up", "horizontal", "3d")]
+        bounds = [_bounds(table.get(f"interval_95_{name}_m")) for name in ("horizontal", "vertical")]
+        shown.add_row(title, str(table["count"]), *figures, *bounds)
+    console.print(shown)
+    if 0 < len(points) <= POINTS_SHOWN:
+        console.print(_points_table(points, {point["name"]: point for point in splat["points"]}))
+        for point in points:
+            if point.get("why"):
+                console.print(f"{point['name']}: {point['why']}.", markup=False, soft_wrap=True)
+
+
+def _points_table(points: Sequence[Mapping[str, JSON]], splat: Mapping[str, Mapping[str, JSON]]) -> Table:
+    """Residuals of each surveyed point: estimated less surveyed, metres."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for title in ("point", "", "photos", "east", "north", "up", "px", "splat: east", "north", "up"):
+        table.add_column(title, justify="left" if title in ("point", "") else "right", overflow="fold")
+    nothing = [None, None, None]
+    for point in points:
+        squares = [x * x + y * y for x, y in (seen.get("residual_px") or (0.0, 0.0) for seen in point["observations"])]
+        marked = [seen for seen in point["observations"] if seen.get("residual_px")]
+        pixels = f"{(sum(squares) / len(marked)) ** 0.5:.2f}" if marked else "–"
+        own = splat.get(point["name"], {}).get("residual_m") or nothing
+        table.add_row(
+            Text(str(point["name"])),
+            Text(str(point["role"]).replace("_", " ")),
+            str(len(point["observations"])),
+            *(_metres(value) for value in point.get("residual_m") or nothing),
+            pixels,
+            *(_metres(value) for value in own),
+        )
+    return table
+
+
+def _metres(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def _bounds(interval: Sequence[float] | None) -> str:
+    return "–" if interval is None else f"{interval[0]:.3f}–{interval[1]:.3f}"
 
 
 def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:

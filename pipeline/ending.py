@@ -8,6 +8,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,8 +48,9 @@ class Ending:
             print_json({**self._as_object(error, seconds), **(self.told or {})})
 
     def _show(self, outcome: Outcome, seconds: float) -> None:
-        from splatpipe.pipeline.console import show_outputs
+        from splatpipe.pipeline.console import show_accuracy, show_outputs
 
+        show_accuracy(*_accuracy(outcome))
         show_outputs(self._out, seconds, len(outcome.ran), _headline(outcome), self._files(outcome))
 
     def _files(self, outcome: Outcome) -> list[Path]:
@@ -78,6 +80,22 @@ class Ending:
             "failed": outcome.failed if outcome else "",
             "outputs": [str(path) for path in self._files(outcome)] if outcome else [],
         }
+
+
+def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The accuracy report, with the splat's own if it was measured, and the surveyed points; empty where not walked."""
+    artifacts = outcome.artifacts.values()
+    parts = {name: part.path for artifact in artifacts for name, part in artifact.parts.items()}
+    report: dict[str, Any] = {}
+    points: list[dict[str, Any]] = []
+    with suppress(OSError, ValueError, KeyError, TypeError):  # what is damaged is told by ``status``
+        if "evaluate.metrics" in parts:
+            report = dict(json.loads(parts["evaluate.metrics"].read_text(encoding="utf-8"))["accuracy"])
+        elif "georef.accuracy" in parts:
+            report = dict(json.loads(parts["georef.accuracy"].read_text(encoding="utf-8")))
+        if "georef.control" in parts:
+            points = list(json.loads(parts["georef.control"].read_text(encoding="utf-8"))["points"])
+    return report, points
 
 
 def _headline(outcome: Outcome) -> dict[str, Any]:

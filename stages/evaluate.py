@@ -1,16 +1,19 @@
-"""evaluate: the held-out photos, rendered and measured (what is, is kept as 8-bit PNG), and what floats in the air."""
+"""evaluate: the held-out photos, rendered and measured (what is, is kept as 8-bit PNG), what floats, what is where."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline import raster
@@ -23,6 +26,7 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.scene.panorama import Panorama, laid_over, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.stages.accuracy import measure_accuracy
 from splatpipe.stages.floaters import measure_floaters
 from splatpipe.stages.line import EvaluateConfig
 from splatpipe.stages.threads import same_bits
@@ -64,7 +68,9 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     cameras = [reduced_camera(view.camera, megapixels) for view in views]
     with same_bits(inputs.machine.threads):
         floaters = measure_floaters(gaussians, cameras, inputs["undistort.dataset"], options)
-    result = {"test_views": len(per_view), "mean": means, "floaters": floaters, "per_view": per_view}
+        accuracy = measure_accuracy(inputs.parts, cameras, held_out, partial(render_depth, gaussians, options=options))
+    result = {"test_views": len(per_view), "mean": means, "floaters": floaters, "accuracy": accuracy}
+    result["per_view"] = per_view
     text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False)
     (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
     summary: dict[str, Any] = {"test_views": len(per_view)}
@@ -103,6 +109,13 @@ def render_pixels(model: Model, camera: Camera, options: raster.RenderOptions) -
             behind = sky.behind(camera, options.background)
             colour = laid_over(colour, rendered.alpha, options.background, behind)
         return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
+
+
+def render_depth(gaussians: Gaussians, camera: Camera, options: raster.RenderOptions) -> Float[np.ndarray, "h w"]:
+    """A camera's median depth, world units along the view axis; 0 where the model has none."""
+    with torch.no_grad():
+        rendered = raster.render(gaussians, camera, replace(options, sh_degree=0, depth=True))
+    return np.asarray(rendered.median_depth.cpu().numpy())
 
 
 def evaluate_view(view: tuple[Camera, Pixels, Mask | None], render: Pixels, stem: Path) -> dict[str, Any]:

@@ -19,10 +19,12 @@ import trimesh
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.crs import utm_of
 from splatpipe.pipeline.scene.dataset import Points, load_points, load_views
 from splatpipe.pipeline.scene.dome import sky_dome
 from splatpipe.pipeline.scene.frames import Frame, load_frame
 from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.scene.georeference import georeference, scene_box, told_in_a_line
 from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.line import ExportConfig
@@ -33,11 +35,11 @@ Facts = dict[str, Any]
 FRUSTUM_PER_SPACING = 0.35  # depth of a drawn frustum over the distance to the next camera: they do not overlap
 FRUSTUM_COLOUR = (255, 140, 0, 255)
 GLTF_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # +Z up to glTF's +Y up
-VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy")
+VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy", "pyproj")
 
 
 def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `splat.ply`, `cameras.json`, `metrics.json` and `sparse.glb`; `sky/sky.ply` where it is asked for.
+    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`; `sky/sky.ply` where asked for.
 
     The frame is georef's: local east, north, up in metres where there are positions, of arbitrary scale elsewhere. The
     sky is a file of its own: within `splat.ply` it would be most of its bounding box, by which programs place and tile.
@@ -64,6 +66,12 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     report.progress(1, 3, "writing the cameras and the points", "files")
     _write_json(out / "cameras.json", cameras_json(cameras, frame))
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))
+    centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
+    box = scene_box(frame.world_from_model.apply(points.xyz), centres)
+    placed = georeference(frame, box)
+    _write_json(out / "georef.json", placed)
+    if frame.origin is not None:
+        report.note(told_in_a_line(placed))
     report.progress(2, 3, "collecting the figures", "files")
     figures = collect_metrics(inputs, plan, points, len(cameras), len(gaussians))
     _write_json(out / "metrics.json", figures)
@@ -100,8 +108,9 @@ def ply_comments(frame: Frame, antialias: bool) -> list[str]:
     return [
         *comments,
         "frame: local east north up, metres",
-        f"origin: {where} (latitude longitude in degrees, height in metres, WGS 84 / EPSG:4979)",
+        f"origin: {where} (latitude longitude in degrees, WGS 84; height in metres, in the vertical datum)",
         f"vertical datum: {frame.vertical_datum}",
+        f"crs: {frame.crs or utm_of(origin.latitude, origin.longitude).text} (see georef.json)",
     ]
 
 
@@ -208,6 +217,7 @@ def collect_metrics(inputs: Inputs, plan: Facts, points: Points, registered: int
         "test_views": measured["test_views"],
         **measured["mean"],
         "floaters": measured["floaters"],
+        "accuracy": measured["accuracy"],
         "per_view": measured["per_view"],
         "seed": plan["options"]["seed"],
         "device": train.get("device"),

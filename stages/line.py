@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from splatpipe.pipeline.engine.stage import Stage, StageConfig
+from splatpipe.pipeline.engine.stage import NamedFile, Stage, StageConfig
 
 PositiveInt = Annotated[int, Field(ge=1)]
 NonNegativeInt = Annotated[int, Field(ge=0)]
@@ -27,6 +27,9 @@ class IngestConfig(StageConfig):
     """Pictures whose longer side is shorter, in pixels, are left out: thumbnails and icons."""
     max_megapixels: Annotated[float, Field(gt=0.0, le=4000.0)] = 500.0
     """Larger pictures are left out undecoded: a small file can claim any size."""
+    positions: str = "auto"
+    """File of the photos' positions, over what these say: `geo.txt` (ODM) or a CSV with a header. `auto`: `geo.txt` or
+    `positions.csv` in the photo folder or beside it; `none`: only what the photos say."""
 
 
 class FeaturesConfig(StageConfig):
@@ -62,6 +65,42 @@ class SparseConfig(StageConfig):
 class GeorefConfig(StageConfig):
     max_position_error_m: PositiveFloat = 10.0
     """Photo positions further than this from the robust fit are named and left out of it."""
+    control: str = "auto"
+    """File of control and check points: `gcp_list.txt` (ODM) or a CSV with a header. `auto`: `gcp_list.txt` or
+    `control.csv` in the photo folder or beside it; `none`: no control."""
+    crs: Annotated[str, Field(max_length=500)] = "auto"
+    """CRS of coordinates that are read out: `EPSG:25832`, with heights `EPSG:25832+7837`, `+proj=…`, `WGS84 UTM 32N`.
+    Auto: the control file's, without one the capture's UTM zone."""
+    vertical: Annotated[str, Field(max_length=40)] = "auto"
+    """Vertical datum of the photos' heights: `ellipsoidal`, `EPSG:n` or `unknown`. Auto: what the files declare."""
+    approximate_crs: bool = False
+    """Take a CRS though the grid of its best way to WGS 84 is missing, or EPSG knows none from its (modern) datum; what
+    that costs is stated in `georef.json`."""
+    pixel_origin: Literal["corner", "centre"] = "corner"
+    """What the pixel coordinates (0, 0) of marks mean: the top-left corner of the first pixel, or its centre."""
+    check_points: Annotated[str, Field(max_length=20_000)] = "auto"
+    """Points that take no part and tell the accuracy: names, separated by commas. `auto`: those that the file names so,
+    else, of six or more, every third; `none`: every point is control."""
+    control_sigma_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.02
+    """Horizontal standard deviation (each of two) of control points whose file states none; raised where they disagree
+    with each other by more."""
+    control_sigma_vertical_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.03
+    """The same of their heights."""
+    mark_sigma_px: Annotated[float, Field(ge=0.01, le=100.0)] = 0.5
+    """Standard deviation of a mark in a photo, pixels."""
+    adjust: Literal["auto", "off"] = "auto"
+    """`auto`: control enters a bundle adjustment; where it moves what the photos show by half a pixel or more, the bent
+    model is used. `off`: it only places the model."""
+
+    @field_validator("crs", "vertical")
+    @classmethod
+    def _known(cls, text: str, field: Any) -> str:
+        """Told now, not after hours; PROJ is only loaded where something is named."""
+        if text.strip().lower() == "auto":
+            return "auto"
+        from splatpipe.pipeline.scene.crs_names import checked
+
+        return checked(text, str(field.field_name))
 
 
 class UndistortConfig(StageConfig):
@@ -246,9 +285,11 @@ INGEST = Stage(
     "ingest",
     version=1,
     config=IngestConfig,
-    reads=("source.photos",),
+    reads=("source.photos", "source.geo"),
     parts={"photos": "photos", "cameras": "cameras.json", "positions": "positions.json", "left_out": "left_out.json"},
     entry="splatpipe.stages.ingest:run",
+    borrows=("georef.approximate_crs",),
+    files={"positions": NamedFile("source.geo", ("geo.txt", "positions.csv"))},
 )
 FEATURES = Stage(
     "features",
@@ -278,9 +319,10 @@ GEOREF = Stage(
     "georef",
     version=1,
     config=GeorefConfig,
-    reads=("sparse.model", "ingest.positions", "ingest.photos"),
-    parts={"frame": "frame.json", "model": "sparse/0"},
+    reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
+    parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
     entry="splatpipe.stages.georef:run",
+    files={"control": NamedFile("source.control", ("gcp_list.txt", "control.csv"))},
 )
 UNDISTORT = Stage(
     "undistort",
@@ -321,13 +363,21 @@ EVALUATE = Stage(
     "evaluate",
     version=6,
     config=EvaluateConfig,
-    reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
+    reads=(
+        "train.model",
+        "train.plan",
+        "train.sky",
+        "undistort.dataset",
+        "georef.frame",
+        "georef.control",
+        "georef.accuracy",
+    ),
     parts={"metrics": "metrics.json", "views": "views"},
     entry="splatpipe.stages.evaluate:run",
 )
 EXPORT = Stage(
     "export",
-    version=1,
+    version=2,
     config=ExportConfig,
     reads=(
         "train.model",
@@ -342,13 +392,14 @@ EXPORT = Stage(
     ),
     parts={
         "splat": "splat.ply",
+        "georef": "georef.json",
         "cameras": "cameras.json",
         "metrics": "metrics.json",
         "sparse": "sparse.glb",
         "sky": "sky",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "cameras", "metrics", "sparse", "sky"),
+    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky"),
 )
 
 LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)

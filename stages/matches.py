@@ -6,6 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -18,10 +19,15 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.scene.photos import Photo, load_photo_list
+from splatpipe.pipeline.scene.upright import display_from_stored, enu_from_gimbal
+from splatpipe.stages.footprints import Views
 from splatpipe.stages.line import MatchesConfig
-from splatpipe.stages.pairs import Costs, Layout, Pair, choose_pairing, components, select_pairs
+from splatpipe.stages.pairs import LOCATED_SHARE, Costs, Layout, Pair, choose_pairing, components, select_pairs
 from splatpipe.stages.retrieval import PER_PHOTO, look_alike_costs
 
+LEVELLING_SIGMA_M = 1.0  # altitudes that are as good tell how high flights took off against each other
+TAKEN_BY = ("latitude", "yaw_deg", "pitch_deg", "relative_altitude_m")  # what tells how a photo was taken
+WITHIN_FLIGHT = 0.5  # of a position's standard deviation: most of the error is common to a flight
 EARTH_RADIUS_M = 6_371_000.0  # of a sphere: these metres only choose neighbours
 TILE = 16  # photos; pairs are matched tile by tile, so that a block needs few photos' descriptors
 BLOCK_PAIRS = 64  # COLMAP keeps as many photos' search trees in memory
@@ -35,8 +41,11 @@ def run(config: MatchesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     """
     photos = load_photo_list(inputs["ingest.photos"]).photos
     positions = json.loads(inputs["ingest.positions"].read_text(encoding="utf-8"))["positions"]
-    layout = make_layout(photos, positions)
     features = inputs["features.database"]
+    layout = make_layout(photos, positions)
+    layout = replace(
+        layout, views=make_views(photos, positions, half_sizes(features, [photo.name for photo in photos]))
+    )
     report.progress(0, 1, "choosing pairs")
     pairing = config.pairing
     if pairing == "auto":
@@ -92,6 +101,60 @@ def make_layout(photos: Sequence[Photo], positions: Sequence[dict[str, JSON]]) -
             directions[number] = viewing_direction(entry["yaw_deg"], entry["pitch_deg"])
     times = np.array([_seconds(photo.time) for photo in photos])
     return Layout([photo.name for photo in photos], times, places, sigmas, directions)
+
+
+def half_sizes(features: Path, names: Sequence[str]) -> Float64[np.ndarray, "n 2"]:
+    """Tangents of half the field of view of each photo, across and down in the stored grid, by its camera's prior."""
+    with pycolmap.Database.open(features) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        of_name = {image.name: cameras[image.camera_id] for image in database.read_all_images()}
+    found = [of_name[name] for name in names]
+    sizes = np.array([[camera.width, camera.height] for camera in found], dtype=np.float64)
+    return sizes / (2.0 * np.array([[camera.mean_focal_length()] for camera in found]))
+
+
+def make_views(
+    photos: Sequence[Photo], positions: Sequence[dict[str, JSON]], half_size: Float64[np.ndarray, "n 2"]
+) -> Views | None:
+    """How photos were taken; None unless it is known of most, by positions, angles and heights above take-off.
+
+    The height is the barometer's: a receiver's altitude errs by metres between photos, unless it is RTK's.
+
+    Args:
+        photos: Sorted by name.
+        positions: The entries of ``positions.json``.
+        half_size: Tangents of half the fields of view.
+    """
+    by_name = {entry["name"]: entry for entry in positions}
+    found = [(index, by_name[photo.name]) for index, photo in enumerate(photos) if photo.name in by_name]
+    found = [(index, entry) for index, entry in found if all(entry[key] is not None for key in TAKEN_BY)]
+    if len(found) < max(2, LOCATED_SHARE * len(photos)):
+        return None
+    index, entries = [index for index, _ in found], [entry for _, entry in found]
+    angles = [np.array([entry[key] or 0.0 for entry in entries]) for key in ("yaw_deg", "pitch_deg", "roll_deg")]
+    turns = np.stack([display_from_stored(photos[at].orientation) for at in index])
+    height = np.array([entry["relative_altitude_m"] for entry in entries], dtype=np.float64)
+    ground = np.full(len(photos), np.nan)
+    ground[index] = _ground_m(entries, height)
+    centres = np.full((len(photos), 3), np.nan)
+    centres[index, :2] = [_metres(entry, entries[0]) for entry in entries]
+    centres[index, 2] = ground[index] + height
+    rotations = np.full((len(photos), 3, 3), np.nan)
+    rotations[index] = enu_from_gimbal(angles[0], angles[1], angles[2]) @ turns
+    noise = float(np.median([entry["sigma_horizontal_m"] for entry in entries])) * WITHIN_FLIGHT
+    return Views(centres, rotations, half_size, ground, noise)
+
+
+def _ground_m(entries: Sequence[dict[str, JSON]], height: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Where each photo's flight took off: 0, unless altitudes are good enough to tell flights' heights apart."""
+    ground = np.zeros(len(entries))
+    if any(entry["altitude_m"] is None or entry["sigma_vertical_m"] > LEVELLING_SIGMA_M for entry in entries):
+        return ground
+    flights = np.array([entry.get("flight", 0) for entry in entries])
+    takeoff = np.array([entry["altitude_m"] for entry in entries]) - height
+    for flight in np.unique(flights):
+        ground[flights == flight] = np.median(takeoff[flights == flight])
+    return ground
 
 
 def _metres(entry: dict[str, JSON], origin: dict[str, JSON]) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.stages.footprints import Views, overlaps
 
 Pair = tuple[int, int]
 Costs = Callable[[int], Float64[np.ndarray, " n"]]
@@ -21,6 +23,11 @@ SPREAD_OVER_SIGMA = 2.0  # positions that scatter no wider than this say nothing
 SAME_PLACE_M = 0.1
 LEAST_FACING = 0.01  # cos² of half the angle between views: opposite views count as ten times further apart or more
 SEQUENCE_LENGTH = 8  # photos a folder; shorter ones are no sequence
+LEAST_OVERLAP = 0.01  # of two photos' footprints; pairs with less give a point in some hundreds
+FLOOR = 6  # nearest photos that are partners whatever the angles say: these may be wrong
+TILTED = -0.87  # of a viewing direction's height, sine: 60° down; views of walls part more and need more partners
+WIDER = 1.5  # times the partners of a photo that looks straight down
+CANDIDATES_OVER_PARTNERS = 6  # photos looked at, nearest first: an orbit has nearer ones that look elsewhere
 LOOP_SHARE = 4  # one pair in so many of a sequence looks for places seen before
 
 
@@ -34,6 +41,7 @@ class Layout:
         positions_m: (n, 3) east, north, up about any origin; NaN where not known.
         sigmas_m: Standard deviation of each position, NaN where not known.
         directions: (n, 3) unit viewing directions in the same axes; NaN where not known.
+        views: How the photos were taken, where that is known of most of them.
     """
 
     names: Sequence[str]
@@ -41,6 +49,7 @@ class Layout:
     positions_m: Float64[np.ndarray, "n 3"]
     sigmas_m: Float64[np.ndarray, " n"]
     directions: Float64[np.ndarray, "n 3"]
+    views: Views | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -52,9 +61,11 @@ class Layout:
 
 def choose_pairing(layout: Layout, exhaustive_up_to: int) -> str:
     """What `auto` means for these photos: ``exhaustive``, ``spatial``, ``sequential`` or ``retrieval``."""
-    if len(layout) <= exhaustive_up_to:
+    tell = positions_tell(layout)
+    overlap_is_known = layout.views is not None and bool(layout.views.known().all())
+    if len(layout) <= exhaustive_up_to and not (tell and overlap_is_known):
         return "exhaustive"
-    if positions_tell(layout):
+    if tell:
         return "spatial"
     return "sequential" if sequences(layout) else "retrieval"
 
@@ -136,12 +147,31 @@ def _spatial(layout: Layout, neighbours: int, look_alike: Callable[[], Costs]) -
             hint="Leave matches.pairing at auto.",
         )
     costs = spatial_costs(layout)
-    pairs = nearest(np.flatnonzero(located).tolist(), costs, neighbours)
+    known = layout.views.known() if layout.views is not None else np.zeros_like(located)
+    pairs = nearest(np.flatnonzero(located & ~known).tolist(), costs, neighbours)
+    if layout.views is not None:
+        pairs |= nearest(np.flatnonzero(known).tolist(), costs, FLOOR) | _overlapping(layout.views, neighbours)
     if located.all():
         return connect(pairs, len(layout), costs)
     alike = look_alike()
     pairs |= nearest(np.flatnonzero(~located).tolist(), alike, neighbours)
     return connect(pairs, len(layout), alike)
+
+
+def _overlapping(views: Views, neighbours: int) -> set[Pair]:
+    """Each photo with those whose footprints overlap its own most; more of them for views of walls."""
+    wide = math.ceil(WIDER * neighbours)
+    partners: dict[int, list[tuple[float, Pair]]] = {}
+    for pair, share in overlaps(views, CANDIDATES_OVER_PARTNERS * wide).items():
+        if share >= LEAST_OVERLAP:
+            for photo in pair:
+                partners.setdefault(photo, []).append((-share, pair))
+    tilted = views.axes[:, 2] > TILTED
+    return {
+        pair
+        for photo, ranked in partners.items()
+        for _, pair in sorted(ranked)[: wide if tilted[photo] else neighbours]
+    }
 
 
 def spatial_costs(layout: Layout) -> Costs:

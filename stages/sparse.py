@@ -17,6 +17,7 @@ import pycolmap
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.dataset import some
+from splatpipe.pipeline.scene.focal import UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.scene.sparse_model import write_model
 from splatpipe.stages.line import SparseConfig
@@ -26,10 +27,7 @@ Model: TypeAlias = pycolmap.Reconstruction
 LEAST_SHARE = 0.1  # of the photos; a model of fewer is an accident
 ENOUGH_SHARE = 0.5  # below it a second attempt is worth its time
 STRAY = 0.1  # of a focal length from its prior: worth a warning
-STRAY_UNOBSERVED = 0.03  # worth holding it where the photos cannot tell it
-PARALLEL_DEG = 15.0  # views within it of their common axis, all of them, tell little of the focal length
-FLAT_RELIEF = 0.3  # nor does ground whose depths differ by less than this share
-RELIEF_PERCENTILES = (5.0, 95.0)
+STRAY_UNOBSERVED = 0.03  # which it may have where the photos cannot tell it
 
 
 @dataclass(frozen=True)
@@ -68,6 +66,9 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         held = _map(inputs, config, again, out, report)
         if _registered(held) >= _registered(models):
             attempt, models = again, held
+            used = {models[0].images[number].camera_id for number in models[0].reg_image_ids()}
+            focals = {number: priors[number].mean_focal_length() for number in used}
+            adjust_within(models[0], focals, STRAY_UNOBSERVED)
     model = canonical(models[0], np.load(inputs["features.colours"]), _keypoint_counts(database))
     write_model(model, out / "sparse" / "0")
     summary = _summary(model, models[1:], names, priors, attempt)
@@ -149,25 +150,13 @@ def _check_enough(models: Sequence[Model], config: SparseConfig, total: int) -> 
 
 
 def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bool:
-    """Whether a focal length left its prior although the photos cannot tell it.
-
-    Over flat ground, photographed straight down from one height, a longer lens from higher up makes the same photos.
-    """
+    """Whether a focal length left its prior although the photos cannot tell it; control may, later."""
     used = {model.images[number].camera_id for number in model.reg_image_ids()}
-    if not all(priors[number].has_prior_focal_length for number in used):
+    strayed = [number for number in sorted(used) if _stray(model.cameras[number], priors[number]) >= STRAY_UNOBSERVED]
+    if not strayed or not all(priors[number].has_prior_focal_length for number in used):
         return False
-    if max(_stray(model.cameras[number], priors[number]) for number in used) < STRAY_UNOBSERVED:
-        return False
-    images = [model.images[number] for number in sorted(model.reg_image_ids())]
-    axes = np.array([image.viewing_direction() for image in images])
-    axis = axes.mean(axis=0)
-    cosines = axes @ axis / max(float(np.linalg.norm(axis)), 1e-12)
-    if float(cosines.min()) < math.cos(math.radians(PARALLEL_DEG)):
-        return False
-    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    low, high = np.percentile(points @ axis, RELIEF_PERCENTILES)
-    depth = float(np.median(points @ axis) - np.median(np.array([i.projection_center() for i in images]) @ axis))
-    return bool(high - low < FLAT_RELIEF * abs(depth))
+    sigmas = focal_sigmas(model)
+    return any(sigmas.get(number, math.inf) > UNOBSERVED for number in strayed)
 
 
 def _stray(camera: pycolmap.Camera, prior: pycolmap.Camera) -> float:
@@ -258,6 +247,6 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
             )
     if summary["focal_held"]:
         report.warning(
-            "Photos of flat ground from one height cannot tell the focal length: that of the metadata was kept.",
+            "Photos of flat ground from one height cannot tell the focal length: it is held to 3 % of the metadata's.",
             hint="Add oblique photos, or a second height, for heights to be trusted.",
         )

@@ -27,7 +27,7 @@ def photos(tmp_path: Path) -> Path:
 def test_help_names_every_command_and_imports_nothing_heavy() -> None:
     done = splatpipe("--help")
     assert done.returncode == 0
-    for command in ("run", "stage", "demo", "status", "clean", "doctor", "options"):
+    for command in ("run", "stage", "demo", "georef", "status", "clean", "doctor", "options"):
         assert command in done.stdout
     code = (
         "import sys; from splatpipe.pipeline import cli; from splatpipe.stages import line\n"
@@ -61,6 +61,9 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
         (["run", "{photos}", "{tmp}/out", "--max-memory", "99999999T"], 2, "train.max_memory_bytes"),
         (["run", "{photos}", "{tmp}/out", "--set", "train.time_budget_s=-1"], 2, "train.time_budget_s"),
         (["demo", "{tmp}/out", "--time-budget", "soon"], 2, 'Cannot understand --time-budget "soon"'),
+        (["run", "{photos}", "{tmp}/out", "--set", "georef.crs=EPSG:1"], 2, "There is no EPSG:1"),
+        (["run", "{photos}", "{tmp}/out", "--set", "georef.vertical=sea"], 2, '"sea" is no vertical datum'),
+        (["georef", "{tmp}/out", "--gcp", "{tmp}/none.txt"], 2, "holds no run"),
         (["stage", "train", "{tmp}/out"], 2, "holds no run"),
         (["stage", "trains", "{tmp}/out"], 2, "no stage"),
         (["status", "{tmp}/out"], 2, "holds no run"),

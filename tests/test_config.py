@@ -56,6 +56,8 @@ def test_the_line_is_whole() -> None:
     known = {"source.photos"}
     sections = set(option_names(LineConfig))
     for stage in LINE:
+        known |= {file.part for file in stage.files.values()}
+        assert {f"{stage.name}.{option}" for option in stage.files} <= sections
         assert set(stage.reads) <= known, stage.name
         assert {stage.name, *stage.borrows} <= sections
         known |= {f"{stage.name}.{part}" for part in stage.parts}

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 import torch
 import trimesh
@@ -46,6 +47,7 @@ REQUIRED = [
     "psnr",
     "psnr_cc",
     "floaters",
+    "accuracy",
     "ssim",
     "per_view",
     "versions",
@@ -148,6 +150,28 @@ def test_header_says_where_the_origin_is(exported: Path, tmp_path: Path) -> None
     assert "arbitrary scale" in arbitrary[1]
 
 
+def test_georef_json_places_the_exported_cameras(exported: Path) -> None:
+    """A camera's place by georef.json is where its own path through PROJ leads; a shrunk scene in a known CRS."""
+    told = json.loads((exported / "georef.json").read_text())
+    assert told["crs"]["id"] == "EPSG:32634" and told["ecef_from_local"]["approximate"]
+    positions = np.array([entry["position"] for entry in json.loads((exported / "cameras.json").read_text())])
+    earth = positions @ np.array(told["exact_path"]["matrix"])[:3, :3].T + np.array(told["exact_path"]["matrix"])[:3, 3]
+    to_utm = pyproj.Transformer.from_crs(4978, "EPSG:32634", always_xy=True)
+    easting, northing = to_utm.transform(*earth.T)[:2]
+    tangent = told["crs_from_local_tangent"]
+    by_matrix = positions @ np.array(tangent["matrix"])[:3, :3].T + np.array(tangent["matrix"])[:3, 3]
+    off = np.hypot(by_matrix[:, 0] - easting, by_matrix[:, 1] - northing)
+    assert off.max() <= tangent["largest_error_m"] + 1e-5  # as rounded
+    low, high = np.array(tangent["over_box_m"])
+    assert (positions >= low - 1e-3).all() and (positions <= high + 1e-3).all()
+
+
+def test_the_crs_and_its_operation_are_told(inputs: Inputs, tmp_path: Path) -> None:
+    recorder = tiny_scene.Recorder()
+    export.run(ExportConfig(), inputs, tmp_path, recorder)
+    assert "EPSG:32634" in recorder.notes[0] and "good to 0 m" in recorder.notes[0] and "unknown" in recorder.notes[0]
+
+
 def test_broken_gaussians_stay_out_of_the_file(inputs: Inputs, tmp_path: Path) -> None:
     model = read_splat(inputs["train.model"])
     model.quats[0] = 0.0
@@ -227,5 +251,5 @@ def test_sky_that_was_not_trained_is_told(inputs: Inputs, tmp_path: Path) -> Non
 
 def test_same_bits_for_the_same_inputs(inputs: Inputs, exported: Path, tmp_path: Path) -> None:
     export.run(ExportConfig(), inputs, tmp_path, tiny_scene.Recorder())
-    for name in ("splat.ply", "cameras.json", "metrics.json", "sparse.glb"):
+    for name in ("splat.ply", "georef.json", "cameras.json", "metrics.json", "sparse.glb"):
         assert (tmp_path / name).read_bytes() == (exported / name).read_bytes(), name

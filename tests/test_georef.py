@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.source import ABSENT
 from splatpipe.pipeline.engine.stage import Inputs, Summary
 from splatpipe.pipeline.scene.frames import Frame, load_frame
 from splatpipe.pipeline.scene.geodesy import Origin
@@ -103,8 +104,14 @@ GROUND = np.random.default_rng(1).uniform(-10, 70, (300, 3)) * [1.0, 1.0, 0.001]
 def ingested(folder: Path, positions: list[dict[str, object]], names: list[str]) -> dict[str, Path]:
     """The parts that ingest would leave."""
     (folder / "positions.json").write_text(json.dumps({"positions": positions, "orientations": {}}))
+    (folder / "cameras.json").write_text('{"cameras": [{"focal_px": 2300.0, "width": 4000, "has_prior": true}]}')
     save_photo_list(PhotoList(tuple(Photo(name, "0" * 64, 4000, 3000, 0) for name in names)), folder)
-    return {"ingest.positions": folder / "positions.json", "ingest.photos": folder}
+    return {
+        "ingest.positions": folder / "positions.json",
+        "ingest.photos": folder,
+        "ingest.cameras": folder / "cameras.json",
+        "source.control": ABSENT,
+    }
 
 
 def georef(

@@ -83,8 +83,40 @@ def copy_of_run(undisturbed: Path, tmp_path: Path) -> Path:
     return shutil.copytree(undisturbed, tmp_path / "out")
 
 
+def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp_path: Path) -> None:
+    """georef anew, then only what reads the frame; once more with a point less, and with another CRS."""
+    lines = (capture_path().parent / "gcp_list.txt").read_text().splitlines()
+    more = tmp_path / "more points.txt"
+    more.write_text("\n".join(lines))
+    fewer = tmp_path / "fewer.txt"
+    fewer.write_text("\n".join(line for line in lines if not line.endswith(" P15")))
+    before = json.loads((copy_of_run / "metrics.json").read_text())
+    for file in (fewer, more):
+        told = splatpipe("georef", copy_of_run, "--gcp", file)
+        assert ran(told) == ["georef", "evaluate", "export"]
+    after = json.loads((copy_of_run / "metrics.json").read_text())
+    assert before["accuracy"]["splat"] is None and after["psnr"] == before["psnr"]
+    tables = after["accuracy"]["tables"]
+    assert tables["control"]["count"] > tables["check"]["count"] > 1 and tables["check"]["rmse_3d_m"] < 0.3
+    assert after["accuracy"]["splat"]["points"]
+    assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:32633"
+    assert ran(splatpipe("georef", copy_of_run)) == []
+    told = splatpipe("georef", copy_of_run, *sets("georef.crs=EPSG:31255"))
+    assert "train" not in ran(told) and ran(told)[-1] == "export"
+    assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:31255"
+
+
 def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
-    for name in ("splat.ply", "cameras.json", "metrics.json", "sparse.glb", "config.toml", "events.jsonl", "stages"):
+    for name in (
+        "splat.ply",
+        "georef.json",
+        "cameras.json",
+        "metrics.json",
+        "sparse.glb",
+        "config.toml",
+        "events.jsonl",
+        "stages",
+    ):
         assert (undisturbed / name).exists(), name
     metrics = json.loads((undisturbed / "metrics.json").read_text())
     for key in [
@@ -101,6 +133,7 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "psnr",
         "psnr_cc",
         "ssim",
+        "accuracy",
         "per_view",
         "versions",
         "seed",

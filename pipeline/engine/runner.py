@@ -22,7 +22,7 @@ from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary
 from splatpipe.pipeline.engine.store import MIN_FREE_BYTES, Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.worker import Task
 
-VERSIONED = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy", "pillow")
+VERSIONED = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy", "pillow", "pyproj")
 State = Literal["valid", "stale", "missing", "waiting"]
 
 
@@ -58,7 +58,7 @@ class Line:
         return StageInputs(
             stage.name,
             stage.version,
-            section.model_dump(mode="json"),
+            section.model_dump(mode="json", exclude=set(stage.files)),
             {name: lookup(self.config, name) for name in stage.borrows},
             {name: parts[name].digest for name in stage.reads},
         )

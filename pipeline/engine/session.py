@@ -60,7 +60,7 @@ def open_session(request: Request, show: Sink) -> Iterator[Runner]:
     Raises:
         SplatpipeError: if the photos or OUT cannot be used.
     """
-    source = open_source(request.photos, request.out)
+    source = open_source(request.photos, request.out, request.stages, request.config)
     store = open_store(request.out, create=True)
     with locked(store) as lock:
         log = EventLog(store.out / EVENTS_FILE)
@@ -93,7 +93,7 @@ def _unheard(_event: Event) -> None:
 
 
 def _open_line(request: Request, store: Store, report: EventReporter, *, remember: bool) -> Line:
-    source = open_source(request.photos, request.out)
+    source = open_source(request.photos, request.out, request.stages, request.config)
     table = HashTable(store.stages / "photos-index.json", remember=remember)
     digests = source.digests(table, request.machine.threads, report)
     parts = {name: Part(source.part_path(name), value) for name, value in digests.items()}

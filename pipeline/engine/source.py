@@ -1,17 +1,23 @@
-"""The user's folder: photos (with masks), or a reconstruction of another program with its images."""
+"""The user's folder: photos (with masks), or a reconstruction of another program with its images; surveyor's files."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+
+from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.digests import MAX_SOURCE_FILES, HashTable, walk_files
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.engine.stage import NamedFile, Reporter, Stage
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
 MASK_FOLDERS = ("masks", "sky_masks")
+AUTO, NONE = "auto", "none"  # what an option that names a file may say instead of a path
+MAX_NAMED_BYTES = 64 << 20  # a table of a million photos; a larger file was named by mistake
+ABSENT = Path(os.devnull)  # where a part without a file lies: no file, and empty for who reads it all the same
 
 
 @dataclass(frozen=True)
@@ -21,10 +27,14 @@ class Source:
     Attributes:
         folder: The folder the user named.
         model: The COLMAP model in it, where it is a reconstruction and not just photos.
+        named: The file of each part that is one file, e.g. ``source.control``; None where there is none.
+        passed: Files that are no photos, whatever they hold: those of such parts, and what could be one.
     """
 
     folder: Path
     model: Path | None
+    named: Mapping[str, Path | None] = field(default_factory=dict)
+    passed: frozenset[Path] = frozenset()
 
     @property
     def part_files(self) -> dict[str, dict[str, Path]]:
@@ -34,7 +44,12 @@ class Source:
             roots = [self.folder / name for name in ("images", *MASK_FOLDERS)]
         beside = [self.folder.parent / name for name in MASK_FOLDERS]
         roots += [root for root in beside if root.is_dir() and root != self.folder]
-        photos = {os.path.relpath(path, self.folder): path for root in roots for path in walk_files(root)}
+        photos = {
+            os.path.relpath(path, self.folder): path
+            for root in roots
+            for path in walk_files(root)
+            if path not in self.passed
+        }
         if len(photos) > MAX_SOURCE_FILES:
             raise SplatpipeError(
                 f"{self.folder} holds {len(photos):,} files.",
@@ -43,10 +58,14 @@ class Source:
         parts = {"source.photos": photos}
         if self.model is not None:
             parts["sparse.model"] = {path.name: path for path in walk_files(self.model)}
+        # The name is no part of the digest: the same points in another file are the same points.
+        parts |= {part: {} if path is None else {"": path} for part, path in self.named.items()}
         return parts
 
     def part_path(self, part: str) -> Path:
-        """Where a part lies."""
+        """Where a part lies; for one without a file a path that is none."""
+        if part in self.named:
+            return self.named[part] or ABSENT
         return self.model if part == "sparse.model" and self.model is not None else self.folder
 
     def digests(self, table: HashTable, threads: int, report: Reporter) -> dict[str, str]:
@@ -59,16 +78,18 @@ class Source:
         }
 
 
-def open_source(photos: Path, out: Path) -> Source:
+def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: BaseModel | None = None) -> Source:
     """Look at what the user named as PHOTOS.
 
     Args:
         photos: The folder of photos, or with ``images/`` and ``sparse/0``.
         out: Where the run writes; must not lie inside the photos.
+        stages: The line, whose stages may read files that lie with the photos.
+        config: The line's configuration, which may name these files.
 
     Raises:
-        SplatpipeError: if there is no such folder.
-        UsageError: if ``out`` lies inside it.
+        SplatpipeError: if there is no such folder or file.
+        UsageError: if ``out`` lies inside the folder, or the folder has two files for one part.
     """
     folder = photos.expanduser().resolve()
     if not folder.exists():
@@ -83,7 +104,72 @@ def open_source(photos: Path, out: Path) -> Source:
             f"{out} lies inside the photo folder {photos}.",
             hint="Choose an OUT beside the photos, not among them.",
         )
-    return Source(folder, _find_model(folder))
+    listed = list(_named_files(stages))
+    known = {name for _, _, file in listed for name in file.names}
+    beside = {root: _files_called(root, known) for root in (folder, folder.parent)}
+    named = {}
+    for section, option, file in listed:
+        setting = str(getattr(getattr(config, section), option))
+        named[file.part] = _choose(file, f"{section}.{option}", setting, beside)
+    passed = {path for paths in beside.values() for path in paths.values()}
+    passed |= {path for path in named.values() if path is not None}
+    return Source(folder, _find_model(folder), named, frozenset(passed))
+
+
+def with_absolute_files(config: BaseModel, stages: Sequence[Stage]) -> BaseModel:
+    """The configuration with every path of a named file made absolute, so that it holds wherever OUT is looked at."""
+    for section, option, _ in _named_files(stages):
+        part = getattr(config, section)
+        setting = getattr(part, option)
+        if setting not in (AUTO, NONE):
+            path = str(Path(setting).expanduser().resolve())
+            config = config.model_copy(update={section: part.model_copy(update={option: path})})
+    return config
+
+
+def _named_files(stages: Iterable[Stage]) -> Iterable[tuple[str, str, NamedFile]]:
+    return ((stage.name, option, file) for stage in stages for option, file in stage.files.items())
+
+
+def _files_called(root: Path, names: set[str]) -> dict[str, Path]:
+    """The files of these names right in a folder, by their names in small letters."""
+    try:
+        found = sorted(path for path in root.iterdir() if path.name.casefold() in names)
+    except OSError:
+        return {}
+    return {path.name.casefold(): path for path in found if path.is_file()}
+
+
+def _choose(file: NamedFile, option: str, setting: str, beside: Mapping[Path, Mapping[str, Path]]) -> Path | None:
+    """The file of a part: the named one, or the one that lies with the photos, or None."""
+    if setting == NONE:
+        return None
+    if setting != AUTO:
+        return _checked(Path(setting), option)
+    for files in beside.values():
+        found = [files[name] for name in file.names if name in files]
+        if len(found) > 1:
+            raise UsageError(
+                f"{found[0].parent} has both {found[0].name} and {found[1].name}.",
+                hint=f"Say which one counts: --set {option}=PATH, or {option}=none.",
+            )
+        if found:
+            return _checked(found[0], option)
+    return None
+
+
+def _checked(path: Path, option: str) -> Path:
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "is no file" if path.exists() else "is not there"
+        raise SplatpipeError(f"The file {path} of {option} {what}.", hint=f"Check the path, or set {option}=none.")
+    if not os.access(path, os.R_OK):
+        raise SplatpipeError(f"The file {path} of {option} may not be read.", hint="Check its permissions.")
+    if path.stat().st_size > MAX_NAMED_BYTES:
+        raise SplatpipeError(
+            f"The file {path} of {option} has {path.stat().st_size / 1e6:,.0f} MB, too many for a table of positions.",
+            hint=f"Check the path, or set {option}=none.",
+        )
+    return path
 
 
 def _find_model(folder: Path) -> Path | None:

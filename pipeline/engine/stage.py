@@ -41,6 +41,19 @@ class Machine:
 
 
 @dataclass(frozen=True)
+class NamedFile:
+    """A file of the user's that lies with the photos or is named by an option: an external part of its own.
+
+    Attributes:
+        part: The part, e.g. ``source.control``: the file, or a path that is none (``is_file()`` is false).
+        names: What it is called where it lies in the photo folder or beside it, in small letters.
+    """
+
+    part: str
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Stage:
     """One step of the line.
 
@@ -53,6 +66,8 @@ class Stage:
         entry: ``module:function`` of the body, a ``Body``.
         borrows: Settings of other stages that its answer depends on, e.g. ``evaluate.every``.
         resumable: Its partial folder is kept after a kill, for the body to go on from.
+        files: Files of the user's by the option that names them (``auto``, ``none`` or a path). Their content is in the
+            key and the option is not: the body knows the part alone.
         deliverables: Parts that are copied into OUT for people (a folder part: what is in it).
     """
 
@@ -64,6 +79,7 @@ class Stage:
     entry: str
     borrows: tuple[str, ...] = ()
     resumable: bool = False
+    files: Mapping[str, NamedFile] = field(default_factory=dict)
     deliverables: tuple[str, ...] = ()
 
 

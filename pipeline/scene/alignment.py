@@ -9,7 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from splatpipe.pipeline.scene.correspondences import LEAST_NOISE_FACTOR, Correspondences, DirectionPrior, Shared
 from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity, rotation_from_vector
+
+__all__ = [
+    "Correspondences",
+    "DirectionPrior",
+    "Shared",
+    "SimilarityFit",
+    "offset_step_sigmas",
+    "robust_similarity",
+    "turn_about_axis",
+]
 
 MAX_HYPOTHESES = 1000  # with half the points wrong, one triple in eight is right: missing it has odds of 1e-58
 REFINED_HYPOTHESES = 5
@@ -24,44 +35,7 @@ OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors never are so large
 OUTLIER_SIGMAS = 3.0  # and an error within what the position states is none
 LEAST_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
 REDUNDANT = 8  # points from which on the residuals tell the noise better than the stated sigmas do
-LEAST_NOISE_FACTOR = 0.3  # GNSS errors change slowly: residuals of one flight look better than the positions are
-
-
-@dataclass(frozen=True)
-class Correspondences:
-    """The same points in two frames.
-
-    Attributes:
-        source: In the source frame, any units.
-        target: In the target frame.
-        sigmas: Standard deviations of the target's coordinates.
-    """
-
-    source: Float64[np.ndarray, "n 3"]
-    target: Float64[np.ndarray, "n 3"]
-    sigmas: Float64[np.ndarray, "n 3"]
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def only(self, chosen: Bool[np.ndarray, " n"]) -> Correspondences:
-        """Some of them."""
-        return Correspondences(self.source[chosen], self.target[chosen], self.sigmas[chosen])
-
-
-@dataclass(frozen=True)
-class DirectionPrior:
-    """Directions known in both frames, which hold a rotation that points leave free.
-
-    Attributes:
-        source: (k, 3) unit vectors.
-        target: (k, 3) unit vectors.
-        sigma_rad: Standard deviation of each.
-    """
-
-    source: Float64[np.ndarray, "k 3"]
-    target: Float64[np.ndarray, "k 3"]
-    sigma_rad: float
+MOST_GROUPS = 20  # whose triples are tried: one good group is enough
 
 
 @dataclass(frozen=True)
@@ -72,11 +46,12 @@ class SimilarityFit:
         similarity: Source to target.
         inliers: Which points agree with the fit. These took part in it, unless they are fewer than 3: then all did, and
             there is no fit to speak of.
-        residuals: Transformed source less target, in the target's units.
+        residuals: Transformed source less target, in the target's units; the groups' shared errors are taken off.
         noise: Robust spread of the residuals over the stated sigmas: 1 where these are right.
         sigma_scale: Standard deviation of the scale, relative; infinite where it is not determined.
         sigma_rotation_rad: Standard deviation of the rotation about its weakest axis; infinite likewise.
         used_prior: Whether the points left a rotation to the prior.
+        offsets: The error that each group shares (target less truth), in the target's units; empty without groups.
     """
 
     similarity: Similarity
@@ -86,6 +61,7 @@ class SimilarityFit:
     sigma_scale: float
     sigma_rotation_rad: float
     used_prior: bool
+    offsets: Float64[np.ndarray, "g 3"]
 
 
 def robust_similarity(points: Correspondences, max_error: float, prior: DirectionPrior | None = None) -> SimilarityFit:
@@ -94,7 +70,8 @@ def robust_similarity(points: Correspondences, max_error: float, prior: Directio
     Triples give hypotheses (every triple of a small set, else 1000 from a fixed seed), scored by squared residuals cut
     off at ``max_error`` and refined locally (MSAC: Torr and Zisserman 2000; LO-RANSAC: Chum, Matas and Kittler 2003).
     From the best, reweighted least squares with the points' own sigmas and Cauchy's weights. Never a reflection, and
-    the same bits for the same input.
+    the same bits for the same input. Errors that groups share are estimated along, each with its sigma as its prior;
+    they are eliminated from the normal equations, so that what is said of accuracy holds with them.
 
     Args:
         points: At least 3, not all in one place.
@@ -116,6 +93,28 @@ def robust_similarity(points: Correspondences, max_error: float, prior: Directio
     _, axis = _weakest_rotation(_information(_Problem(chosen, fit.similarity), _sigma_weights(chosen), None))
     start = turn_about_axis(fit.similarity, axis, chosen.target.mean(axis=0), prior)
     return _refine(start, points, max_error, prior)
+
+
+def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: int) -> Float64[np.ndarray, "g 3"]:
+    """Standard deviations of the differences between the groups' offsets and one group's.
+
+    Args:
+        fit: Of the points.
+        points: With shared errors.
+        reference: The group that the others are compared with.
+    """
+    assert points.shared is not None
+    chosen = points.only(fit.inliers).at_noise(fit.noise)
+    assert chosen.shared is not None
+    problem, weights = _Problem(chosen, fit.similarity), _sigma_weights(chosen)
+    membership = chosen.shared.membership()
+    own = membership @ weights + 1.0 / chosen.shared.sigmas**2
+    # An offset is the mean of what is left of its points, so it moves with the similarity by their mean Jacobian.
+    mean = np.einsum("gn,nk,nkp->gkp", membership, weights, problem.jacobian()) / own[:, :, None]
+    steps = mean - mean[reference]
+    covariance = np.linalg.pinv(_information(problem, weights, None), rcond=FREE, hermitian=True)
+    variances = np.einsum("gkp,pq,gkq->gk", steps, covariance, steps) + 1.0 / own + 1.0 / own[reference]
+    return np.asarray(max(fit.noise, LEAST_NOISE_FACTOR) * np.sqrt(np.maximum(variances, 0.0)))
 
 
 def turn_about_axis(
@@ -167,13 +166,14 @@ def _consensus(points: Correspondences, max_error: float) -> Similarity:
     """The best hypothesis from triples; accurate points count more."""
     importance = np.median(points.sigmas) / points.sigmas
     weights = importance.mean(axis=1) ** 2
-    triples = _triples(len(points))
+    triples = _triples(points)
     found = fit_similarity(points.source[triples], points.target[triples], weights[triples])
     hypotheses = [Similarity(float(scale), r, t) for scale, r, t in zip(*found, strict=True) if scale > 0.0]
     hypotheses.append(_closed_form(points, weights))
 
     def cost(hypothesis: Similarity) -> float:
-        squares = ((_residuals(hypothesis, points) * importance) ** 2).sum(axis=1)
+        settled = points.without(_median_offsets(hypothesis, points))
+        squares = ((_residuals(hypothesis, settled) * importance) ** 2).sum(axis=1)
         return float(np.minimum(squares, max_error**2).sum())
 
     costs = [cost(hypothesis) for hypothesis in hypotheses]
@@ -183,10 +183,11 @@ def _consensus(points: Correspondences, max_error: float) -> Similarity:
         for _ in range(LOCAL_ROUNDS):
             if cost(candidate) < best_cost:
                 best_cost, best = cost(candidate), candidate
-            near = np.linalg.norm(_residuals(candidate, points), axis=1) <= max_error
+            settled = points.without(_median_offsets(candidate, points))
+            near = np.linalg.norm(_residuals(candidate, settled), axis=1) <= max_error
             if near.sum() < 3:
                 break
-            candidate = _closed_form(points.only(near), weights[near])
+            candidate = _closed_form(settled.only(near), weights[near])
     return best
 
 
@@ -195,45 +196,51 @@ def _refine(
 ) -> SimilarityFit:
     """Reweighted least squares on the points near the fit, until these stay the same."""
     similarity = start
-    inliers = np.linalg.norm(_residuals(start, points), axis=1) <= max_error
+    settled = points.without(_median_offsets(start, points))
+    inliers = np.linalg.norm(_residuals(start, settled), axis=1) <= max_error
     if inliers.sum() < 3:
         inliers = np.ones(len(points), dtype=bool)
-    near, noise = inliers, 1.0
+    near, noise, offsets = inliers, 1.0, np.zeros((0, 3))
     for _ in range(LOCAL_ROUNDS):
-        similarity, noise = _reweighted(similarity, points.only(inliers), prior)
-        residuals = _residuals(similarity, points)
+        similarity, noise, offsets = _reweighted(similarity, points.only(inliers), prior)
+        residuals = _residuals(similarity, points.without(offsets))
         normed = _normed(residuals, points)
         near = np.linalg.norm(residuals, axis=1) <= max_error
         near &= normed <= max(OUTLIER_SIGMAS, OUTLIER_NOISES * noise)
         if near.sum() < 3 or (near == inliers).all():
             break
         inliers = near
-    chosen = points.only(inliers)
+    chosen = points.only(inliers).at_noise(noise)
     information = _information(_Problem(chosen, similarity), _sigma_weights(chosen), prior)
     factor = max(noise, LEAST_NOISE_FACTOR) if len(chosen) >= REDUNDANT else max(noise, 1.0)
     sigma_rotation, _ = _weakest_rotation(information)
     return SimilarityFit(
         similarity=similarity,
         inliers=near,
-        residuals=_residuals(similarity, points),
+        residuals=_residuals(similarity, points.without(offsets)),
         noise=noise,
         sigma_scale=factor * _sigma_scale(information),
         sigma_rotation_rad=factor * sigma_rotation,
         used_prior=prior is not None,
+        offsets=offsets,
     )
 
 
 def _reweighted(
     similarity: Similarity, points: Correspondences, prior: DirectionPrior | None
-) -> tuple[Similarity, float]:
-    """Gauss-Newton with Cauchy's weights at the residuals' own spread; returns the noise, too."""
+) -> tuple[Similarity, float, Float64[np.ndarray, "g 3"]]:
+    """Gauss-Newton with Cauchy's weights at the residuals' own spread; returns the noise and the offsets, too."""
     noise = 1.0
+    offsets = _median_offsets(similarity, points)
+    stated = points
     for _ in range(IRLS_ROUNDS):
-        problem = _Problem(points, similarity)
-        residuals = _residuals(similarity, points)
-        normed = _normed(residuals, points)
+        normed = _normed(_residuals(similarity, points.without(offsets)), points)
         noise = max(float(np.median(normed)) / MEDIAN_OF_CHI3, LEAST_NOISE)
         weights = _sigma_weights(points) / (1.0 + (normed / (CAUCHY * noise)) ** 2)[:, None]
+        points = stated.at_noise(noise)
+        problem = _Problem(points, similarity)
+        offsets = _offsets(similarity, points, weights)
+        residuals = _residuals(similarity, points.without(offsets))
         gradient = np.einsum("nk,nkp->p", weights * residuals, problem.jacobian())
         if prior is not None:
             turned = prior.source @ similarity.rotation.T
@@ -243,15 +250,20 @@ def _reweighted(
         extent = float(np.abs(problem.arms).max())
         if np.abs(step[:4]).max() < IRLS_TOLERANCE and np.abs(step[4:]).max() < IRLS_TOLERANCE * extent:
             break
-    return similarity, noise
+    return similarity, noise, _offsets(similarity, points, weights)
 
 
 def _information(
     problem: _Problem, weights: Float64[np.ndarray, "n 3"], prior: DirectionPrior | None
 ) -> Float64[np.ndarray, "7 7"]:
-    """The normal matrix: points by their weights, the prior by its sigma."""
+    """The normal matrix: points by their weights, the prior by its sigma, shared errors eliminated."""
     jacobian = problem.jacobian()
     information = np.einsum("nkp,nk,nkq->pq", jacobian, weights, jacobian)
+    shared = problem.points.shared
+    if shared is not None:
+        coupled = np.einsum("gn,nk,nkp->gkp", shared.membership(), weights, jacobian)
+        own = shared.membership() @ weights + 1.0 / shared.sigmas**2
+        information -= np.einsum("gkp,gk,gkq->pq", coupled, 1.0 / own, coupled)
     if prior is not None:
         turned = cross_matrix(prior.source @ problem.similarity.rotation.T)
         information[:3, :3] += (np.swapaxes(turned, 1, 2) @ turned).sum(axis=0) / prior.sigma_rad**2
@@ -281,11 +293,24 @@ def _sigma_scale(information: Float64[np.ndarray, "7 7"]) -> float:
     return 1.0 / math.sqrt(left) if left > FREE * information[3, 3] else math.inf
 
 
-def _triples(count: int) -> np.ndarray:
-    if math.comb(count, 3) <= MAX_HYPOTHESES:
-        return np.array(list(itertools.combinations(range(count), 3)))
+def _triples(points: Correspondences) -> np.ndarray:
+    """Of all points; where groups share errors, half within groups, which these errors leave alone."""
+    everyone = np.arange(len(points))
+    if points.shared is None:
+        return _triples_of(everyone, MAX_HYPOTHESES)
+    groups = [np.flatnonzero(members) for members in points.shared.membership()]
+    large = sorted((group for group in groups if len(group) >= 3), key=len, reverse=True)[:MOST_GROUPS]
+    share = MAX_HYPOTHESES // (2 * max(1, len(large)))
+    within = [_triples_of(group, share) for group in large]
+    return np.concatenate([*within, _triples_of(everyone, MAX_HYPOTHESES // 2)])
+
+
+def _triples_of(indices: np.ndarray, most: int) -> np.ndarray:
+    if math.comb(len(indices), 3) <= most:
+        return np.asarray(indices[np.array(list(itertools.combinations(range(len(indices)), 3)))])
     generator = np.random.Generator(np.random.PCG64(0))
-    return np.stack([generator.choice(count, 3, replace=False, shuffle=False) for _ in range(MAX_HYPOTHESES)])
+    draws = [generator.choice(len(indices), 3, replace=False, shuffle=False) for _ in range(most)]
+    return np.asarray(indices[np.stack(draws)])
 
 
 def _closed_form(points: Correspondences, weights: Float64[np.ndarray, " n"]) -> Similarity:
@@ -295,6 +320,30 @@ def _closed_form(points: Correspondences, weights: Float64[np.ndarray, " n"]) ->
 
 def _residuals(similarity: Similarity, points: Correspondences) -> Float64[np.ndarray, "n 3"]:
     return np.asarray(similarity.apply(points.source) - points.target)
+
+
+def _median_offsets(similarity: Similarity, points: Correspondences) -> Float64[np.ndarray, "g 3"]:
+    """The error that each group shares, as the median of its points' (target less transformed source)."""
+    if points.shared is None:
+        return np.zeros((0, 3))
+    errors = -_residuals(similarity, points)
+    offsets = np.zeros_like(points.shared.sigmas)
+    for group in range(len(offsets)):
+        members = points.shared.group == group
+        if members.any():
+            offsets[group] = np.median(errors[members], axis=0)
+    return offsets
+
+
+def _offsets(
+    similarity: Similarity, points: Correspondences, weights: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "g 3"]:
+    """The same by least squares, drawn to zero by the groups' sigmas."""
+    if points.shared is None:
+        return np.zeros((0, 3))
+    membership = points.shared.membership()
+    sums = membership @ (-weights * _residuals(similarity, points))
+    return np.asarray(sums / (membership @ weights + 1.0 / points.shared.sigmas**2))
 
 
 def _normed(residuals: Float64[np.ndarray, "n 3"], points: Correspondences) -> Float64[np.ndarray, " n"]:

@@ -53,6 +53,7 @@ class Exif:
         width: The picture's width when it was taken (PixelXDimension), or None.
         height: Likewise.
         gps: Position, or None when EXIF has none.
+        serial: Of the camera's body; empty when unknown.
     """
 
     make: str = ""
@@ -65,6 +66,7 @@ class Exif:
     width: int | None = None
     height: int | None = None
     gps: Gps | None = None
+    serial: str = ""
 
 
 def read_exif(picture: Image.Image) -> Exif:
@@ -89,6 +91,7 @@ def read_exif(picture: Image.Image) -> Exif:
         width=int(width) if width is not None else None,
         height=int(height) if height is not None else None,
         gps=_gps(_tags(picture, ExifTags.IFD.GPSInfo)),
+        serial=_text(tags.get(TAG.BodySerialNumber)),
     )
 
 

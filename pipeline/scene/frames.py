@@ -42,7 +42,10 @@ class Frame:
             place and heading mean nothing.
         world_from_model: From the model's frame to the world's.
         origin: The world's zero on the earth; None when arbitrary.
-        vertical_datum: Of the heights; ``unknown`` unless somebody declared it.
+        vertical_datum: Of the world's heights, which are as they were stated: ``ellipsoidal``, ``EPSG:n``, or
+            ``unknown`` unless somebody declared it.
+        crs: The CRS that coordinates are read out in, as ``parse_crs`` takes it; empty for the UTM zone of ``origin``.
+        approximate_crs: The user accepts it though a grid of it is missing.
         residuals: ``rmse_horizontal_m``, ``rmse_vertical_m``, ``rmse_m`` of the photos that took part, how many there
             are, the standard deviations of scale and rotation, and east, north, up of each photo by name (metres).
         left_out: Photos whose position is off, sorted.
@@ -56,6 +59,8 @@ class Frame:
     residuals: Mapping[str, Any] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     note: str = ""
+    crs: str = ""
+    approximate_crs: bool = False
 
 
 def save_frame(frame: Frame, path: Path) -> None:
@@ -68,6 +73,8 @@ def save_frame(frame: Frame, path: Path) -> None:
         if origin is None
         else {"latitude": origin.latitude, "longitude": origin.longitude, "height_m": origin.height_m},
         "vertical_datum": frame.vertical_datum,
+        "crs": frame.crs,
+        "approximate_crs": frame.approximate_crs,
         "world_from_model": similarity.matrix().tolist(),
         "scale": similarity.scale,
         "rotation": similarity.rotation.tolist(),
@@ -103,6 +110,8 @@ def load_frame(path: Path) -> Frame:
             residuals=value["residuals"],
             left_out=tuple(value["left_out"]),
             note=value["note"],
+            crs=str(value.get("crs", "")),
+            approximate_crs=bool(value.get("approximate_crs", False)),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(f"The frame {path} cannot be read: {error}", "Run again with --rerun georef.") from error

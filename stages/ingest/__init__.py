@@ -25,13 +25,14 @@ from splatpipe.pipeline.scene.photos import (
     photo_root,
     save_photo_list,
 )
-from splatpipe.stages.ingest.cameras import CameraGroup, cameras_json, group_cameras
+from splatpipe.stages.ingest.cameras import CameraGroup, cameras_json, group_cameras, refused_calibrations
 from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
 from splatpipe.stages.ingest.convert import convert_photo, save_png, scale_of
 from splatpipe.stages.ingest.duplicates import split_duplicates
 from splatpipe.stages.ingest.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
-from splatpipe.stages.ingest.positions import DATUM_STEP_M, PositionList, positions_json, read_positions
+from splatpipe.stages.ingest.positions import DATUM_STEP_M, NOWHERE, PositionList, positions_json, read_positions
 from splatpipe.stages.ingest.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan, scan_folder
+from splatpipe.stages.ingest.stated import FilePlace, read_places
 from splatpipe.stages.line import IngestConfig
 
 MIN_PHOTOS = 2
@@ -90,10 +91,11 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         others = [entry.name for entry in left_out]
         masked = _mask(_MASKS, root, photos, others, opacity, work)
         skies = _mask(_SKIES, root, photos, others, {}, work)
-    positions = read_positions(photos)
+    places = _places(inputs, photos, report)
+    positions = read_positions(photos, places)
     _tell_positions(positions, report)
     if colmap_model(inputs.photos_dir) is None:  # a given model has its calibration
-        _tell_focal(groups, report)
+        _tell_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
     _write_json(out / "cameras.json", cameras_json(groups))
     _write_json(out / "positions.json", positions_json(positions))
@@ -103,7 +105,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "left_out": len(left_out),
         "cameras": len(groups),
         "focal_sources": sorted({group.focal_source for group in groups}),
-        "positions": len(positions.positions),
+        **_accuracy(positions),
         "masks": len(masked),
         "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
@@ -239,10 +241,54 @@ def _tell_left_out(left_out: Sequence[LeftOut], report: Reporter) -> None:
         report.warning(f"Left out: {_names(names)} {reason}.")
 
 
+def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) -> Mapping[str, FilePlace]:
+    """What the file of positions says, where there is one."""
+    path = inputs["source.geo"]
+    if not path.is_file():
+        return {}
+    approximate = bool(inputs.settings.get("georef.approximate_crs", False))
+    places = read_places(path, [photo.name for photo in photos], approximate=approximate)
+    report.note(f"{path.name}: positions of {len(places.by_name)} of {len(photos)} photos, in {places.note}.")
+    if places.unknown:
+        report.warning(
+            f"{path.name} names photos that are not there, or twice: {_names(places.unknown)}.",
+            "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
+        )
+    others = [photo.name for photo in photos if photo.name not in places.by_name and photo.exif.gps is not None]
+    if others:
+        report.warning(
+            f"{path.name} does not name {_names(others)}: their own positions count, as a flight of its own.",
+            "Add them to the file if it has better ones.",
+        )
+    return places.by_name
+
+
+def _accuracy(positions: PositionList) -> dict[str, JSON]:
+    """How many positions there are, in how many flights, from where, and how accurate they count as."""
+    stated = positions.positions
+    if not stated:
+        return {"positions": 0}
+    return {
+        "positions": len(stated),
+        "position_sources": sorted({each.source for each in stated}),
+        "flights": len({each.flight for each in stated}),
+        "sigma_horizontal_m": float(np.median([each.sigma_horizontal_m for each in stated])),
+        "sigma_vertical_m": float(np.median([each.sigma_vertical_m for each in stated])),
+        "sigma_sources": sorted({each.sigma_source for each in stated}),
+    }
+
+
 def _tell_positions(positions: PositionList, report: Reporter) -> None:
     if positions.impossible:
         report.warning(
             f"The position is none that can be on Earth: {_names(positions.impossible)}.",
+            "These photos take part without their position.",
+        )
+    elsewhere = [f"{_shown(name)} {why}" for name, why in positions.wrong.items() if why != NOWHERE]
+    if elsewhere:
+        more = f"; and {len(elsewhere) - NAMES_SHOWN} more" if len(elsewhere) > NAMES_SHOWN else ""
+        report.warning(
+            f"Positions that cannot be right: {'; '.join(elsewhere[:NAMES_SHOWN])}{more}.",
             "These photos take part without their position.",
         )
     step = positions.altitude_step_m
@@ -253,7 +299,12 @@ def _tell_positions(positions: PositionList, report: Reporter) -> None:
         )
 
 
-def _tell_focal(groups: Sequence[CameraGroup], report: Reporter) -> None:
+def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:
+    if refused:
+        report.warning(
+            f"The calibrated focal length in {_names(refused)} is far from what lens and sensor give; it is not used.",
+            "Was the picture cropped or resized, or its metadata copied?",
+        )
     unknown = sum(group.photos for group in groups if not group.has_prior)
     if unknown:
         report.warning(

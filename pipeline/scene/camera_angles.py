@@ -1,0 +1,57 @@
+"""Conventions of a camera's yaw, pitch and roll, brought to that of gimbals: pitch -90 straight down."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Literal
+
+import numpy as np
+
+Convention = Literal["gimbal", "nadir"]
+DOWNWARD_DEG = -60.0  # who looks further down than this counts from the horizon: from nadir it would look back and up
+LOCKED = 1e-6  # cosine of the pitch: straight down, where yaw and roll turn about one axis
+
+
+def tell_convention(pitches_deg: Iterable[float]) -> Convention:
+    """Where the pitch of a camera's photos is counted from: 0 is the horizon (``gimbal``) or straight down (``nadir``).
+
+    Pix4D's ``Camera:`` tags count from nadir, and some makers write the gimbal's angle there all the same. Photos that
+    are taken for mapping look down in part: as -90 from the horizon, as 0 from nadir, where -60 or less would look
+    back past the horizontal's half.
+    """
+    pitches = [(pitch + 180.0) % 360.0 - 180.0 for pitch in pitches_deg]
+    return "gimbal" if pitches and min(pitches) <= DOWNWARD_DEG else "nadir"
+
+
+def gimbal_from_nadir(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+    """Angles of an aircraft whose camera looks down between its wings, as those of a gimbal.
+
+    Args:
+        yaw_deg: Of the top of the picture, clockwise from north.
+        pitch_deg: Nose up, so that the camera looks forward.
+        roll_deg: Right wing down.
+
+    Returns:
+        Yaw, pitch (-90 straight down) and roll of the same view, degrees.
+    """
+    yaw, pitch, roll = (math.radians(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
+    turned = _about_z(yaw) @ _about_y(pitch) @ _about_x(roll) @ _about_y(-math.pi / 2.0)
+    cosine = math.hypot(turned[0, 0], turned[1, 0])
+    down = math.degrees(math.atan2(-turned[2, 0], cosine))
+    if cosine < LOCKED:
+        return math.degrees(math.atan2(-turned[0, 1], turned[1, 1])), down, 0.0
+    heading = math.degrees(math.atan2(turned[1, 0], turned[0, 0]))
+    return heading, down, math.degrees(math.atan2(turned[2, 1], turned[2, 2]))
+
+
+def _about_x(angle: float) -> np.ndarray:
+    return np.array([[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]])
+
+
+def _about_y(angle: float) -> np.ndarray:
+    return np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+
+
+def _about_z(angle: float) -> np.ndarray:
+    return np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])

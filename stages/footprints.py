@@ -1,0 +1,135 @@
+"""How much of what one photo shows another one shows, too, from positions, angles and focal lengths alone.
+
+Each photo's rays are followed to where they may end: to the ground, and to where the views of the photos cross, which
+is the building that an orbit goes around. The share of these points that lies in another picture, weighted by how alike
+the two see them, says whether the pair is worth matching.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+GRID = 5  # rays across a picture, and as many down
+FURTHEST = 4.0  # times the height above ground or the distance to the building: what is behind is small in the picture
+LEAST_HEIGHT_M = 2.0
+CROSSING_DEG = 15.0  # views that part less do not tell where they cross
+CROSSING_MISS = 0.3  # of the distance: axes that pass each other by more do not look at the same thing
+LEAST_CROSSINGS = 3
+MARGIN = 0.1  # of a half picture: angles err by some degrees
+ALIKE_DEG, UNLIKE_DEG = 15.0, 90.0  # SIFT matches as well as ever up to the one, and nothing past the other
+
+
+@dataclass(frozen=True)
+class Views:
+    """How photos were taken; NaN throughout for a photo of which that is not known.
+
+    Attributes:
+        centres_m: East, north, up about any origin.
+        enu_from_camera: Rotations; camera x right, y down, z forward.
+        half_size: Tangents of half the field of view, across and down.
+        ground_m: Height of the ground in the same axes, below each photo.
+        noise_m: Standard deviation of the positions against each other.
+    """
+
+    centres_m: Float64[np.ndarray, "n 3"]
+    enu_from_camera: Float64[np.ndarray, "n 3 3"]
+    half_size: Float64[np.ndarray, "n 2"]
+    ground_m: Float64[np.ndarray, " n"]
+    noise_m: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.centres_m)
+
+    def known(self) -> Bool[np.ndarray, " n"]:
+        """Of which photos it is known how they were taken."""
+        return np.asarray(np.isfinite(self.centres_m).all(axis=1) & np.isfinite(self.axes).all(axis=1))
+
+    @property
+    def axes(self) -> Float64[np.ndarray, "n 3"]:
+        """Unit viewing directions."""
+        return np.asarray(self.enu_from_camera[:, :, 2])
+
+
+def overlaps(views: Views, candidates: int) -> dict[tuple[int, int], float]:
+    """The share of two photos' points that both show, weighted by how alike they show them.
+
+    Args:
+        views: The photos.
+        candidates: So many of the nearest photos are looked at, for each.
+
+    Returns:
+        From 0 (exclusive) to 1, the mean of both ways, by pair (i, j), i < j; pairs without any are left out.
+    """
+    known = np.flatnonzero(views.known())
+    crossings = crossing_distances(views)
+    shares: dict[tuple[int, int], float] = {}
+    for i in known.tolist():
+        distances = ((views.centres_m[known] - views.centres_m[i]) ** 2).sum(axis=1)
+        near = known[np.argsort(distances, kind="stable")[: candidates + 1]]
+        points = _points(views, i, float(crossings[i]))
+        for j, share in zip(near.tolist(), _share_seen(views, i, near, points).tolist(), strict=True):
+            if j != i and share > 0.0:
+                pair = (min(i, j), max(i, j))
+                shares[pair] = shares.get(pair, 0.0) + share / 2.0
+    return shares
+
+
+def crossing_distances(views: Views) -> Float64[np.ndarray, " n"]:
+    """Distance along each photo's axis to where other views cross it (the median); NaN where too few do."""
+    distances = np.full(len(views), np.nan)
+    axes = views.axes
+    for i in range(len(views)):
+        cosines = axes @ axes[i]
+        sines2 = np.maximum(1.0 - cosines**2, 1e-12)
+        base = views.centres_m - views.centres_m[i]
+        along, back = base @ axes[i], np.einsum("nk,nk->n", base, axes)
+        own = (along - cosines * back) / sines2
+        other = (cosines * along - back) / sines2
+        gap = np.linalg.norm(base + other[:, None] * axes - own[:, None] * axes[i], axis=1)
+        crosses = np.abs(cosines) < np.cos(np.radians(CROSSING_DEG))
+        crosses &= (own > LEAST_HEIGHT_M) & (other > LEAST_HEIGHT_M) & (gap < CROSSING_MISS * np.minimum(own, other))
+        if np.count_nonzero(crosses) >= LEAST_CROSSINGS:
+            distances[i] = np.median(own[crosses])
+    return distances
+
+
+def _points(views: Views, i: int, crossing_m: float) -> Float64[np.ndarray, "m 3"]:
+    """Where the rays of a photo may end."""
+    steps = (np.arange(GRID) + 0.5) / GRID * 2.0 - 1.0
+    across, down = np.meshgrid(steps * views.half_size[i, 0], steps * views.half_size[i, 1])
+    rays = np.stack([across.ravel(), down.ravel(), np.ones(GRID * GRID)], axis=1) @ views.enu_from_camera[i].T
+    height = max(float(views.centres_m[i, 2] - views.ground_m[i]), LEAST_HEIGHT_M)
+    reach = FURTHEST * (height if np.isnan(crossing_m) else max(height, crossing_m))
+    with np.errstate(divide="ignore"):
+        to_ground = np.where(rays[:, 2] < 0.0, height / np.maximum(-rays[:, 2], 1e-9), np.inf)
+    depths = to_ground[to_ground <= reach]
+    points = [views.centres_m[i] + depths[:, None] * rays[to_ground <= reach]]
+    if not np.isnan(crossing_m):
+        in_front = to_ground > crossing_m  # the ground ends the others before
+        points.append(views.centres_m[i] + crossing_m * rays[in_front])
+    elif not len(depths):
+        points.append(views.centres_m[i] + reach / 2.0 * rays)
+    return np.concatenate(points)
+
+
+def _share_seen(
+    views: Views, i: int, others: Int[np.ndarray, " k"], points: Float64[np.ndarray, "m 3"]
+) -> Float64[np.ndarray, " k"]:
+    """Of points that photo i shows, the weighted share that each of the others shows."""
+    to_point = points[None] - views.centres_m[others][:, None]  # (k, m, 3)
+    in_camera = np.einsum("kmx,kxc->kmc", to_point, views.enu_from_camera[others])
+    half_size = views.half_size[others][:, None]
+    distances = np.linalg.norm(to_point, axis=2)
+    slack = MARGIN + views.noise_m / np.maximum(distances, 1.0)[:, :, None] / half_size
+    depth = np.maximum(in_camera[:, :, 2:], 0.0)
+    inside = (np.abs(in_camera[:, :, :2]) <= (1.0 + slack) * half_size * depth).all(axis=2)
+    own = points - views.centres_m[i]
+    own_distances = np.linalg.norm(own, axis=1)
+    cosines = np.einsum("kmx,mx->km", to_point, own) / np.maximum(distances * own_distances, 1e-9)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    alike = np.clip((UNLIKE_DEG - angles) / (UNLIKE_DEG - ALIKE_DEG), 0.0, 1.0)
+    scale = np.minimum(distances, own_distances) / np.maximum(np.maximum(distances, own_distances), 1e-9)
+    return np.asarray((inside * alike * scale).mean(axis=1))

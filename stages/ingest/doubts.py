@@ -1,0 +1,46 @@
+"""Positions that cannot be right, judged by those of the other photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float64
+
+METRES_A_DEGREE = 111_195.0  # of a sphere: these distances only tell what is far
+FAR_M = 500.0  # no drone photographs one building from further
+FAR_SPREADS = 20.0  # times the median distance from the middle: long corridors are captures, too
+MIN_POSITIONS = 3  # of two, nobody knows which is wrong
+
+
+def find_wrong(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:
+    """Photos that state to be far from all others, and why.
+
+    Args:
+        places: Latitude and longitude in degrees, by photo.
+
+    Returns:
+        The end of a sentence that starts with the photo's name, by photo.
+    """
+    if len(places) < MIN_POSITIONS:
+        return {}
+    degrees = np.array(list(places.values()), dtype=np.float64)
+    # Longitudes about the first, as they may straddle 180°.
+    relative = np.stack([degrees[:, 0], (degrees[:, 1] - degrees[0, 1] + 180.0) % 360.0 - 180.0], axis=1)
+    middle = np.median(relative, axis=0)
+    distances = _distances_m(relative, middle)
+    limit = max(FAR_M, FAR_SPREADS * float(np.median(distances)))
+    swapped = np.stack([degrees[:, 1], (degrees[:, 0] - degrees[0, 1] + 180.0) % 360.0 - 180.0], axis=1)
+    mirrored = _distances_m(swapped, middle) <= limit
+    wrong = {}
+    for name, distance, is_mirrored in zip(places, distances, mirrored, strict=True):
+        if distance > limit:
+            far = f"is stated {distance / 1000.0:,.1f} km from the others"
+            wrong[name] = "has latitude and longitude swapped" if is_mirrored else far
+    return wrong
+
+
+def _distances_m(places: Float64[np.ndarray, "n 2"], middle: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " n"]:
+    """Along the meridian and the parallel; enough to tell what is far."""
+    east = (places[:, 1] - middle[1]) * np.cos(np.radians(middle[0]))
+    return np.asarray(METRES_A_DEGREE * np.hypot(places[:, 0] - middle[0], east))

@@ -1,0 +1,114 @@
+"""Files of control points: every form that surveyors hand over, and none that breaks the reader."""
+
+from pathlib import Path
+
+import pytest
+
+from splatpipe.demo import CAPTURE
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.control_file import ControlFile, Mark, read_control_file
+
+
+def read(folder: Path, text: str | bytes, name: str = "gcp_list.txt") -> ControlFile:
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_control_file(path)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32633", "+proj=utm +zone=11 +ellps=WGS84 +units=m +no_defs\t", "WGS84 UTM 33N"])
+def test_odm_list_gives_points_with_their_marks(tmp_path: Path, crs: str) -> None:
+    found = read(
+        tmp_path,
+        f"# surveyed by us\n{crs}\r\n10.5 20.25 512.0 100.5 200.25 A.JPG P1 extra 7\r\n\n# pause\n"
+        "10.5\t20.25\t512.0\t7\t8\tmy photo.JPG\tP1\n11 21 513 1 2 A.JPG P2\n",
+    )
+    assert found.crs == crs.strip()
+    assert [point.name for point in found.points] == ["P1", "P2"]
+    assert (found.points[0].x, found.points[0].y, found.points[0].z) == (10.5, 20.25, 512.0)
+    assert found.points[0].marks == (Mark("A.JPG", 100.5, 200.25), Mark("my photo.JPG", 7.0, 8.0))
+    assert found.points[0].role is None
+
+
+def test_lines_without_names_are_told_apart_by_their_coordinates(tmp_path: Path) -> None:
+    found = read(tmp_path, "EPSG:32633\n1 2 3 10 20 A.JPG\n4 5 6 10 20 A.JPG\n1 2 3 11 21 B.JPG\n")
+    assert [(point.name, len(point.marks)) for point in found.points] == [("point 1", 2), ("point 2", 1)]
+
+
+def test_demo_capture_has_eighteen_points(tmp_path: Path) -> None:
+    found = read_control_file(CAPTURE / "gcp_list.txt")
+    assert found.crs == "EPSG:32633"
+    assert len(found.points) == 18
+    assert all(point.z is not None and len(point.marks) >= 2 for point in found.points)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "EPSG:25832\nname,x,y,z,photo,pixel_x,pixel_y,role,sigma_h,sigma_v\nP1,1.5,2.5,3.5,A.JPG,10,20,check,0.01,0.02\n",
+        "# CRS: EPSG:25832\nName;Easting;Northing;Height;Image;px;py;Role;accuracy_xy;accuracy_z\n"
+        "P1;1,5;2,5;3,5;A.JPG;10;20;check;0,01;0,02\n",
+        "label\tcrs\teast\tnorth\taltitude\timage_name\tu\tv\ttype\tsigma_xy\tsigma_z\n"
+        "P1\t25832\t1.5\t2.5\t3.5\tA.JPG\t10\t20\tcp\t.01\t.02\n",
+    ],
+)
+def test_tables_are_read_by_their_header(tmp_path: Path, text: str) -> None:
+    found = read(tmp_path, text, "control.csv")
+    point = found.points[0]
+    assert found.crs == "EPSG:25832"
+    assert (point.name, point.x, point.y, point.z) == ("P1", 1.5, 2.5, 3.5)
+    assert (point.role, point.sigma_m, point.marks) == ("check", (0.01, 0.02), (Mark("A.JPG", 10.0, 20.0),))
+
+
+def test_table_of_longitudes_and_latitudes_needs_no_crs(tmp_path: Path) -> None:
+    found = read(tmp_path, "name,lat,lon,photo,px,py\nP1,47.8,13.5,A.JPG,1,2\n")
+    assert (found.crs, found.points[0].x, found.points[0].y, found.points[0].z) == ("EPSG:4326", 13.5, 47.8, None)
+
+
+def test_height_of_exactly_zero_is_unknown_unless_the_sea_is_near(tmp_path: Path) -> None:
+    inland = read(tmp_path, "EPSG:32633\n1 2 0.0 1 1 A.JPG P1\n3 4 512 1 1 A.JPG P2\n5 6 NaN 1 1 A.JPG P3\n")
+    assert [point.z for point in inland.points] == [None, 512.0, None]
+    assert inland.zero_heights == ("P1",)
+    coast = read(tmp_path, "EPSG:32633\n1 2 0.0 1 1 A.JPG P1\n3 4 1.25 1 1 A.JPG P2\n")
+    assert [point.z for point in coast.points] == [0.0, 1.25]
+    flat = read(tmp_path, "EPSG:32633\n1 2 0.0 1 1 A.JPG P1\n3 4 0 1 1 A.JPG P2\n")
+    assert [point.z for point in flat.points] == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("EPSG:32633\n", "no observations"),
+        ("1 2 3 4 5 A.JPG P1\n", "has to name the CRS"),
+        ("EPSG:32633\n1 2 3 4 5\n", "Line 2.*5 fields"),
+        ("EPSG:32633\n1 2 3 nan 5 A.JPG\n", "Line 2.*pixel x"),
+        ("EPSG:32633\n1 1e300 3 4 5 A.JPG\n", "Line 2.*y is"),
+        ("EPSG:32633\n1 inf 3 4 5 A.JPG\n", "Line 2.*y is"),
+        ("EPSG:32633\n1 2 3 4 5 A.JPG P1\n9 2 3 4 5 B.JPG P1\n", "Line 3.*other coordinates than in line 2"),
+        ("EPSG:32633\n1 2 3 4 5 A.JPG P1\n1 2 3 40 5 A.JPG P1\n", "Line 3.*second mark"),
+        ("EPSG:32633\n1 2 3 4 5 " + "A" * 300 + " P1\n", "Line 2.*too long"),
+        ("EPSG:32633\n" + "1" * 3000, "no plain text in line 2"),
+        (b"EPSG:32633\n1 2 3 4 5 \x00.JPG", "no plain text in line 2"),
+        (b"\xff\xd8\xff\xe0\x00\x10JFIF", "no UTF-8"),
+        ("name,x,y,photo,px,py\nP1,1,2,A.JPG,3,4\n", "names no CRS"),
+        ("EPSG:1\nname,x,y,photo,px,py,role\nP1,1,2,A.JPG,3,4,boss\n", "Line 3.*neither control nor check"),
+        ("EPSG:1\nname,x,y,photo,px,py,sigma_h\nP1,1,2,A.JPG,3,4,0\n", "Line 3.*standard deviation"),
+        ("name,x,y,photo,px,py,crs\nP1,1,2,A.JPG,3,4,1\nP2,1,2,A.JPG,3,4,2\n", "Line 3.*another CRS"),
+    ],
+)
+def test_file_that_is_wrong_is_refused_with_its_line(tmp_path: Path, text: str | bytes, message: str) -> None:
+    with pytest.raises(SplatpipeError, match=message) as caught:
+        read(tmp_path, text)
+    assert caught.value.hint
+
+
+def test_point_may_be_listed_without_being_marked(tmp_path: Path) -> None:
+    assert read(tmp_path, "EPSG:32633\nname,x,y,photo,px,py\nP1,1,2\n").points[0].marks == ()
+
+
+def test_too_much_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SplatpipeError, match="more than 200,000 lines"):
+        read(tmp_path, "EPSG:32633\n" + "\n" * 200_001)
+    many = "EPSG:32633\n" + "".join(f"{i} 0 1 2 3 A.JPG P{i}\n" for i in range(10_001))
+    with pytest.raises(SplatpipeError, match="10,000 points"):
+        read(tmp_path, many)

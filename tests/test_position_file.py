@@ -1,0 +1,106 @@
+"""Files of photos' positions: geo.txt as ODM defines it, CSV as people write it, and what is neither."""
+
+import random
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.position_file import PhotoPlace, PositionFile, read_position_file
+from splatpipe.pipeline.scene.survey_text import MAX_LINE_CHARS
+
+
+def read(tmp_path: Path, text: str | bytes) -> PositionFile:
+    path = tmp_path / "geo.txt"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return read_position_file(path)
+
+
+def test_fields_of_geo_txt_count_strictly_by_position(tmp_path: Path) -> None:
+    file = read(
+        tmp_path,
+        "# made by hand\nEPSG:32633\n"
+        "a.jpg 388710.5 5299705.2\n"
+        "b.jpg 388710.5 5299705.2 512.0\n"
+        "c.jpg 388710.5 5299705.2 512.0 0.02 0.03\n"
+        "d.jpg 388710.5 5299705.2 512.0 90 -5 1\n"
+        "# c.jpg in between\n"
+        "e.jpg\t388710.5\t5299705.2\t512.0\t0\t0\t0\t0.02\t0.03\n",
+    )
+    place = (388710.5, 5299705.2)
+    nothing = (None, None)
+    assert file.crs == "EPSG:32633"
+    assert file.photos == (
+        PhotoPlace(3, "a.jpg", *place, None, None, nothing),
+        PhotoPlace(4, "b.jpg", *place, 512.0, None, nothing),
+        PhotoPlace(5, "c.jpg", *place, 512.0, None, nothing),
+        PhotoPlace(6, "d.jpg", *place, 512.0, (90.0, -5.0, 1.0), nothing),
+        PhotoPlace(8, "e.jpg", *place, 512.0, None, (0.02, 0.03)),
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "name,lon,lat,alt\na b.jpg,13.5127,47.8412,512\n",
+        "\ufeffImage;Longitude;Latitude;Altitude\r\na b.jpg;13,5127;47,8412;512\r\n",
+        "EPSG:4326\nfilename\tx\ty\tz\na b.jpg\t13.5127\t47.8412\t512\n",
+        "# CRS: EPSG:4326\nlabel,y,x,height\na b.jpg,47.8412,13.5127,512\n",
+        'photo,x,y,z,epsg\n"a b.jpg",13.5127,47.8412,512,4326\n',
+    ],
+)
+def test_a_csv_is_read_by_its_header(tmp_path: Path, text: str) -> None:
+    file = read(tmp_path, text)
+    assert file.crs == "EPSG:4326"
+    (photo,) = file.photos
+    assert (photo.name, photo.x, photo.y, photo.z) == ("a b.jpg", 13.5127, 47.8412, 512.0)
+
+
+def test_angles_and_accuracies_of_a_csv(tmp_path: Path) -> None:
+    header = "name,lon,lat,alt,yaw,pitch,roll,sigma_horizontal,sigma_vertical\n"
+    file = read(tmp_path, header + "a.jpg,13.5,47.8,512,90,-88,0.5,0.02,0.04\nb.jpg,13.5,47.8,,,,,0,\n")
+    assert file.photos[0].angles_deg == (90.0, -88.0, 0.5)
+    assert file.photos[0].sigma_m == (0.02, 0.04)
+    assert (file.photos[1].z, file.photos[1].angles_deg, file.photos[1].sigma_m) == (None, None, (None, None))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("# nothing\n\n", "is empty"),
+        ("EPSG:4326\n", "names no photo"),
+        ("a.jpg 13.5 47.8 512\n", "Line 1 .* the first line has to name the CRS"),
+        ("EPSG:4326\na.jpg 13.5\n", "Line 2 .* 2 fields where at least 3"),
+        ("EPSG:4326\na.jpg 13.5 north\n", "Line 2 .* y is 'north'"),
+        ("EPSG:4326\na.jpg 13.5 inf\n", "Line 2 .* y is 'inf'"),
+        ("EPSG:4326\na.jpg 13.5 1e300\n", "Line 2 .* no number that it can be"),
+        ("EPSG:4326\na.jpg 13.5 -\n", "Line 2 .* no x or no y"),
+        ("EPSG:4326\na.jpg 1 2\na.jpg 1 2\n", "Line 3 .* was in line 2 already"),
+        ("EPSG:4326\na.jpg 1 2 3 0 0 0 -5 1\n", "Line 2 .* an accuracy of -5 m"),
+        ("EPSG:4326\na.jpg 1 2 3 1e6 0 0\n", "Line 2 .* angles"),
+        ("name,x,y\na.jpg,388710,5299705\n", "names no CRS"),
+        ("name,x,y,epsg\na.jpg,1,2,4326\nb.jpg,1,2,32633\n", "Line 3 .* another CRS"),
+        ("EPSG:4326\n" + "a" * (MAX_LINE_CHARS + 1), "no plain text in line 2"),
+        ("EPSG:4326\na\x00.jpg 1 2\n", "no plain text in line 2"),
+        (b"EPSG:4326\n\xff\xfe.jpg 1 2\n", "no UTF-8 text"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, text: str | bytes, message: str) -> None:
+    with pytest.raises(SplatpipeError, match=message) as caught:
+        read(tmp_path, text)
+    assert caught.value.hint
+
+
+def test_hostile_files_are_refused_or_read_and_nothing_else(tmp_path: Path) -> None:
+    rng = random.Random(4)
+    text = "EPSG:32633\nname,x,y\na.jpg 388710.5 5299705.2 512.0 90 -5 1 0.02 0.03\nb.jpg\t1\t2\t3\n"
+    for _ in range(300):
+        data = bytearray(text.encode())
+        for _ in range(rng.randint(1, 12)):
+            at = rng.randrange(len(data))
+            data[at : at + rng.randint(0, 3)] = bytes(rng.choices(b' \t\n,;"#-.e19:\x00\xc3', k=rng.randint(0, 4)))
+        try:
+            read(tmp_path, bytes(data))
+        except SplatpipeError as error:
+            assert error.message and error.hint
