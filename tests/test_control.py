@@ -190,6 +190,13 @@ def test_residuals_to_consumer_gps_are_what_was_injected(tmp_path: Path, whole: 
         assert table[f"rmse_{axis}_m"] == pytest.approx(sigma, rel=0.2)
 
 
+def test_check_points_in_another_datum_than_the_positions_are_told(
+    tmp_path: Path, whole: pycolmap.Reconstruction
+) -> None:
+    result = georef(tmp_path, whole, gcp_list(rows(FIVE)), RTK, lift=47.0, check_points=checks(*FIVE))
+    assert [w for w in result.told.warnings if "+47.0 m" in w and "vertical datum" in w]
+
+
 def test_control_places_a_model_without_positions(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     result = georef(tmp_path, whole, gcp_list(rows(tuple(POINTS))), None, check_points=checks(*OTHERS))
     assert result.table("gps") is None
@@ -452,6 +459,6 @@ def test_intervals_follow_the_chi_squared_distribution(degrees: int, tail: float
     assert chi_squared_quantile(0.975, degrees) == pytest.approx(tail, rel=1e-6)
     assert chi_squared_cdf(tail, degrees) == pytest.approx(0.975, abs=1e-7)
     rng = np.random.default_rng(degrees)
-    rms = np.sqrt((rng.normal(size=(400, degrees)) ** 2).mean(axis=1))
+    rms = np.sqrt((rng.normal(size=(200, degrees)) ** 2).mean(axis=1))
     held = [low <= 1.0 <= high for low, high in (rmse_interval(float(each), degrees) for each in rms)]
-    assert np.mean(held) == pytest.approx(0.95, abs=0.04)
+    assert np.mean(held) == pytest.approx(0.95, abs=0.05)

@@ -28,6 +28,8 @@ from splatpipe.stages.georef.place import Site, Targets, stations_of
 from splatpipe.stages.georef.survey import load_survey
 from splatpipe.stages.line import GeorefConfig
 
+DATUM_STEP_M = 1.0  # between two vertical datums; less may be the receiver's error
+
 
 def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write the parts frame (``frame.json``), model, control (``control.json``) and accuracy (``accuracy.json``).
@@ -61,7 +63,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         frame = arbitrary_frame(model, positions, frame)
     frame = _declared(frame, config, controlled)
     save_frame(frame, out / "frame.json")
-    accuracy = _write_accuracy(config, out, controlled, (model, positions, frame), photos)
+    accuracy = _write_accuracy(config, out, controlled, (model, positions, frame), photos, report)
     if controlled is not None and controlled.bent is not None:
         write_model(controlled.bent, out / "sparse" / "0")
     else:
@@ -110,12 +112,14 @@ def _write_accuracy(
     controlled: ByControl | None,
     alone: tuple[SparseModel, Positions, Frame],
     photos: Mapping[str, Photo],
+    report: Reporter,
 ) -> JSON:
     """Write ``control.json`` and ``accuracy.json``; returns the latter."""
     if controlled is not None:
         control = control_json(controlled.survey, controlled.site, controlled.placed, photos, config.mark_sigma_px)
         gsd = gsd_m(controlled.survey, controlled.placed.model, controlled.placed.world_from_model.scale)
         accuracy = accuracy_json(controlled.survey, controlled.site, controlled.placed, gsd or None)
+        _tell_heights(accuracy["tables"], report)
     else:
         control = no_control()
         accuracy = _accuracy_of_positions(*alone)
@@ -123,6 +127,16 @@ def _write_accuracy(
         text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
         (out / name).write_text(text + "\n", encoding="utf-8")
     return accuracy
+
+
+def _tell_heights(tables: JSON, report: Reporter) -> None:
+    """Warn of check points whose heights are in another datum than the positions', where no control joins the two."""
+    check = tables["check"]
+    if tables["control"] is None and check is not None and abs(check["mean_m"][2] or 0.0) > DATUM_STEP_M:
+        report.warning(
+            f"The check points' heights differ from the positions' by {check['mean_m'][2]:+.1f} m on average.",
+            "They may be in another vertical datum. Control points with heights would tell the offset.",
+        )
 
 
 def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Frame) -> JSON:
@@ -133,7 +147,7 @@ def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Fram
     nothing = Targets(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
     site = Site(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))
     placed = replace(placed, offsets=_stated_offsets(frame, stations.flights))
-    return accuracy_json(None, site, placed, None)
+    return accuracy_json(None, site, placed, model.gsd(frame.world_from_model.scale))
 
 
 def _stated_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:

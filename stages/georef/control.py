@@ -38,6 +38,7 @@ QUIET = 2.0  # times the stated sigmas: control that is off by no more keeps the
 STRAY = 0.1  # of a focal length from its prior: worth a warning
 SUSPICIOUS = 1.0  # with sigmas that are none too small, sound control stays well below
 LONELY = 3.0  # a point is off alone where the others are quieter without it by this
+CROWD = 3.0  # sigmas: where half of the points are off by more, it is not one that is
 SUSPECTS = 3  # points that are tried so, those with the largest residuals
 ROUNDS = 4  # of adjustment, each with the control that the one before showed to be wrong or less accurate
 
@@ -129,7 +130,7 @@ def place_by_control(
 def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, config: GeorefConfig) -> Frame:
     control = survey.of_role("control")
     heights = any(point.surveyed.z is not None for point in control)
-    vertical = survey.crs.vertical if heights else UNKNOWN
+    vertical = survey.crs.vertical if heights else UNKNOWN if frame is None else frame.vertical_datum
     if vertical == UNKNOWN and config.vertical != "auto":
         vertical = parse_vertical(config.vertical)
     note = f"From {len(control)} control points"
@@ -183,7 +184,7 @@ def _without_one(
 ) -> tuple[int, float, _Settled] | None:
     """The point without which the others agree, how far it is off then, and the adjustment; None if there is none."""
     chosen = _chosen(settled.survey)
-    if len(chosen) <= MIN_CONTROL:
+    if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > CROWD:
         return None
     for worst in np.argsort(-settled.done.normed, kind="stable")[:SUSPECTS].tolist():
         index = chosen[worst]

@@ -81,6 +81,19 @@ class SparseModel:
         camera = self.reconstruction.cameras[image.camera_id]
         return View(camera, np.asarray(image.cam_from_world().matrix(), np.float64), camera.width / width)
 
+    def gsd(self, scale: float) -> float | None:
+        """Ground sampling distance in a world that is so many times larger: the median of the photos' medians."""
+        sizes = []
+        for number in self.image_ids:
+            image = self.reconstruction.images[number]
+            seen = [self.reconstruction.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]
+            if seen:
+                pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+                depths = np.array(seen) @ pose[2, :3] + pose[2, 3]
+                focal = self.reconstruction.cameras[image.camera_id].mean_focal_length()
+                sizes.append(scale * float(np.median(depths)) / focal)
+        return float(np.median(sizes)) if sizes else None
+
 
 def read_model(path: Path, photos: Iterable[str]) -> SparseModel:
     """Read a sparse model.

@@ -58,7 +58,7 @@ def surface_points(count: int, seed: int = 0) -> tuple[Array, Array]:
 
 
 def true_model(
-    photos: Sequence[str] | None = None, points: int = 1500, seed: int = 0, flat: bool = False
+    photos: Sequence[str] | None = None, points: int = 900, seed: int = 0, flat: bool = False
 ) -> pycolmap.Reconstruction:
     """Exact cameras and points, their features seen with noise, in the true world; or over flat ground alone."""
     rng = np.random.default_rng(seed)
