@@ -143,7 +143,7 @@ def placed(
 def contents(path: Path, work: Path, threads: int) -> dict[str, str]:
     """Digests of a capture's files, remembered in the work folder."""
     table = HashTable(work / "photos-index.json", remember=True)
-    return open_source(path, work).digests(table, threads, SilentReporter())
+    return open_source(path, work, LINE, config_of((), 0)).digests(table, threads, SilentReporter())
 
 
 def options(sets: Sequence[str]) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from splatpipe.pipeline.scene.names import NameFinder
 ONE_SURFACE = 0.02  # of the depth, between neighbouring pixels: ground at a slant has less, an edge far more
 ENOUGH = 3  # held-out photos of a point: of two, a single floater moves the median by half of its distance
 DIGITS = 5  # of lengths in metres: a hundredth of a millimetre
+POINT_FACTS = ("name", "role", "why", "surveyed_crs", "surveyed_m", "sigma_m", "estimated_m", "residual_m")
 DepthMap = Float[np.ndarray, "h w"]
 
 
@@ -65,7 +66,7 @@ def measure_accuracy(
     held_out: Sequence[str],
     depth_of: Callable[[Camera], DepthMap],
 ) -> dict[str, Any]:
-    """What metrics.json has as `accuracy`: georef's tables, and the splat's own.
+    """What metrics.json has as `accuracy`: georef's tables and points, and the splat's own.
 
     Args:
         parts: With ``georef.frame``, ``georef.control`` and ``georef.accuracy``; where a dataset alone is evaluated,
@@ -78,9 +79,9 @@ def measure_accuracy(
         StageError: if a part is broken.
     """
     if "georef.control" not in parts:
-        return {"gsd_m": None, "tables": {}, "splat": None}
+        return {"gsd_m": None, "tables": {}, "points": [], "splat": None}
     frame = load_frame(parts["georef.frame"])
-    result: dict[str, Any] = dict(_read(parts["georef.accuracy"]))
+    result: dict[str, Any] = {**_read(parts["georef.accuracy"]), "points": georef_points(parts["georef.control"])}
     points = read_surveyed(parts["georef.control"], [camera.name for camera in cameras])
     if frame.kind != "enu" or not any(point.observations for point in points):
         return {**result, "splat": None}
@@ -95,6 +96,26 @@ def measure_accuracy(
                 if seen.photo == photo:
                     places[point.name] += _unprojected(seen, by_name[photo], depth, frame)
     return {**result, "splat": _splat(points, places, set(held_out))}
+
+
+def georef_points(control: Path) -> list[dict[str, Any]]:
+    """Each point of `control.json` with what georef found of it, without its single observations.
+
+    Raises:
+        StageError: if it is broken.
+    """
+    try:
+        told = []
+        for point in _read(control)["points"]:
+            entry = {name: point.get(name) for name in POINT_FACTS}
+            squares = [x * x + y * y for x, y in filter(None, (seen["residual_px"] for seen in point["observations"]))]
+            rms = math.sqrt(math.fsum(squares) / len(squares)) if squares else None
+            told.append(
+                {**entry, "photos": len(point["observations"]), "rms_px": None if rms is None else round(rms, 3)}
+            )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise StageError(f"{control.name} is broken: {error!r}.", hint="Run again with --rerun georef.") from error
+    return told
 
 
 def read_surveyed(control: Path, photos: Sequence[str]) -> list[Surveyed]:

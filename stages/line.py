@@ -74,7 +74,8 @@ class GeorefConfig(StageConfig):
     vertical: Annotated[str, Field(max_length=40)] = "auto"
     """Vertical datum of the photos' heights: `ellipsoidal`, `EPSG:n` or `unknown`. Auto: what the files declare."""
     approximate_crs: bool = False
-    """Take a CRS though the grid of its best way to WGS 84 is missing; what that costs is stated in `georef.json`."""
+    """Take a CRS though the grid of its best way to WGS 84 is missing, or EPSG knows none from its (modern) datum; what
+    that costs is stated in `georef.json`."""
     pixel_origin: Literal["corner", "centre"] = "corner"
     """What the pixel coordinates (0, 0) of marks mean: the top-left corner of the first pixel, or its centre."""
     check_points: Annotated[str, Field(max_length=20_000)] = "auto"

@@ -101,6 +101,18 @@ def test_a_true_splat_has_no_residuals(parts: dict[str, Path]) -> None:
         assert len(told["observations"]) == tiny_scene.CAMERAS and not told["held_out"]
 
 
+def test_what_georef_found_of_each_point_is_kept(parts: dict[str, Path]) -> None:
+    told = json.loads(parts["georef.control"].read_text())
+    told["points"][1] |= {"why": "", "residual_m": [0.01, 0.02, None], "surveyed_crs": [388_710.5, 5_299_705.2, None]}
+    told["points"][1]["observations"][0]["residual_px"] = [0.3, -0.4]
+    told["points"][1]["observations"][1]["residual_px"] = [0.0, 1.2]
+    rewrite(parts["georef.control"], told)
+    point = measured(parts)["points"][1]
+    assert (point["name"], point["role"], point["photos"]) == ("P1", "check", 9)
+    assert point["residual_m"] == [0.01, 0.02, None] and point["surveyed_crs"][0] == 388_710.5
+    assert point["rms_px"] == pytest.approx(math.sqrt((0.25 + 1.44) / 2), abs=1e-3)
+
+
 def test_a_splat_beside_its_place_is_told_by_how_much(parts: dict[str, Path]) -> None:
     """Surveyed points beside the wall: the residuals are the negative of it."""
     off = (0.3, -0.2, 0.5)
@@ -152,7 +164,7 @@ def test_points_without_a_height_photo_or_surface_are_told_as_far_as_they_go(par
 
 def test_without_points_or_a_place_on_earth_there_are_georefs_tables_alone(parts: dict[str, Path]) -> None:
     rewrite(parts["georef.control"], {"points": []})
-    assert measured(parts) == {"gsd_m": 0.7, "tables": {"gps": None}, "splat": None}
+    assert measured(parts) == {"gsd_m": 0.7, "tables": {"gps": None}, "points": [], "splat": None}
     rewrite(parts["georef.control"], control(cameras(), points_on_the_wall()))
     save_frame(Frame("arbitrary", WORLD_FROM_MODEL), parts["georef.frame"])
     assert measured(parts)["splat"] is None

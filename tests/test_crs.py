@@ -262,6 +262,22 @@ def test_a_missing_grid_is_taken_as_it_is_where_the_user_accepts_that_and_told()
     assert np.hypot(*(there[:2] - [538_250.0, 177_600.0])) < 1000.0  # Greenwich, roughly, in the national grid
 
 
+def test_a_modern_datum_without_an_operation_is_wgs84_only_where_the_user_accepts_that() -> None:
+    """CGCS2000 has none in EPSG; MGI's, beside its area of use, is hundreds of metres off and stays refused."""
+    wuhan = frame("EPSG:4547", origin=Origin(30.5, 114.3, 30.0))
+    with pytest.raises(SplatpipeError, match="knows no way") as raised:
+        open_world(wuhan)
+    assert "approximate_crs" in raised.value.hint
+    operation = georeference(replace(wuhan, approximate_crs=True), BOX)["crs"]["operation"]
+    assert operation["accuracy_m"] is None and "taken for" in operation["note"]
+    with pytest.raises(SplatpipeError, match="knows no way"):
+        open_operation(parse_crs("EPSG:31277"), 44.0, 21.0, approximate=True)
+    with pytest.raises(SplatpipeError, match="knows no way"):
+        open_operation(parse_crs("EPSG:2985"), -66.5, 140.0, approximate=True)
+    unstated = open_operation(parse_crs("+proj=utm +zone=33 +ellps=GRS80 +units=m"), 47.8, 13.5)
+    assert "not stated" in unstated.note
+
+
 def test_heights_go_through_the_geoids_grid_where_it_is_there(tmp_path: Path) -> None:
     """A made-up EGM96: 40 m at 47° N, falling by 2 m to the degree northwards."""
     rows, columns = 721, 1440
@@ -312,6 +328,12 @@ def test_coordinates_of_another_crs_are_named() -> None:
         to_geodetic(np.array([[1e12, 1e12, 0.0]]), parse_crs("EPSG:31255"))
     with pytest.raises(SplatpipeError, match="no place for"):
         to_geodetic(np.array([[np.nan, 0.0, 0.0]]), parse_crs("EPSG:32633"))
+
+
+@pytest.mark.parametrize("text", ["+proj=tmerc +R=1e300", "+proj=laea +R=298.257", "+proj=laea +over=bessel +a=33"])
+def test_a_crs_of_another_planet_is_refused(text: str) -> None:
+    with pytest.raises(SplatpipeError, match=r"knows no way|no place for"):
+        to_geodetic(np.array([[388_710.5, 5_299_705.2, 512.0]]), parse_crs(text))
 
 
 def test_utm_zones_hemispheres_and_poles() -> None:

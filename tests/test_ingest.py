@@ -605,6 +605,23 @@ def test_positions_angles_and_sigmas_are_read(folder: Path) -> None:
     assert (found["float.jpg"]["rtk"], found["float.jpg"]["sigma_horizontal_m"]) == ("float", 0.5)
 
 
+def test_the_file_of_positions_counts_and_says_so(folder: Path, tmp_path: Path) -> None:
+    save(folder / "c.jpg", 3, exif=drone_exif(gps_of(46.5, -91.5, 198.5)))
+    geo = tmp_path / "geo.txt"
+    geo.write_text("EPSG:4326\na.jpg -91.5001 46.5001 199 0 0 0 0.02 0.03\nz.jpg -91.5 46.5 199\n")
+    result = ingest(folder, geo=geo)
+    found = {str(record["name"]): record for record in result.json("positions.json")["positions"]}
+    assert (found["a.jpg"]["source"], found["c.jpg"]["source"]) == ("file", "exif")
+    assert found["a.jpg"]["flight"] != found["c.jpg"]["flight"]
+    assert (found["a.jpg"]["latitude"], found["a.jpg"]["sigma_horizontal_m"]) == (pytest.approx(46.5001), 0.02)
+    assert (result.summary["position_sources"], result.summary["sigma_sources"]) == (
+        ["exif", "file"],
+        ["default", "file"],
+    )
+    assert any("not there, or twice: z.jpg" in warning for warning in result.warnings)
+    assert any("does not name c.jpg" in warning for warning in result.warnings)
+
+
 def test_impossible_positions_are_left_out_and_named(folder: Path) -> None:
     save(folder / "zero.jpg", 3, exif=drone_exif(gps_of(0.0, 0.0, 0.0)))
     save(folder / "north.jpg", 4, exif=drone_exif(gps_of(91.0, 10.0, 0.0)))
@@ -641,6 +658,22 @@ def test_cameras_are_grouped_by_make_model_size_and_focal_length(folder: Path) -
     assert groups[1]["params"] == [groups[1]["focal_px"], 200.0, 150.0, 0.0]
 
 
+def test_dewarped_photos_are_another_camera_and_a_false_calibration_is_told(folder: Path) -> None:
+    for seed, (name, values) in enumerate(
+        {
+            "c.jpg": {"DewarpFlag": 0},
+            "d.jpg": {"DewarpFlag": 1},
+            "e.jpg": {},
+            "f.jpg": {"CalibratedFocalLength": "3600"},
+        }.items()
+    ):
+        save(folder / name, seed + 3, exif=drone_exif(), xmp=xmp_of(**values))
+    result = ingest(folder)
+    cameras = {name: photo.camera for name, photo in result.photos.items()}
+    assert cameras["c.jpg"] == cameras["e.jpg"] == cameras["f.jpg"] != cameras["d.jpg"]
+    assert any("calibrated focal length in f.jpg is far" in warning for warning in result.warnings)
+
+
 CALIBRATED = {"drone-dji:CalibratedFocalLength": "2300.0"}
 DRONE = Exif(make="DJI", model="FC330", focal_mm=3.61, focal_35mm=20.0, width=4000, height=3000)
 
@@ -652,6 +685,7 @@ DRONE = Exif(make="DJI", model="FC330", focal_mm=3.61, focal_35mm=20.0, width=40
         (DRONE, CALIBRATED, (2000, 1500), "xmp-calibrated", 1150.0),
         (DRONE, CALIBRATED, (1500, 2000), "xmp-calibrated", 1150.0),
         (DRONE, {"drone-dji:CalibratedFocalLength": "3.6"}, (4000, 3000), "sensor-table", 2340.4),
+        (DRONE, {"drone-dji:CalibratedFocalLength": "3600"}, (4000, 3000), "sensor-table", 2340.4),
         (DRONE, {}, (2000, 1500), "sensor-table", 1170.2),
         (
             Exif(focal_mm=30.0, focal_plane_px_per_mm=191.5, width=4272, height=2848),

@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Bool, Float64
 
+from splatpipe.pipeline.scene.correspondences import LEAST_NOISE_FACTOR, Correspondences, DirectionPrior, Shared
 from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity, rotation_from_vector
+
+__all__ = [
+    "Correspondences",
+    "DirectionPrior",
+    "Shared",
+    "SimilarityFit",
+    "offset_step_sigmas",
+    "robust_similarity",
+    "turn_about_axis",
+]
 
 MAX_HYPOTHESES = 1000  # with half the points wrong, one triple in eight is right: missing it has odds of 1e-58
 REFINED_HYPOTHESES = 5
@@ -25,76 +36,6 @@ OUTLIER_SIGMAS = 3.0  # and an error within what the position states is none
 LEAST_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
 REDUNDANT = 8  # points from which on the residuals tell the noise better than the stated sigmas do
 MOST_GROUPS = 20  # whose triples are tried: one good group is enough
-LEAST_NOISE_FACTOR = 0.3  # GNSS errors change slowly: residuals of one flight look better than the positions are
-
-
-@dataclass(frozen=True)
-class Shared:
-    """Errors that points of a group have in common, e.g. those of one flight.
-
-    Attributes:
-        group: Of each point; -1 for those that share nothing.
-        sigmas: Standard deviations of each group's error, in the target's units.
-    """
-
-    group: Int[np.ndarray, " n"]
-    sigmas: Float64[np.ndarray, "g 3"]
-
-    def membership(self) -> Float64[np.ndarray, "g n"]:
-        """1 where a point is of a group, else 0."""
-        return np.asarray(self.group == np.arange(len(self.sigmas))[:, None], dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Correspondences:
-    """The same points in two frames.
-
-    Attributes:
-        source: In the source frame, any units.
-        target: In the target frame.
-        sigmas: Standard deviations of the target's coordinates, besides what they share.
-        shared: Errors of the target that groups of points share; None without any.
-    """
-
-    source: Float64[np.ndarray, "n 3"]
-    target: Float64[np.ndarray, "n 3"]
-    sigmas: Float64[np.ndarray, "n 3"]
-    shared: Shared | None = None
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def only(self, chosen: Bool[np.ndarray, " n"]) -> Correspondences:
-        """Some of them."""
-        shared = None if self.shared is None else Shared(self.shared.group[chosen], self.shared.sigmas)
-        return Correspondences(self.source[chosen], self.target[chosen], self.sigmas[chosen], shared)
-
-    def without(self, offsets: Float64[np.ndarray, "g 3"]) -> Correspondences:
-        """The same without what groups have in common, which is taken off their targets."""
-        if self.shared is None:
-            return self
-        return replace(self, target=self.target - self.shared.membership().T @ offsets)
-
-    def at_noise(self, noise: float) -> Correspondences:
-        """The same where the stated sigmas are wrong by this factor, and those of shared errors are not."""
-        if self.shared is None:
-            return self
-        return replace(self, shared=replace(self.shared, sigmas=self.shared.sigmas / max(noise, LEAST_NOISE_FACTOR)))
-
-
-@dataclass(frozen=True)
-class DirectionPrior:
-    """Directions known in both frames, which hold a rotation that points leave free.
-
-    Attributes:
-        source: (k, 3) unit vectors.
-        target: (k, 3) unit vectors.
-        sigma_rad: Standard deviation of each.
-    """
-
-    source: Float64[np.ndarray, "k 3"]
-    target: Float64[np.ndarray, "k 3"]
-    sigma_rad: float
 
 
 @dataclass(frozen=True)
@@ -366,10 +307,10 @@ def _triples(points: Correspondences) -> np.ndarray:
 
 def _triples_of(indices: np.ndarray, most: int) -> np.ndarray:
     if math.comb(len(indices), 3) <= most:
-        return indices[np.array(list(itertools.combinations(range(len(indices)), 3)))]
+        return np.asarray(indices[np.array(list(itertools.combinations(range(len(indices)), 3)))])
     generator = np.random.Generator(np.random.PCG64(0))
     draws = [generator.choice(len(indices), 3, replace=False, shuffle=False) for _ in range(most)]
-    return indices[np.stack(draws)]
+    return np.asarray(indices[np.stack(draws)])
 
 
 def _closed_form(points: Correspondences, weights: Float64[np.ndarray, " n"]) -> Similarity:

@@ -8,26 +8,32 @@ read is plain text from elsewhere: everything has a limit, and every refusal nam
 from __future__ import annotations
 
 import csv
-import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.survey_text import (
+    CRS_COMMENT,
+    MAX_LINE_CHARS,
+    UNKNOWN,
+    LineError,
+    TableKind,
+    delimiter_of,
+    find_columns,
+    is_number,
+    number_in,
+    read_lines,
+    title_of,
+)
 
 Role = Literal["control", "check"]
-MAX_BYTES = 32 << 20
-MAX_LINES = 200_000
-MAX_LINE = 2000
 MAX_POINTS = 10_000
 MAX_NAME = 255
-LARGEST = 1e9  # of a coordinate, metres or pixels: beyond it there is neither an earth nor a photo
 SAME_PLACE_M = 1e-3  # lines of one point repeat its coordinates; within a millimetre they do
 SEA_LEVEL_M = 20.0  # a height of exactly 0 is one, where other points lie so near to it; else nobody measured it
 SIGMA_BOUNDS_M = (1e-4, 1e3)
-UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "name": ("name", "label", "point", "point_name", "gcp", "gcp_name", "id"),
     "x": ("x", "geo_x", "east", "easting", "e", "lon", "longitude", "x/east", "x/longitude"),
@@ -56,9 +62,6 @@ ROLES: Mapping[str, Role] = {
     "checkpoint": "check",
     "cp": "check",
 }
-CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg)\s*[:=]\s*(\S.*)", re.IGNORECASE)
-DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,7 @@ def read_control_file(path: Path) -> ControlFile:
     Raises:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
-    lines = _lines(path)
+    lines = read_lines(path, _KIND)
     written = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not written:
         raise SplatpipeError(f"The control file {path.name} is empty.", _EXPECTED)
@@ -134,7 +137,7 @@ def read_control_file(path: Path) -> ControlFile:
     try:
         crs, rows = _odm_rows(written) if header is None else _csv_rows(lines, written, header)
         return _assemble(crs, rows)
-    except _LineError as error:
+    except LineError as error:
         where = f"Line {error.line} of" if error.line else "The control file"
         raise SplatpipeError(f"{where} {path.name}: {error}.", error.hint or _EXPECTED) from error
 
@@ -143,51 +146,22 @@ _EXPECTED = (
     "First a line with the CRS, e.g. EPSG:32633, then lines of `x y z pixel_x pixel_y photo point`;"
     " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo."
 )
-
-
-class _LineError(ValueError):
-    def __init__(self, line: int, text: str, hint: str = "") -> None:
-        super().__init__(text)
-        self.line, self.hint = line, hint
-
-
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered lines, from 1.
-
-    Raises:
-        SplatpipeError: if the file is no text, or too much of it.
-    """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise SplatpipeError(f"The control file {path.name} is too large.", "Is it a table of control points?")
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise SplatpipeError(
-            f"The control file {path.name} is no UTF-8 text.", "Save it as plain text in UTF-8."
-        ) from error
-    except OSError as error:
-        raise SplatpipeError(f"The control file {path} cannot be read: {error.strerror}.") from error
-    lines = text.splitlines()
-    long = next((i for i, line in enumerate(lines, 1) if len(line) > MAX_LINE or CONTROL_CHARACTERS.search(line)), None)
-    if len(lines) > MAX_LINES or long is not None:
-        what = f"more than {MAX_LINES:,} lines" if long is None else f"no plain text in line {long}"
-        raise SplatpipeError(f"The control file {path.name} has {what}.", _EXPECTED)
-    return list(enumerate(lines, 1))
+_KIND = TableKind("control file", _EXPECTED, max_bytes=32 << 20, max_lines=200_000)
 
 
 def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[_Row]]:
     first, crs = written[0][0], written[0][1].strip()
     fields = crs.split()
-    if len(fields) >= 6 and all(_is_number(field) for field in fields[:5]):
-        raise _LineError(first, "the first line has to name the CRS, and is an observation", _EXPECTED)
+    if len(fields) >= 6 and all(is_number(field) for field in fields[:5]):
+        raise LineError(first, "the first line has to name the CRS, and is an observation", _EXPECTED)
     rows = []
     for number, line in written[1:]:
         fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 5 else line.split()
         if len(fields) < 6:
-            raise _LineError(number, f"{len(fields)} fields where at least 6 are needed")
-        place = (_number(number, "x", fields[0]), _number(number, "y", fields[1]), _height(number, fields[2]))
+            raise LineError(number, f"{len(fields)} fields where at least 6 are needed")
+        place = (number_in(number, "x", fields[0]), number_in(number, "y", fields[1]), _height(number, fields[2]))
         mark = Mark(
-            _name(number, fields[5]), _number(number, "pixel x", fields[3]), _number(number, "pixel y", fields[4])
+            _name(number, fields[5]), number_in(number, "pixel x", fields[3]), number_in(number, "pixel y", fields[4])
         )
         name = _name(number, fields[6]) if len(fields) > 6 and fields[6] else ""
         rows.append(_Row(number, name, place, mark, None, (None, None)))
@@ -195,80 +169,65 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[_Row]]:
 
 
 def _is_header(line: str) -> bool:
-    delimiter = _delimiter(line)
-    columns = _columns(next(csv.reader([line], delimiter=delimiter)))
+    delimiter = delimiter_of(line)
+    columns = find_columns(next(csv.reader([line], delimiter=delimiter)), COLUMNS)
     return {"x", "y", "photo", "px", "py"} <= set(columns)
-
-
-def _delimiter(line: str) -> str:
-    return max(",;\t", key=line.count)
-
-
-def _columns(header: Sequence[str]) -> dict[str, int]:
-    """The place of each column that is known, by our name for it."""
-    spelled = {spelling: name for name, spellings in COLUMNS.items() for spelling in spellings}
-    places: dict[str, int] = {}
-    for place, title in enumerate(header):
-        name = spelled.get(title.strip().casefold().replace(" ", "_"))
-        if name is not None:
-            places.setdefault(name, place)
-    return places
 
 
 def _csv_rows(
     lines: Sequence[tuple[int, str]], written: Sequence[tuple[int, str]], header: int
 ) -> tuple[str, list[_Row]]:
     number, line = written[header]
-    delimiter = _delimiter(line)
+    delimiter = delimiter_of(line)
     titles = next(csv.reader([line], delimiter=delimiter))
-    columns = _columns(titles)
+    columns = find_columns(titles, COLUMNS)
     crs = written[0][1].strip() if header == 1 else ""
     comments = (CRS_COMMENT.match(text.strip()) for _, text in lines)
     crs = crs or next((found.group(1).strip() for found in comments if found), "")
-    if not crs and titles[columns["x"]].strip().casefold() in GEOGRAPHIC:
+    if not crs and title_of(titles[columns["x"]]) in GEOGRAPHIC:
         crs = "EPSG:4326"
     rows = []
     for number, text in written[header + 1 :]:
         try:
             cells = next(csv.reader([text], delimiter=delimiter))
         except csv.Error as error:
-            raise _LineError(number, str(error)) from error
+            raise LineError(number, str(error)) from error
         row = {name: cells[place].strip() if place < len(cells) else "" for name, place in columns.items()}
         stated = row.get("crs", "")
         if stated:
             stated = f"EPSG:{stated}" if stated.isdigit() else stated
             if crs and crs.casefold() != stated.casefold():
-                raise _LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})", "Use one CRS a file.")
+                raise LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})", "Use one CRS a file.")
             crs = stated
         rows.append(_csv_row(number, row))
     if not crs:
-        raise _LineError(0, "it names no CRS", "Put it into the first line, e.g. EPSG:32633, or into a column crs.")
+        raise LineError(0, "it names no CRS", "Put it into the first line, e.g. EPSG:32633, or into a column crs.")
     return crs, rows
 
 
 def _csv_row(number: int, row: Mapping[str, str]) -> _Row:
     role = row.get("role", "").casefold()
     if role and role not in ROLES:
-        raise _LineError(number, f"the role {role[:40]!r} is neither control nor check")
-    place = (_number(number, "x", row["x"]), _number(number, "y", row["y"]), _height(number, row.get("z", "")))
+        raise LineError(number, f"the role {role[:40]!r} is neither control nor check")
+    place = (number_in(number, "x", row["x"]), number_in(number, "y", row["y"]), _height(number, row.get("z", "")))
     mark = None
     if row["photo"]:  # a point may be listed without being marked
         photo = _name(number, row["photo"])
-        mark = Mark(photo, _number(number, "pixel x", row["px"]), _number(number, "pixel y", row["py"]))
+        mark = Mark(photo, number_in(number, "pixel x", row["px"]), number_in(number, "pixel y", row["py"]))
     sigmas = (_sigma(number, row.get("sigma_horizontal", "")), _sigma(number, row.get("sigma_vertical", "")))
     return _Row(number, _name(number, row["name"]) if row.get("name") else "", place, mark, ROLES.get(role), sigmas)
 
 
 def _assemble(crs: str, rows: Sequence[_Row]) -> ControlFile:
-    if not crs or len(crs) > MAX_LINE:
-        raise _LineError(0, "it names no CRS")
+    if not crs or len(crs) > MAX_LINE_CHARS:
+        raise LineError(0, "it names no CRS")
     if not rows:
-        raise _LineError(0, "it has no observations")
+        raise LineError(0, "it has no observations")
     groups: dict[object, list[_Row]] = {}
     for row in rows:
         groups.setdefault(row.name or row.place, []).append(row)
     if len(groups) > MAX_POINTS:
-        raise _LineError(0, f"it has more than {MAX_POINTS:,} points")
+        raise LineError(0, f"it has more than {MAX_POINTS:,} points")
     heights = [group[0].place[2] for group in groups.values()]
     at_sea = any(height and abs(height) < SEA_LEVEL_M for height in heights)
     points, zero = [], []
@@ -288,9 +247,7 @@ def _point(name: str, rows: Sequence[_Row], keep_zero: bool) -> SurveyedPoint:
         _require_same(name, first, row)
         if row.mark is not None:
             if row.mark.photo in marks and row.mark != marks[row.mark.photo]:
-                raise _LineError(
-                    row.line, f"a second mark of {name} in {row.mark.photo}", "A photo shows a point once."
-                )
+                raise LineError(row.line, f"a second mark of {name} in {row.mark.photo}", "A photo shows a point once.")
             marks[row.mark.photo] = row.mark
     x, y, z = first.place
     role = next((row.role for row in rows if row.role is not None), None)
@@ -304,43 +261,29 @@ def _require_same(name: str, first: _Row, row: _Row) -> None:
         if (have is None) != (want is None) or (
             have is not None and want is not None and abs(have - want) > SAME_PLACE_M
         ):
-            raise _LineError(
+            raise LineError(
                 row.line,
                 f"{name} has other coordinates than in line {first.line}",
                 "One name is one point: correct the coordinates, or give the points different names.",
             )
     if row.role is not None and first.role is not None and row.role != first.role:
-        raise _LineError(row.line, f"{name} is {row.role} here and {first.role} in line {first.line}")
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
-
-
-def _number(line: int, what: str, text: str) -> float:
-    text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
-    if not _is_number(text) or abs(float(text)) > LARGEST:
-        raise _LineError(line, f"{what} is {text[:40]!r}, no number that it can be")
-    return float(text)
+        raise LineError(row.line, f"{name} is {row.role} here and {first.role} in line {first.line}")
 
 
 def _height(line: int, text: str) -> float | None:
-    return None if text.casefold() in UNKNOWN else _number(line, "height", text)
+    return None if text.casefold() in UNKNOWN else number_in(line, "height", text)
 
 
 def _sigma(line: int, text: str) -> float | None:
     if text.casefold() in UNKNOWN:
         return None
-    value = _number(line, "the standard deviation", text)
+    value = number_in(line, "the standard deviation", text)
     if not SIGMA_BOUNDS_M[0] <= value <= SIGMA_BOUNDS_M[1]:
-        raise _LineError(line, f"a standard deviation of {value:g} m")
+        raise LineError(line, f"a standard deviation of {value:g} m")
     return value
 
 
 def _name(line: int, text: str) -> str:
     if not text or len(text) > MAX_NAME:
-        raise _LineError(line, "a name that is empty or too long")
+        raise LineError(line, "a name that is empty or too long")
     return text

@@ -22,6 +22,7 @@ import numpy as np
 import pyproj
 from jaxtyping import Float64
 from pyproj.aoi import AreaOfInterest
+from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -35,6 +36,7 @@ from splatpipe.pipeline.scene.crs_names import (
     same_datum,
     utm_of,
 )
+from splatpipe.pipeline.scene.geodesy import FLATTENING, SEMI_MAJOR_M
 
 __all__ = [
     "ELLIPSOIDAL",
@@ -105,7 +107,8 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
         crs: The CRS.
         latitude: Of the place, degrees.
         longitude: The same.
-        approximate: Take the best of those whose grids are there, though a better one lacks its grid.
+        approximate: Take the best of those whose grids are there, though a better one lacks its grid; and a datum of
+            WGS 84's ellipsoid for WGS 84 where EPSG has no operation.
 
     Raises:
         SplatpipeError: if the place is far outside of the CRS's area, a grid is missing, or PROJ knows no operation.
@@ -114,15 +117,14 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
     group = _quiet_group(crs.horizontal, latitude, longitude)
     if not group.best_available and not (approximate and group.transformers):
         raise _lacks_grid(crs, group)
+    note = crs.assumed
+    if not group.transformers and approximate and _like_wgs84(crs):
+        group = _quiet_group(crs.horizontal, latitude, longitude, allow_ballpark=True)
+        note = "EPSG has no operation to WGS 84: its datum is taken for that, which may be metres off."
     if not group.transformers:
-        raise SplatpipeError(
-            f"PROJ knows no way between {crs.text} ({crs.name}) and WGS 84.",
-            "State its datum: an EPSG code, or +datum=… or +towgs84=… in the PROJ string.",
-        )
+        raise _no_way(f"{crs.text} ({crs.name})", _like_wgs84(crs))
     best = group.transformers[0]
     accuracy = float(best.accuracy) if best.accuracy is not None and best.accuracy >= 0.0 else None
-    assumed = crs.text.startswith("+") and "datum" not in crs.text and "towgs84" not in crs.text
-    note = "Its datum is not stated and taken for WGS 84." if assumed else ""
     name = re.sub(r" \+ axis order change \([^)]*\)|axis order change \([^)]*\) \+ ", "", best.description)
     return Operation(name, accuracy, best.definition, bool(group.best_available), note, best)
 
@@ -234,23 +236,31 @@ def undulation(
     return np.asarray(height, dtype=np.float64)
 
 
-def _quiet_group(source: pyproj.CRS, latitude: float, longitude: float) -> TransformerGroup:
+def _quiet_group(
+    source: pyproj.CRS, latitude: float, longitude: float, *, allow_ballpark: bool = False
+) -> TransformerGroup:
     south, north = max(latitude - AROUND_DEG, -90.0), min(latitude + AROUND_DEG, 90.0)
     area = AreaOfInterest(longitude - AROUND_DEG, south, longitude + AROUND_DEG, north)
     with warnings.catch_warnings():  # that a grid is missing: it is told by an error of our own
         warnings.simplefilter("ignore", UserWarning)
-        return TransformerGroup(
-            source,
-            WGS84_3D,
-            always_xy=True,
-            area_of_interest=area,  # type: ignore[arg-type]  # pyproj's stub has a class of its own for it
-            allow_ballpark=False,
-        )
+        try:
+            return TransformerGroup(
+                source,
+                WGS84_3D,
+                always_xy=True,
+                area_of_interest=area,  # type: ignore[arg-type]  # pyproj's stub has a class of its own for it
+                allow_ballpark=allow_ballpark,
+            )
+        except (ProjError, IndexError) as error:  # the latter where PROJ knows nothing of an operation's grid
+            raise _no_way(source.name) from error
 
 
 def _rough_place(points: Float64[np.ndarray, "n 3"], crs: Crs) -> tuple[float, float]:
     """Where the points are, to a kilometre: enough to choose the operation by."""
-    rough = pyproj.Transformer.from_crs(crs.horizontal, WGS84_3D, always_xy=True)
+    try:
+        rough = pyproj.Transformer.from_crs(crs.horizontal, WGS84_3D, always_xy=True)
+    except ProjError as error:  # a CRS of another planet, for one
+        raise _no_way(f"{crs.text} ({crs.name})") from error
     lon, lat = rough.transform(points[:, 0], points[:, 1], np.zeros(len(points)))[:2]
     good = np.isfinite(lon) & np.isfinite(lat)
     if not good.any():
@@ -316,6 +326,22 @@ def _lacks_grid(crs: Crs, group: TransformerGroup) -> SplatpipeError:
         f"{crs.text} ({crs.name}) needs a grid that is not there: {', '.join(missing[:GRIDS_SHOWN])}; {rest}.",
         _how_to_fetch(missing) + " --set georef.approximate_crs=true takes it as it is.",
     )
+
+
+def _like_wgs84(crs: Crs) -> bool:
+    """Whether its ellipsoid is WGS 84's to a millimetre: then its datum is a modern one, metres off at most."""
+    ellipsoid = crs.horizontal.ellipsoid
+    if ellipsoid is None:
+        return False
+    shape = abs(ellipsoid.semi_major_metre - SEMI_MAJOR_M), abs(ellipsoid.inverse_flattening - 1.0 / FLATTENING)
+    return shape[0] < 0.5 and shape[1] < 1e-4
+
+
+def _no_way(crs: str, like_wgs84: bool = False) -> SplatpipeError:
+    hint = "State its datum: an EPSG code, or +datum=… or +towgs84=… in the PROJ string."
+    if like_wgs84:
+        hint = "--set georef.approximate_crs=true takes its datum for WGS 84, which may be metres off."
+    return SplatpipeError(f"PROJ knows no way between {crs} and WGS 84.", hint)
 
 
 def _not_there(crs: Crs, point: Float64[np.ndarray, " 3"]) -> SplatpipeError:

@@ -39,6 +39,7 @@ class Crs:
         vertical: Datum of its heights: ``ellipsoidal``, ``EPSG:n`` of a vertical CRS, or ``unknown``.
         height_unit_m: Of its heights.
         area: Where it is meant for: west, south, east, north in degrees; None where that is not stated.
+        assumed: What its text leaves open, a sentence or empty.
         horizontal: What pyproj has of it, with heights above its own ellipsoid.
     """
 
@@ -47,6 +48,7 @@ class Crs:
     vertical: str
     height_unit_m: float
     area: tuple[float, float, float, float] | None
+    assumed: str
     horizontal: pyproj.CRS = field(repr=False, compare=False)
 
     @property
@@ -162,7 +164,7 @@ def _from_epsg(code: str, heights: str | None) -> Crs:
         raise SplatpipeError(f"{text} ({name}) is neither a projected nor a geographic CRS.", FORMS)
     use = horizontal.area_of_use
     area = None if use is None else (use.west, use.south, use.east, use.north)
-    return Crs(text, name, vertical, unit_m, area, horizontal.to_3d())
+    return Crs(text, name, vertical, unit_m, area, "", horizontal.to_3d())
 
 
 def _from_proj(text: str) -> Crs:
@@ -182,8 +184,10 @@ def _from_proj(text: str) -> Crs:
     unit = keys.get("vunits") or keys.get("units", "m")
     kept = [token for token in text.split(" ") if not token.startswith(("+vunits", "+type", "+no_defs"))]
     stated = " ".join([*kept, "+no_defs"])
+    assumed = ""
     if keys.get("ellps") in LIKE_WGS84 and not {"datum", "towgs84", "nadgrids"} & set(keys):
         kept.append("+towgs84=0,0,0")
+        assumed = "Its datum is not stated and taken for WGS 84."
     try:
         crs = pyproj.CRS(" ".join([*kept, "+no_defs", "+type=crs"]))
     except CRSError as error:
@@ -193,7 +197,7 @@ def _from_proj(text: str) -> Crs:
     unit_m = 1.0 if crs.is_geographic and "vunits" not in keys else HEIGHT_UNITS_M.get(unit, 0.0)
     if unit_m == 0.0:
         raise SplatpipeError(f"The unit {unit[:20]} of {text[:120]} is not known.", "m, ft and us-ft are.")
-    return Crs(stated, stated, UNKNOWN, unit_m, None, crs.to_3d())
+    return Crs(stated, stated, UNKNOWN, unit_m, None, assumed, crs.to_3d())
 
 
 @cache

@@ -9,22 +9,27 @@ read is plain text from elsewhere: everything has a limit, and every refusal nam
 from __future__ import annotations
 
 import csv
-import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.survey_text import (
+    CRS_COMMENT,
+    UNKNOWN,
+    LineError,
+    TableKind,
+    delimiter_of,
+    find_columns,
+    is_number,
+    number_in,
+    read_lines,
+    title_of,
+)
 
-MAX_BYTES = 64 << 20
-MAX_LINES = 1_000_000
-MAX_LINE_CHARS = 2000
 MAX_NAME_CHARS = 1000
-LARGEST = 1e9  # of a coordinate: beyond it there is no earth
 LARGEST_ANGLE_DEG = 720.0
 SIGMA_BOUNDS_M = (1e-4, 1e4)
-UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "name": ("name", "image", "image_name", "photo", "filename", "file", "label", "sourcefile"),
     "x": ("x", "geo_x", "east", "easting", "e", "lon", "lng", "long", "longitude", "gpslongitude", "x/longitude"),
@@ -48,13 +53,12 @@ GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "x/longitude")
 NUMBERS = ("x", "y", "z", "yaw", "pitch", "roll", "sigma_horizontal", "sigma_vertical")
 ODM_ORDER = ("name", *NUMBERS)
 ANGLES_FROM = 7  # fields of a line of geo.txt
-CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg)\s*[:=]\s*(\S.*)", re.IGNORECASE)
-DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 EXPECTED = (
     "First a line with the CRS, e.g. EPSG:4326, then lines of `photo x y z`, east (or longitude) first; or a CSV with a"
     " header name,longitude,latitude,altitude."
 )
+
+KIND = TableKind("file of positions", EXPECTED, max_bytes=64 << 20, max_lines=1_000_000)
 
 
 @dataclass(frozen=True)
@@ -88,23 +92,17 @@ class PositionFile:
     photos: tuple[PhotoPlace, ...]
 
 
-class _LineError(ValueError):
-    def __init__(self, line: int, text: str) -> None:
-        super().__init__(text)
-        self.line = line
-
-
 def read_position_file(path: Path) -> PositionFile:
     """Read a file of photos' positions.
 
     Raises:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
-    lines = _lines(path)
+    lines = read_lines(path, KIND)
     written = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not written:
         raise SplatpipeError(f"The file of positions {path.name} is empty.", EXPECTED)
-    header = next((at for at, (_, line) in enumerate(written[:2]) if _columns(line, _delimiter(line))), None)
+    header = next((at for at, (_, line) in enumerate(written[:2]) if _header(line)), None)
     try:
         if header is None:
             crs, rows = _odm_rows(written)
@@ -112,7 +110,7 @@ def read_position_file(path: Path) -> PositionFile:
             crs, rows = _csv_rows([line for _, line in lines], written, header)
         photos = [_photo(number, row) for number, row in rows]
         _require_once(photos)
-    except _LineError as error:
+    except LineError as error:
         where = f"Line {error.line} of" if error.line else "The file of positions"
         raise SplatpipeError(f"{where} {path.name}: {error}.", EXPECTED) from error
     if not photos:
@@ -120,40 +118,17 @@ def read_position_file(path: Path) -> PositionFile:
     return PositionFile(crs, tuple(photos))
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered lines, from 1."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise SplatpipeError(f"The file of positions {path.name} is too large.", "Is it a table of photos?")
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise SplatpipeError(
-            f"The file of positions {path.name} is no UTF-8 text.", "Save it as plain text in UTF-8."
-        ) from error
-    except OSError as error:
-        raise SplatpipeError(
-            f"The file of positions {path} cannot be read: {error.strerror}.", "Check the path."
-        ) from error
-    lines = text.splitlines()
-    if len(lines) > MAX_LINES:
-        raise SplatpipeError(f"The file of positions {path.name} has more than {MAX_LINES:,} lines.", EXPECTED)
-    for number, line in enumerate(lines, 1):
-        if len(line) > MAX_LINE_CHARS or CONTROL_CHARACTERS.search(line):
-            raise SplatpipeError(f"The file of positions {path.name} has no plain text in line {number}.", EXPECTED)
-    return list(enumerate(lines, 1))
-
-
 def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[tuple[int, Mapping[str, str]]]]:
     first, crs = written[0]
     fields = crs.split()
-    if len(fields) >= 3 and all(_is_number(field) for field in fields[1:3]):
-        raise _LineError(first, "the first line has to name the CRS, and is a photo's")
+    if len(fields) >= 3 and all(is_number(field) for field in fields[1:3]):
+        raise LineError(first, "the first line has to name the CRS, and is a photo's")
     rows: list[tuple[int, Mapping[str, str]]] = []
     for number, line in written[1:]:
         # A name with blanks is one field where tabs part the fields.
         fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 2 else line.split()
         if len(fields) < 3:
-            raise _LineError(number, f"{len(fields)} fields where at least 3 are needed")
+            raise LineError(number, f"{len(fields)} fields where at least 3 are needed")
         row = dict(zip(ODM_ORDER, fields, strict=False))
         if len(fields) < ANGLES_FROM:
             row = {key: row[key] for key in ("name", "x", "y", "z") if key in row}
@@ -165,56 +140,43 @@ def _csv_rows(
     lines: Sequence[str], written: Sequence[tuple[int, str]], header: int
 ) -> tuple[str, list[tuple[int, Mapping[str, str]]]]:
     _, titles = written[header]
-    delimiter = _delimiter(titles)
-    columns = _columns(titles, delimiter)
+    delimiter = delimiter_of(titles)
+    columns = _header(titles)
     comments = (CRS_COMMENT.match(line.strip()) for line in lines)
     crs = written[0][1].strip() if header == 1 else next((found[1].strip() for found in comments if found), "")
-    if not crs and _title(titles.split(delimiter)[columns["x"]]) in GEOGRAPHIC:
+    if not crs and title_of(next(csv.reader([titles], delimiter=delimiter))[columns["x"]]) in GEOGRAPHIC:
         crs = "EPSG:4326"
     rows: list[tuple[int, Mapping[str, str]]] = []
     for number, line in written[header + 1 :]:
         try:
             cells = next(csv.reader([line], delimiter=delimiter))
         except csv.Error as error:
-            raise _LineError(number, str(error)) from error
+            raise LineError(number, str(error)) from error
         row = {key: cells[place].strip() if place < len(cells) else "" for key, place in columns.items()}
         stated = f"EPSG:{row['crs']}" if row.get("crs", "").isdigit() else row.get("crs", "")
         if stated and crs and crs.casefold() != stated.casefold() and rows:
-            raise _LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})")
+            raise LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})")
         crs = stated or crs
         rows.append((number, row))
     if not crs:
-        raise _LineError(0, "it names no CRS: put it into the first line, e.g. EPSG:32633, or into a column crs")
+        raise LineError(0, "it names no CRS: put it into the first line, e.g. EPSG:32633, or into a column crs")
     return crs, rows
 
 
-def _delimiter(line: str) -> str:
-    return max(",;\t", key=line.count)
-
-
-def _columns(line: str, delimiter: str) -> dict[str, int]:
-    """The place of each column that is known, by our name for it; nothing where the line is no header."""
-    spelled = {spelling: key for key, spellings in COLUMNS.items() for spelling in spellings}
-    places: dict[str, int] = {}
-    for place, title in enumerate(line.split(delimiter)):
-        key = spelled.get(_title(title))
-        if key is not None:
-            places.setdefault(key, place)
-    return places if {"name", "x", "y"} <= set(places) else {}
-
-
-def _title(text: str) -> str:
-    return text.strip().strip('"').casefold().replace(" ", "_")
+def _header(line: str) -> dict[str, int]:
+    """The columns of a header; nothing where the line is none."""
+    columns = find_columns(next(csv.reader([line], delimiter=delimiter_of(line))), COLUMNS)
+    return columns if {"name", "x", "y"} <= set(columns) else {}
 
 
 def _photo(number: int, row: Mapping[str, str]) -> PhotoPlace:
     name = row["name"]
     if not name or len(name) > MAX_NAME_CHARS:
-        raise _LineError(number, "a name that is empty or too long")
+        raise LineError(number, "a name that is empty or too long")
     values = {key: _number(number, key, row.get(key, "")) for key in NUMBERS}
     x, y = values["x"], values["y"]
     if x is None or y is None:
-        raise _LineError(number, f"{name[:80]} has no x or no y")
+        raise LineError(number, f"{name[:80]} has no x or no y")
     angles = values["yaw"], values["pitch"], values["roll"]
     sigmas = _sigma(number, values["sigma_horizontal"]), _sigma(number, values["sigma_vertical"])
     return PhotoPlace(number, name, x, y, values["z"], _angles(number, *angles), sigmas)
@@ -226,7 +188,7 @@ def _angles(
     if yaw is None or pitch is None or yaw == pitch == (roll or 0.0) == 0.0:
         return None
     if max(abs(yaw), abs(pitch), abs(roll or 0.0)) > LARGEST_ANGLE_DEG:
-        raise _LineError(number, "angles that are none in degrees")
+        raise LineError(number, "angles that are none in degrees")
     return yaw, pitch, roll or 0.0
 
 
@@ -235,29 +197,17 @@ def _sigma(number: int, value: float | None) -> float | None:
     if value is None or value == 0.0:
         return None
     if not SIGMA_BOUNDS_M[0] <= value <= SIGMA_BOUNDS_M[1]:
-        raise _LineError(number, f"an accuracy of {value:g} m")
+        raise LineError(number, f"an accuracy of {value:g} m")
     return value
 
 
 def _number(number: int, what: str, text: str) -> float | None:
-    text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
-    if text.casefold() in UNKNOWN:
-        return None
-    if not _is_number(text) or abs(float(text)) > LARGEST:
-        raise _LineError(number, f"{what} is {text[:40]!r}, no number that it can be")
-    return float(text)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
+    return None if text.casefold() in UNKNOWN else number_in(number, what, text)
 
 
 def _require_once(photos: Sequence[PhotoPlace]) -> None:
     lines: dict[str, int] = {}
     for photo in photos:
         if photo.name in lines:
-            raise _LineError(photo.line, f"{photo.name[:80]} was in line {lines[photo.name]} already")
+            raise LineError(photo.line, f"{photo.name[:80]} was in line {lines[photo.name]} already")
         lines[photo.name] = photo.line

@@ -25,7 +25,7 @@ from splatpipe.pipeline.scene.photos import (
     photo_root,
     save_photo_list,
 )
-from splatpipe.stages.ingest.cameras import CameraGroup, cameras_json, group_cameras
+from splatpipe.stages.ingest.cameras import CameraGroup, cameras_json, group_cameras, refused_calibrations
 from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
 from splatpipe.stages.ingest.convert import convert_photo, save_png, scale_of
 from splatpipe.stages.ingest.duplicates import split_duplicates
@@ -95,7 +95,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     positions = read_positions(photos, places)
     _tell_positions(positions, report)
     if colmap_model(inputs.photos_dir) is None:  # a given model has its calibration
-        _tell_focal(groups, report)
+        _tell_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
     _write_json(out / "cameras.json", cameras_json(groups))
     _write_json(out / "positions.json", positions_json(positions))
@@ -105,7 +105,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "left_out": len(left_out),
         "cameras": len(groups),
         "focal_sources": sorted({group.focal_source for group in groups}),
-        "positions": len(positions.positions),
+        **_accuracy(positions),
         "masks": len(masked),
         "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
@@ -263,6 +263,21 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
     return places.by_name
 
 
+def _accuracy(positions: PositionList) -> dict[str, JSON]:
+    """How many positions there are, in how many flights, from where, and how accurate they count as."""
+    stated = positions.positions
+    if not stated:
+        return {"positions": 0}
+    return {
+        "positions": len(stated),
+        "position_sources": sorted({each.source for each in stated}),
+        "flights": len({each.flight for each in stated}),
+        "sigma_horizontal_m": float(np.median([each.sigma_horizontal_m for each in stated])),
+        "sigma_vertical_m": float(np.median([each.sigma_vertical_m for each in stated])),
+        "sigma_sources": sorted({each.sigma_source for each in stated}),
+    }
+
+
 def _tell_positions(positions: PositionList, report: Reporter) -> None:
     if positions.impossible:
         report.warning(
@@ -284,7 +299,12 @@ def _tell_positions(positions: PositionList, report: Reporter) -> None:
         )
 
 
-def _tell_focal(groups: Sequence[CameraGroup], report: Reporter) -> None:
+def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:
+    if refused:
+        report.warning(
+            f"The calibrated focal length in {_names(refused)} is far from what lens and sensor give; it is not used.",
+            "Was the picture cropped or resized, or its metadata copied?",
+        )
     unknown = sum(group.photos for group in groups if not group.has_prior)
     if unknown:
         report.warning(

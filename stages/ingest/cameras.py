@@ -23,6 +23,7 @@ SHAPE_TOLERANCE = 0.03  # between a sensor's specified shape and that of the pic
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 WIDEST_SENSOR = 1.51  # width over height; wider pictures are cut from a sensor of 4:3
 PANORAMA = 2.5  # wider still, no sensor's shape
+CALIBRATION_STRAY = 0.15  # from the sensor's focal length: more is another unit, or another mode of the camera
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,8 @@ def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> 
             plane: _times(exif.focal_mm, exif.focal_plane_px_per_mm, scale),
             "35mm-equivalent": _from_35mm(exif.focal_35mm, longer, aspect),
         }
+        if not _is_credible(found["xmp-calibrated"], found["sensor-table"] or found["35mm-equivalent"]):
+            del found["xmp-calibrated"]
         for source in FOCAL_SOURCES:
             focal = found.get(source)
             if focal is not None and FOCAL_BOUNDS[0] <= focal / longer <= FOCAL_BOUNDS[1]:
@@ -108,8 +111,23 @@ def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> 
     return Focal(DEFAULT_FOCAL * longer, "guess", False)
 
 
+def _is_credible(calibrated: float | None, nominal: float | None) -> bool:
+    """Whether a maker's calibration can be of this lens and picture, as far as anything else tells."""
+    return calibrated is None or nominal is None or abs(calibrated / nominal - 1.0) <= CALIBRATION_STRAY
+
+
+def refused_calibrations(photos: Sequence[CheckedPhoto]) -> list[str]:
+    """Names of photos whose stated calibration is far from what their lens and sensor give."""
+    return [
+        photo.name
+        for photo in photos
+        if xmp_number(photo.xmp, "drone-dji:CalibratedFocalLength", 1.0, 1e6) is not None
+        and focal_prior(photo.exif, photo.xmp, photo.width, photo.height).source != "xmp-calibrated"
+    ]
+
+
 def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], dict[str, int]]:
-    """Group photos by make, model, size and focal length.
+    """Group photos by make, model, size, focal length, and whether the drone has taken their distortion out.
 
     Args:
         photos: Those that take part, sorted by name.
@@ -121,7 +139,8 @@ def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], di
     for photo in photos:
         exif = photo.exif
         focal_mm = round(exif.focal_mm, 2) if exif.focal_mm is not None else None
-        key = (exif.make, exif.model, photo.width, photo.height, focal_mm, exif.focal_35mm)
+        dewarped = photo.xmp.get("drone-dji:DewarpFlag") == "1"
+        key = (exif.make, exif.model, photo.width, photo.height, focal_mm, exif.focal_35mm, dewarped)
         members.setdefault(key, []).append(photo)
     groups = [_group(list(group)) for group in members.values()]
     index = {photo.name: number for number, group in enumerate(members.values()) for photo in group}

@@ -130,7 +130,8 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
             continue
         source = "file" if place is not None else "exif" if good[0] is photo.exif.gps else "xmp"
         position = _position(photo, good[0], source, place)
-        position = replace(position, **_angles(photo, place, conventions.get(_camera(photo), "nadir")))
+        yaw, pitch, roll = _angles(photo, place, conventions.get(_camera(photo), "nadir"))
+        position = replace(position, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
         found.append(position)
         stamps.append(_stamp(photo, position))
         exif_altitude, xmp_altitude = _exif_altitude(photo.exif.gps), _xmp_altitude(photo.xmp)
@@ -235,7 +236,9 @@ def _conventions(photos: Sequence[CheckedPhoto]) -> dict[tuple[str, str], Conven
     return {camera: tell_convention(values) for camera, values in pitches.items()}
 
 
-def _angles(photo: CheckedPhoto, place: FilePlace | None, convention: Convention) -> dict[str, float | None]:
+def _angles(
+    photo: CheckedPhoto, place: FilePlace | None, convention: Convention
+) -> tuple[float | None, float | None, float | None]:
     xmp = photo.xmp
     yaw, pitch, roll = (
         xmp_number(xmp, f"drone-dji:Gimbal{name}Degree", -limit, limit)
@@ -247,7 +250,7 @@ def _angles(photo: CheckedPhoto, place: FilePlace | None, convention: Convention
         yaw, pitch, roll = (xmp_number(xmp, f"Camera:{name}", -720.0, 720.0) for name in ("Yaw", "Pitch", "Roll"))
         if convention == "nadir" and yaw is not None and pitch is not None:
             yaw, pitch, roll = gimbal_from_nadir(yaw, pitch, roll or 0.0)
-    return {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
+    return yaw, pitch, roll
 
 
 def _sigmas(photo: CheckedPhoto, rtk: str | None, place: FilePlace | None) -> tuple[str, float, float]:

@@ -1,0 +1,109 @@
+"""Plain text that surveyors' tables are, from untrusted files: everything has a limit, every refusal names its line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+
+MAX_LINE_CHARS = 2000
+LARGEST = 1e9  # of a coordinate, metres or pixels: beyond it there is neither an earth nor a photo
+UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
+CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg)\s*[:=]\s*(\S.*)", re.IGNORECASE)
+DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+
+
+class LineError(ValueError):
+    """What is wrong in a line (0: in the file as a whole), the end of a sentence."""
+
+    def __init__(self, line: int, text: str, hint: str = "") -> None:
+        super().__init__(text)
+        self.line, self.hint = line, hint
+
+
+@dataclass(frozen=True)
+class TableKind:
+    """A kind of file.
+
+    Attributes:
+        what: Its name in messages.
+        expected: What such a file looks like, a hint.
+        max_bytes: It may not be larger.
+        max_lines: Nor have more lines.
+    """
+
+    what: str
+    expected: str
+    max_bytes: int
+    max_lines: int
+
+
+def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
+    """Numbered lines, from 1.
+
+    Raises:
+        SplatpipeError: if the file is no text, or too much of it.
+    """
+    name = f"The {kind.what} {path.name}"
+    try:
+        if path.stat().st_size > kind.max_bytes:
+            raise SplatpipeError(f"{name} is too large.", kind.expected)
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SplatpipeError(f"{name} is no UTF-8 text.", "Save it as plain text in UTF-8.") from error
+    except OSError as error:
+        raise SplatpipeError(f"The {kind.what} {path} cannot be read: {error.strerror}.", "Check the path.") from error
+    lines = text.splitlines()
+    long = next(
+        (at for at, line in enumerate(lines, 1) if len(line) > MAX_LINE_CHARS or CONTROL_CHARACTERS.search(line)), None
+    )
+    if len(lines) > kind.max_lines or long is not None:
+        what = f"more than {kind.max_lines:,} lines" if long is None else f"no plain text in line {long}"
+        raise SplatpipeError(f"{name} has {what}.", kind.expected)
+    return list(enumerate(lines, 1))
+
+
+def delimiter_of(line: str) -> str:
+    """What parts the cells of a header."""
+    return max(",;\t", key=line.count)
+
+
+def find_columns(titles: Sequence[str], spellings: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """The place of each column that is known, by our name for it; the first of several."""
+    spelled = {spelling: key for key, each in spellings.items() for spelling in each}
+    places: dict[str, int] = {}
+    for place, title in enumerate(titles):
+        key = spelled.get(title_of(title))
+        if key is not None:
+            places.setdefault(key, place)
+    return places
+
+
+def title_of(text: str) -> str:
+    """A column's title as spellings are compared."""
+    return text.strip().casefold().replace(" ", "_")
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a finite number."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def number_in(line: int, what: str, text: str) -> float:
+    """A finite number that can be a coordinate; a decimal comma is one.
+
+    Raises:
+        LineError: if it is none.
+    """
+    text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
+    if not is_number(text) or abs(float(text)) > LARGEST:
+        raise LineError(line, f"{what} is {text[:40]!r}, no number that it can be")
+    return float(text)
