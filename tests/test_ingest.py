@@ -622,6 +622,18 @@ def test_the_file_of_positions_counts_and_says_so(folder: Path, tmp_path: Path) 
     assert any("does not name c.jpg" in warning for warning in result.warnings)
 
 
+def test_a_file_in_another_zone_is_told(folder: Path, tmp_path: Path) -> None:
+    """46.5° N: a zone of UTM, 6°, is 459 km wide there."""
+    for seed, name in enumerate("cde"):
+        save(folder / f"{name}.jpg", seed + 3, exif=drone_exif(gps_of(46.5, -91.5, 198.5)))
+    geo = tmp_path / "geo.txt"
+    rows = "".join(f"{name}.jpg 615097.16 5150696.35 199\n" for name in "cde")  # of zone 15, by PROJ
+    for zone, is_told in ((15, False), (16, True)):
+        geo.write_text(f"EPSG:326{zone}\n{rows}")
+        warnings = ingest(folder, geo=geo, out=f"out{zone}").warnings
+        assert any("geo.txt places the photos 459." in warning for warning in warnings) == is_told
+
+
 def test_impossible_positions_are_left_out_and_named(folder: Path) -> None:
     save(folder / "zero.jpg", 3, exif=drone_exif(gps_of(0.0, 0.0, 0.0)))
     save(folder / "north.jpg", 4, exif=drone_exif(gps_of(91.0, 10.0, 0.0)))

@@ -46,14 +46,16 @@ def tell_flights(stamps: Sequence[Stamp]) -> list[int]:
         stamps: Of the photos, in the order of their names; photos without a time stay with their device's others.
     """
     flights: list[list[int]] = []
-    for device in dict.fromkeys(stamp.device for stamp in stamps):
-        members = [index for index, stamp in enumerate(stamps) if stamp.device == device]
+    takeoffs = np.array([stamp.takeoff_m for stamp in stamps])
+    devices: dict[tuple[str, ...], list[int]] = {}
+    for index, stamp in enumerate(stamps):
+        devices.setdefault(stamp.device, []).append(index)
+    for members in devices.values():
         timed = [index for index in members if math.isfinite(stamps[index].time_s)]
         untimed = [index for index in members if not math.isfinite(stamps[index].time_s)]
         timed.sort(key=lambda index: stamps[index].time_s)
         runs = _split_at_gaps(timed, stamps) if timed else [[]]
         runs[0] += untimed
-        takeoffs = np.array([stamp.takeoff_m for stamp in stamps])
         flights += [flight for run in runs for flight in _split_at_steps(run, takeoffs)]
     flights.sort(key=min)
     number = {index: flight for flight, members in enumerate(flights) for index in members}

@@ -15,6 +15,7 @@ from splatpipe.pipeline.scene.alignment import Correspondences, Shared, Similari
 from splatpipe.pipeline.scene.crs_names import UNKNOWN
 
 LEAST_PHOTOS = 3  # of a flight with an offset of its own; fewer say nothing about it
+MOST_FLIGHTS = 100  # with offsets of their own, the largest
 APART_SIGMAS = 3.0  # flights that differ by more do not differ by their receivers' errors: another datum, another base
 UNBOUND_M = 1e4  # a standard deviation that binds nothing
 
@@ -33,6 +34,8 @@ def shared_errors(records: Sequence[Mapping[str, Any]], sigmas: Float64[np.ndarr
     large = numbers[counts >= LEAST_PHOTOS]
     if len(large) == 0:
         return None
+    largest = np.argsort(-counts[counts >= LEAST_PHOTOS], kind="stable")[:MOST_FLIGHTS]
+    large = large[np.sort(largest)]
     group = np.full(len(records), -1, dtype=np.int64)
     for index, number in enumerate(large):
         group[flights == number] = index

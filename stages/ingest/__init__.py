@@ -28,9 +28,17 @@ from splatpipe.pipeline.scene.photos import (
 from splatpipe.stages.ingest.cameras import CameraGroup, cameras_json, group_cameras, refused_calibrations
 from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
 from splatpipe.stages.ingest.convert import convert_photo, save_png, scale_of
+from splatpipe.stages.ingest.doubts import FAR_M, median_distance_m
 from splatpipe.stages.ingest.duplicates import split_duplicates
 from splatpipe.stages.ingest.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
-from splatpipe.stages.ingest.positions import DATUM_STEP_M, NOWHERE, PositionList, positions_json, read_positions
+from splatpipe.stages.ingest.positions import (
+    DATUM_STEP_M,
+    NOWHERE,
+    PositionList,
+    is_on_earth,
+    positions_json,
+    read_positions,
+)
 from splatpipe.stages.ingest.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan, scan_folder
 from splatpipe.stages.ingest.stated import FilePlace, read_places
 from splatpipe.stages.line import IngestConfig
@@ -259,6 +267,16 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
         report.warning(
             f"{path.name} does not name {_names(others)}: their own positions count, as a flight of its own.",
             "Add them to the file if it has better ones.",
+        )
+    both = [(places.by_name[photo.name], photo.exif.gps) for photo in photos if photo.name in places.by_name]
+    known = [(place, gps) for place, gps in both if gps is not None and is_on_earth(gps.latitude, gps.longitude)]
+    apart = median_distance_m(
+        [(place.latitude, place.longitude) for place, _ in known], [(gps.latitude, gps.longitude) for _, gps in known]
+    )
+    if apart > FAR_M:
+        report.warning(
+            f"{path.name} places the photos {apart / 1000.0:,.1f} km from where they say themselves.",
+            "Check its CRS (the zone, too), and that east or longitude comes first; or set ingest.positions=none.",
         )
     return places.by_name
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -38,6 +38,21 @@ def find_wrong(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:
             far = f"is stated {distance / 1000.0:,.1f} km from the others"
             wrong[name] = "has latitude and longitude swapped" if is_mirrored else far
     return wrong
+
+
+def median_distance_m(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]]) -> float:
+    """Median distance between two statements of where the same photos were taken; 0 without any.
+
+    Args:
+        first: Latitude and longitude in degrees.
+        second: The same, of the other.
+    """
+    if not first:
+        return 0.0
+    apart = np.array(first, dtype=np.float64) - np.array(second, dtype=np.float64)
+    apart[:, 1] = (apart[:, 1] + 180.0) % 360.0 - 180.0
+    apart[:, 1] *= np.cos(np.radians(np.array(second, dtype=np.float64)[:, 0]))
+    return float(METRES_A_DEGREE * np.median(np.hypot(apart[:, 0], apart[:, 1])))
 
 
 def _distances_m(places: Float64[np.ndarray, "n 2"], middle: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " n"]:
