@@ -63,6 +63,7 @@ class Adjusted:
         focal_sigmas: Standard deviation of each camera's focal length, relative, by COLMAP's camera id, as the photos
             and control tell it.
         held: Cameras whose focal length nothing tells, so that it stays near its prior.
+        usable: Whether the adjustment found a solution.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -72,6 +73,7 @@ class Adjusted:
     feature_sigma_px: float
     focal_sigmas: Mapping[int, float]
     held: tuple[int, ...]
+    usable: bool
 
 
 def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
@@ -111,13 +113,14 @@ def adjust(
         blocks.add_target(model, place, target)
     offsets = _add_stations(blocks, model, stations)
     _add_lens(blocks, model, focal_priors)
-    pyceres.solve(solver_options(len(model.reg_image_ids())), problem, pyceres.SolverSummary())
+    solved = pyceres.SolverSummary()
+    pyceres.solve(solver_options(len(model.reg_image_ids())), problem, solved)
     focal_sigmas = posterior_focal_sigmas(model, problem)
     held = [n for n, focal in focal_priors.items() if focal_sigmas.get(n, 0.0) > UNOBSERVED]
     if held:
         for number in held:
             keep_near(problem, model.cameras[number], focal_priors[number], FOCAL_SIGMA)
-        pyceres.solve(solver_options(len(model.reg_image_ids())), problem, pyceres.SolverSummary())
+        pyceres.solve(solver_options(len(model.reg_image_ids())), problem, solved)
     normed = np.array(
         [
             math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())
@@ -125,7 +128,8 @@ def adjust(
         ]
     )
     model.update_point_3d_errors()
-    return Adjusted(model, places, normed, offsets, sigma, focal_sigmas, tuple(held))
+    usable = bool(solved.IsSolutionUsable()) and bool(np.isfinite(places).all())
+    return Adjusted(model, places, normed, offsets, sigma, focal_sigmas, tuple(held), usable)
 
 
 def feature_sigma(model: pycolmap.Reconstruction) -> float:

@@ -205,6 +205,12 @@ def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report:
     """The result with the model that an adjustment bends, where that moves what the photos show."""
     settled = _settle(result, capture, config, report)
     survey, done, factor = settled.survey, settled.done, settled.factor
+    if not done.usable:
+        report.warning(
+            "The adjustment to the control did not find a solution: the control places the model without bending it.",
+            "Is the control spread over the site, and marked right?",
+        )
+        return replace(result, survey=survey)
     if factor > 1.0:
         worth = factor * float(np.median(result.site.targets.sigmas[_chosen(survey), 0]))
         report.warning(
