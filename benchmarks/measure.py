@@ -37,7 +37,7 @@ from splatpipe.pipeline.scene.dataset import IMAGES, MODEL, View, load_model, lo
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.draws import permutation

@@ -22,7 +22,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.evaluate import as_trained, measure, render_pixels
-from splatpipe.stages.line import LineConfig, TrainConfig
+from splatpipe.stages.options import LineConfig, TrainConfig
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.depth import supervised

@@ -25,7 +25,7 @@ from measure import (
     time_case,
 )
 
-from splatpipe.stages.line import InitializeConfig
+from splatpipe.stages.options import InitializeConfig
 
 COLUMNS = {
     "points": "points:",

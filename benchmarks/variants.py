@@ -12,7 +12,7 @@ from comparison import BASE
 
 from splatpipe.pipeline.engine.config import load_file, load_preset, parse_set, resolve, with_seed
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.stages.line import LineConfig
+from splatpipe.stages.options import LineConfig
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}")  # also a folder's
 PRESET = "standard"  # what `splatpipe run` takes without --preset

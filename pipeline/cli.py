@@ -27,7 +27,7 @@ from splatpipe.pipeline.engine.errors import (
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runner import Runner
     from splatpipe.pipeline.engine.session import Request
-    from splatpipe.stages.line import LineConfig
+    from splatpipe.stages.options import LineConfig
 
 app = typer.Typer(
     name="splatpipe",
@@ -77,14 +77,14 @@ class _Overrides:
 
     def resolve(self, *below: dict[str, Any]) -> LineConfig:
         from splatpipe.pipeline.engine.config import resolve
-        from splatpipe.stages.line import LineConfig
+        from splatpipe.stages.options import LineConfig
 
         return resolve(LineConfig, [*below, *self.tables])
 
 
 def _overrides(config: Path | None, assignments: Sequence[str] | None, seed: int | None) -> _Overrides:
     from splatpipe.pipeline.engine.config import load_file, parse_set, with_seed
-    from splatpipe.stages.line import LineConfig
+    from splatpipe.stages.options import LineConfig
 
     tables = [load_file(config)] if config else []
     for table in tables:  # OUT/config.toml has these two besides the options
@@ -208,7 +208,7 @@ def stage(
     """Run one stage again on an existing OUT, and nothing else."""
     from splatpipe.pipeline.engine.config import known
     from splatpipe.pipeline.engine.session import load_run
-    from splatpipe.stages.line import LineConfig
+    from splatpipe.stages.options import LineConfig
 
     with Ending(out, as_json) as done:
         _check_stage(name)
@@ -235,7 +235,7 @@ def georef(
     """Place a finished run anew: other control points, another CRS. What does not change is reused."""
     from splatpipe.pipeline.engine.config import known
     from splatpipe.pipeline.engine.session import load_run
-    from splatpipe.stages.line import LineConfig
+    from splatpipe.stages.options import LineConfig
 
     with Ending(out, as_json) as done:
         photos, table = load_run(out)
@@ -314,7 +314,7 @@ def doctor(as_json: JsonOption = False) -> None:
 def _existing(out: Path) -> Request:
     from splatpipe.pipeline.engine.config import known
     from splatpipe.pipeline.engine.session import load_run
-    from splatpipe.stages.line import LineConfig
+    from splatpipe.stages.options import LineConfig
 
     photos, table = load_run(out)
     return _request(photos, out, _Overrides([]).resolve(known(LineConfig, table)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from splatpipe.pipeline.scene.panorama import Panorama, laid_over, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.accuracy import measure_accuracy
 from splatpipe.stages.floaters import measure_floaters
-from splatpipe.stages.line import EvaluateConfig
+from splatpipe.stages.options import EvaluateConfig
 from splatpipe.stages.threads import same_bits
 
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
@@ -114,7 +113,7 @@ def render_pixels(model: Model, camera: Camera, options: raster.RenderOptions) -
 def render_depth(gaussians: Gaussians, camera: Camera, options: raster.RenderOptions) -> Float[np.ndarray, "h w"]:
     """A camera's median depth, world units along the view axis; 0 where the model has none."""
     with torch.no_grad():
-        rendered = raster.render(gaussians, camera, replace(options, sh_degree=0, depth=True))
+        rendered = raster.render(gaussians, camera, options.for_depths())
     return np.asarray(rendered.median_depth.cpu().numpy())
 
 

@@ -27,7 +27,7 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.georeference import georeference, scene_box, told_in_a_line
 from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
-from splatpipe.stages.line import ExportConfig
+from splatpipe.stages.options import ExportConfig
 
 Doubles = npt.NDArray[np.float64]
 Facts = dict[str, Any]

@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.parallel import ordered_map
 from splatpipe.pipeline.scene.photos import Photo, PhotoList, decode, decode_mask, load_photo_list
-from splatpipe.stages.line import FeaturesConfig
+from splatpipe.stages.options import FeaturesConfig
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]

@@ -21,7 +21,7 @@ from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.scene.photos import Photo, load_photo_list
 from splatpipe.pipeline.scene.upright import display_from_stored, enu_from_gimbal
 from splatpipe.stages.footprints import Views
-from splatpipe.stages.line import MatchesConfig
+from splatpipe.stages.options import MatchesConfig
 from splatpipe.stages.pairs import LOCATED_SHARE, Costs, Layout, Pair, choose_pairing, components, select_pairs
 from splatpipe.stages.retrieval import PER_PHOTO, look_alike_costs
 

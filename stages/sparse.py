@@ -20,7 +20,7 @@ from splatpipe.pipeline.scene.dataset import some
 from splatpipe.pipeline.scene.focal import UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.scene.sparse_model import write_model
-from splatpipe.stages.line import SparseConfig
+from splatpipe.stages.options import SparseConfig
 
 Model: TypeAlias = pycolmap.Reconstruction
 

@@ -12,7 +12,8 @@ from splatpipe.pipeline.engine.config import load_preset, parse_set, resolve
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine
-from splatpipe.stages.line import LINE, LineConfig
+from splatpipe.stages.line import LINE
+from splatpipe.stages.options import LineConfig
 
 
 def main(photos: str, out: str, stage: str, how: str, *assignments: str) -> None:

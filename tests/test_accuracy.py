@@ -22,7 +22,7 @@ from splatpipe.pipeline.scene.geodesy import Origin
 from splatpipe.pipeline.scene.similarity import Similarity
 from splatpipe.stages import evaluate
 from splatpipe.stages.accuracy import depth_at, measure_accuracy
-from splatpipe.stages.line import EvaluateConfig
+from splatpipe.stages.options import EvaluateConfig
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -183,7 +183,7 @@ def test_evaluate_leaves_it_in_its_metrics(parts: dict[str, Path], tmp_path: Pat
     from splatpipe.pipeline.scene.dataset import load_views
     from splatpipe.pipeline.scene.panorama import write_panorama
     from splatpipe.pipeline.scene.ply import write_splat
-    from splatpipe.stages.line import TrainConfig
+    from splatpipe.stages.options import TrainConfig
     from splatpipe.stages.train.plan import make_plan
 
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")

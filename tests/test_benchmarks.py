@@ -19,7 +19,7 @@ from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages import evaluate, initialize, train
-from splatpipe.stages.line import EvaluateConfig, InitializeConfig, TrainConfig
+from splatpipe.stages.options import EvaluateConfig, InitializeConfig, TrainConfig
 from splatpipe.stages.train.plan import make_plan
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

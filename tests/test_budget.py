@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import evaluate, initialize, train
-from splatpipe.stages.line import EvaluateConfig, InitializeConfig, TrainConfig
+from splatpipe.stages.options import EvaluateConfig, InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop, planning
 from splatpipe.stages.train.budget import (
     FEWEST,

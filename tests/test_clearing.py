@@ -12,7 +12,7 @@ import torch
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.free_space import FreeSpace, near_or_free
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.clearing import STEPS_BETWEEN, free_space_of, is_clearing_step, unwanted
 from splatpipe.stages.train.plan import make_plan, resolve_schedule
 from splatpipe.stages.train.state import TrainState

@@ -19,7 +19,8 @@ from splatpipe.pipeline.engine.config import (
     with_seed,
 )
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.stages.line import LINE, LineConfig
+from splatpipe.stages.line import LINE
+from splatpipe.stages.options import LineConfig
 
 
 @pytest.mark.parametrize("name", preset_names())

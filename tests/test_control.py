@@ -18,7 +18,7 @@ from splatpipe.pipeline.scene.confidence import chi_squared_cdf, chi_squared_qua
 from splatpipe.pipeline.scene.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.scene.frames import load_frame
 from splatpipe.stages.georef import run
-from splatpipe.stages.line import GeorefConfig
+from splatpipe.stages.options import GeorefConfig
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from surveyed import (

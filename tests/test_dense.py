@@ -18,7 +18,7 @@ from splatpipe.stages.initialize.dense import DensePoints, dense_points, thinned
 from splatpipe.stages.initialize.likeness import Picture
 from splatpipe.stages.initialize.neighbours import Tracks, inverse_depths, neighbours
 from splatpipe.stages.initialize.sweep import sweep
-from splatpipe.stages.line import InitializeConfig
+from splatpipe.stages.options import InitializeConfig
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.densify import (
     DensityStatistics,
     grow,

@@ -12,7 +12,7 @@ from splatpipe.pipeline import raster
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.sh import rgb_to_dc
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.density import BLIND, Density, DensityStep, Look, Seen, make_density
 from splatpipe.stages.train.density.error import error_share, photo_error
 from splatpipe.stages.train.density.mcmc import composite_integral, disturb, draw_parents, shared

@@ -17,7 +17,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import write_splat
 from splatpipe.stages import evaluate
-from splatpipe.stages.line import EvaluateConfig, TrainConfig
+from splatpipe.stages.options import EvaluateConfig, TrainConfig
 from splatpipe.stages.train.plan import make_plan
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

@@ -21,7 +21,7 @@ from splatpipe.pipeline.scene.frames import load_frame
 from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, panorama_of, write_panorama
 from splatpipe.pipeline.scene.ply import read_splat, write_splat
 from splatpipe.stages import evaluate, export
-from splatpipe.stages.line import EvaluateConfig, ExportConfig, TrainConfig
+from splatpipe.stages.options import EvaluateConfig, ExportConfig, TrainConfig
 from splatpipe.stages.train.plan import make_plan
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

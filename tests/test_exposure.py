@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.train.exposure import Exposure
 from splatpipe.stages.train.exposure_grid import GridExposure, roughness_gradient
 

@@ -19,7 +19,7 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.pipeline.scene.sh import coefficient_count
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.depth import depth_weight_at, point_weights, supervised, with_depth
 from splatpipe.stages.train.dropout import dropped, share_at

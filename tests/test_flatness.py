@@ -10,7 +10,7 @@ import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.train import flatness, loop
 from splatpipe.stages.train.plan import Plan, means_rate, resolve_schedule
 from splatpipe.stages.train.state import TrainState

@@ -16,7 +16,7 @@ from splatpipe.pipeline.scene.geodesy import Origin
 from splatpipe.pipeline.scene.photos import Photo, PhotoList, save_photo_list
 from splatpipe.pipeline.scene.similarity import Similarity, rotation_from_vector
 from splatpipe.stages.georef import run
-from splatpipe.stages.line import GeorefConfig
+from splatpipe.stages.options import GeorefConfig
 
 PLACE = Origin(46.84266, -91.994, 199.0)
 TRUTH = Similarity(

@@ -23,7 +23,7 @@ from splatpipe.pipeline.scene.exif import Exif
 from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, decode_sky_mask, load_photo_list, photo_root
 from splatpipe.stages.ingest import run
 from splatpipe.stages.ingest.cameras import focal_prior
-from splatpipe.stages.line import IngestConfig
+from splatpipe.stages.options import IngestConfig
 
 WIDTH, HEIGHT = 400, 300
 JPEG_ERROR = 12  # grey values, of a smooth picture at quality 95

@@ -14,7 +14,7 @@ from splatpipe.pipeline.scene.dataset import Points
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.pipeline.scene.sh import dc_to_rgb
 from splatpipe.stages.initialize import choose_points, point_sizes, run
-from splatpipe.stages.line import InitializeConfig
+from splatpipe.stages.options import InitializeConfig
 
 RNG = np.random.default_rng(7)
 FAR = np.array([[0.0, 0.0, -100.0]])  # a camera so far away that no size is capped

@@ -15,7 +15,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig
+from splatpipe.stages.options import InitializeConfig
 from splatpipe.stages.train.layers import FREE_PX, HALF_PX, depth_origin, is_spread_counted, spread_loss
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

@@ -13,7 +13,8 @@ from splatpipe.pipeline.engine.events import EventReporter
 from splatpipe.pipeline.engine.runner import Line
 from splatpipe.pipeline.engine.source import MAX_NAMED_BYTES, Source, open_source, with_absolute_files
 from splatpipe.pipeline.engine.store import Part
-from splatpipe.stages.line import GEOREF, INGEST, LINE, LineConfig
+from splatpipe.stages.line import GEOREF, INGEST, LINE
+from splatpipe.stages.options import LineConfig
 
 PARTS = {"source.photos", "source.geo", "source.control"}
 

@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine, Summary
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.train.plan import Plan, make_plan
 from splatpipe.stages.train.refinement import LIMIT_PX, CameraRefinement, anchor_of, image_shift_px
 from splatpipe.stages.train.stream import TrainingPhoto

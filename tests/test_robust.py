@@ -15,7 +15,7 @@ from splatpipe.pipeline.scene import metrics
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.plan import Plan, resolve_schedule
 from splatpipe.stages.train.robust import (

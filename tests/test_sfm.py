@@ -12,7 +12,7 @@ import pytest
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.stages import features, matches, sparse
-from splatpipe.stages.line import FeaturesConfig, MatchesConfig, SparseConfig
+from splatpipe.stages.options import FeaturesConfig, MatchesConfig, SparseConfig
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos

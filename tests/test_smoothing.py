@@ -18,7 +18,7 @@ from splatpipe.pipeline.scene.dataset import View, load_views
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, read_splat_header
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train import state as state_module
 from splatpipe.stages.train.plan import Plan, make_plan

@@ -20,7 +20,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.images import load_colour
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import initialize, train
-from splatpipe.stages.line import InitializeConfig, TrainConfig
+from splatpipe.stages.options import InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.checkpoint import load_checkpoint
 from splatpipe.stages.train.plan import Plan

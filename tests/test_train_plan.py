@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.checkpoint import (
     BrokenCheckpointError,
     Checkpoint,

@@ -22,7 +22,7 @@ from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat, write_splat
 from splatpipe.pipeline.scene.sky import SkyMask, directions
 from splatpipe.stages import evaluate, initialize, train
-from splatpipe.stages.line import EvaluateConfig, InitializeConfig, TrainConfig
+from splatpipe.stages.options import EvaluateConfig, InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.measure import Effort, measure
 from splatpipe.stages.train.plan import Plan, make_plan

@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.scene.dataset import load_points, load_views
 from splatpipe.pipeline.scene.photos import PhotoList, load_photo_list, save_photo_list
 from splatpipe.stages import resampling, undistort
-from splatpipe.stages.line import UndistortConfig
+from splatpipe.stages.options import UndistortConfig
 from splatpipe.stages.undistort import pinhole_camera
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

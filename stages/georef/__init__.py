@@ -26,7 +26,7 @@ from splatpipe.stages.georef.level import Positions, arbitrary_frame
 from splatpipe.stages.georef.model import SparseModel, copy_model, read_model
 from splatpipe.stages.georef.place import Site, Targets, stations_of
 from splatpipe.stages.georef.survey import load_survey
-from splatpipe.stages.line import GeorefConfig
+from splatpipe.stages.options import GeorefConfig
 
 DATUM_STEP_M = 1.0  # between two vertical datums; less may be the receiver's error
 

@@ -26,7 +26,7 @@ from splatpipe.pipeline.scene.similarity import Similarity
 from splatpipe.stages.georef.model import SparseModel
 from splatpipe.stages.georef.place import Site, Stations, locate_survey, observed_in
 from splatpipe.stages.georef.survey import Survey, SurveyPoint
-from splatpipe.stages.line import GeorefConfig
+from splatpipe.stages.options import GeorefConfig
 
 FAR_M = 2000.0  # from the photos: control that they are to show lies nearer
 DATUM_M = 20.0  # off the positions, and more than they are wrong: another datum

@@ -31,7 +31,7 @@ from splatpipe.stages.georef.place import (
     with_sigmas_times,
 )
 from splatpipe.stages.georef.survey import Survey, locate
-from splatpipe.stages.line import GeorefConfig
+from splatpipe.stages.options import GeorefConfig
 
 BENT_PX = 0.5  # what control has to move the photos' content by, root mean square, for the model to be worth bending
 QUIET = 2.0  # times the stated sigmas: control that is off by no more keeps them

@@ -20,7 +20,7 @@ from splatpipe.stages.georef.gps import MIN_POSITIONS, ORIGIN_DIGITS, NoPlaceErr
 from splatpipe.stages.georef.level import UP_SIGMA_RAD, Positions, upright_cameras
 from splatpipe.stages.georef.model import SparseModel
 from splatpipe.stages.georef.survey import Survey
-from splatpipe.stages.line import GeorefConfig
+from splatpipe.stages.options import GeorefConfig
 
 MIN_CONTROL = 3  # without positions
 START_SHARE = 0.05  # of the control's extent: what a hypothesis may miss a point by

@@ -18,7 +18,7 @@ from splatpipe.pipeline.scene.names import NameFinder
 from splatpipe.pipeline.scene.photos import Photo
 from splatpipe.pipeline.scene.triangulation import Rays, Triangulated, triangulate
 from splatpipe.stages.georef.model import SparseModel
-from splatpipe.stages.line import GeorefConfig
+from splatpipe.stages.options import GeorefConfig
 
 NAMES_SHOWN = 8
 LEAST_FOR_CHECKS = 6  # points, from which on some are kept as check points

@@ -41,7 +41,7 @@ from splatpipe.stages.ingest.positions import (
 )
 from splatpipe.stages.ingest.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan, scan_folder
 from splatpipe.stages.ingest.stated import FilePlace, read_places
-from splatpipe.stages.line import IngestConfig
+from splatpipe.stages.options import IngestConfig
 
 MIN_PHOTOS = 2
 NAMES_SHOWN = 10  # in one message; left_out.json has them all

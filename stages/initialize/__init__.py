@@ -16,7 +16,7 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.ply import write_splat
 from splatpipe.pipeline.scene.sh import rgb_to_dc
 from splatpipe.stages.initialize.dense import DensePoints, dense_points
-from splatpipe.stages.line import InitializeConfig
+from splatpipe.stages.options import InitializeConfig
 
 Doubles = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]

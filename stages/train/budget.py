@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.densify import room_at
 from splatpipe.stages.train.plan import coarse_level_at, resolve_schedule
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from splatpipe.pipeline.scene.dataset import View, load_points_and_tracks
 from splatpipe.pipeline.scene.free_space import FreeSpace, free_space, near_or_free
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 
 STEPS_BETWEEN = 5  # steps of density control from one look to the next: a look takes as long as several iterations
 LAST_LOOK = 0.9  # of the run: the rest closes the holes

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.draws import SPLIT_POSITION, normal
 
 MIN_AFTER_PRUNE = 1  # a model is never emptied: there would be nothing left to learn from

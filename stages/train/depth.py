@@ -17,7 +17,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster import Render
 from splatpipe.pipeline.scene.dataset import PointDepths, View, load_model
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.stream import TrainingPhoto
 
 LAST_WEIGHT = 0.1  # of the first: towards the end the photos know the surface better than a keypoint's pixel does

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.side import SideModel
 
 LAST_RATE = 0.1  # of the first; exponential in between

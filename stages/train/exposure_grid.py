@@ -25,7 +25,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from splatpipe.pipeline.raster.colour import bilateral_colour
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.exposure import Exposure
 
 ENTRIES = 12  # of a map

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.plan import Plan
 
 WINDOW_SHARE = 0.25  # of the iterations done: what the line is drawn through

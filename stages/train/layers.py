@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster import Render
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 
 FIRST_SHARE = 0.2  # of the run, without it: the surface has to be found first
 LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth

@@ -19,7 +19,7 @@ from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.scene.dataset import View, load_views
 from splatpipe.pipeline.scene.panorama import write_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step

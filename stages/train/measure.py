@@ -17,7 +17,7 @@ from splatpipe.pipeline.scene import metrics
 from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.images import reduced_view
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
 from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.sky import SkyModel

@@ -21,7 +21,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.sh import coefficient_count
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.budget import FEWEST_GAUSSIANS
 from splatpipe.stages.train.plan import Plan
 

@@ -14,7 +14,7 @@ import numpy as np
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View, split_views
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.durable import write_durably
 
 PLAN_FORMAT = 2

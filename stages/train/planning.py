@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.budget import (
     FEWEST_GAUSSIANS,
     FIRST_GROWTH,

@@ -33,7 +33,7 @@ from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View, load_points_and_tracks
 from splatpipe.pipeline.scene.images import reduced_camera
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.side import SideModel
 from splatpipe.stages.train.stream import TrainingPhoto

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 
 
 def add_decay(gaussians: Gaussians, visible: Bool[Tensor, " n"], options: TrainConfig, extent: float) -> None:

@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from splatpipe.pipeline.raster import Render
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.stream import TrainingPhoto
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them

@@ -17,7 +17,7 @@ from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.free_space import FreeSpace
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, Checkpoint
 from splatpipe.stages.train.clearing import is_clearing_step, unwanted
 from splatpipe.stages.train.densify import (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.dataset import View
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.clearing import free_space_of
 from splatpipe.stages.train.plan import Plan
 from splatpipe.stages.train.refinement import anchor

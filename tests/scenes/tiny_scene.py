@@ -14,7 +14,7 @@ from splatpipe.pipeline import raster
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.sh import dc_to_rgb, rgb_to_dc
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 
 WIDTH, HEIGHT, FOCAL = 72, 54, 70.0
 CAMERAS = 9

@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.density.error import ErrorDensity
 from splatpipe.stages.train.density.gradient import AbsoluteDensity, PublishedDensity
 from splatpipe.stages.train.density.mcmc import McmcDensity

@@ -18,7 +18,7 @@ from torch import Tensor
 from splatpipe.pipeline.raster import Render
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.sh import C0
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.density.strategy import BLIND, Look, ScoredDensity, Seen
 from splatpipe.stages.train.stream import TrainingPhoto
 

@@ -10,7 +10,7 @@ published is what is ranked and its threshold.
 
 from __future__ import annotations
 
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.density.strategy import Look, ScoredDensity, Seen
 
 

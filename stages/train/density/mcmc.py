@@ -21,7 +21,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.densify import Growth, rotate
 from splatpipe.stages.train.density.strategy import BLIND, Density, DensityStep, Look, Seen
 from splatpipe.stages.train.draws import POSITION_NOISE, RELOCATION, normal, uniform

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster import Render
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.line import TrainConfig
+from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.densify import DensityStatistics, Growth, grow, prune_mask
 from splatpipe.stages.train.stream import TrainingPhoto
 
