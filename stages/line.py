@@ -309,7 +309,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=1,
+    version=2,
     config=SparseConfig,
     reads=("matches.database", "features.colours"),
     parts={"model": "sparse/0", "summary": "models.json"},
@@ -317,7 +317,7 @@ SPARSE = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=1,
+    version=2,
     config=GeorefConfig,
     reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
     parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
