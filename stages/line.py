@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatpipe.pipeline.engine.stage import Stage
+from splatpipe.pipeline.engine.stage import NamedFile, Stage
 from splatpipe.stages.options import (
     EvaluateConfig,
     ExportConfig,
@@ -44,7 +44,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=1,
+    version=2,
     config=SparseConfig,
     reads=("matches.database", "features.colours"),
     parts={"model": "sparse/0", "summary": "models.json"},
@@ -52,7 +52,7 @@ SPARSE = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=1,
+    version=2,
     config=GeorefConfig,
     reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
     parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
