@@ -127,7 +127,7 @@ def test_what_differs_by_place_is_the_grids_and_not_the_splats(uneven: Path, tmp
     assert errors["bilateral"] < 0.8 * errors["affine"]
     assert len(archives["affine"]) == 0
     grids = archives["bilateral"].reshape(len(names), 4, 8, 8, 3, 4)
-    assert np.abs(grids.mean(axis=(0, 2, 3)) - np.eye(3, 4)).max() < 1e-6  # at each brightness
+    assert np.abs(grids.mean(axis=(0, 2, 3)) - np.eye(3, 4)).max() < 3e-6  # at each brightness
     found = json.loads((tmp_path / "bilateral/exposures.json").read_text())
     assert found["model"] == "bilateral" and list(found["views"]) == sorted(names)
     assert np.allclose(list(found["views"].values()), grids.mean(axis=(1, 2, 3)), atol=1e-6)

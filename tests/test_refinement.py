@@ -53,7 +53,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rgb = np.full((len(points), 3), 128, np.uint8)
     tiny_scene.write_model(folder / "dataset/sparse/0", perturbed(tiny_scene.cameras()), points, rgb)
     parts = {"undistort.dataset": folder / "dataset"}
-    initialize.run(InitializeConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(opacity=0.1), Inputs(parts, folder), folder, tiny_scene.Recorder())
     return folder
 
 

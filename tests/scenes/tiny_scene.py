@@ -29,6 +29,7 @@ PLAIN: dict[str, object] = {
     "prune_free_space": 0,
     "dropout": 0.0,
     "depth_weight": 0.0,
+    "lr_opacity": 0.05,
 }
 
 
