@@ -21,26 +21,26 @@ class Rays:
     Attributes:
         cam_from_world: Poses.
         rays: Undistorted image points, x/z and y/z in the camera.
-        focals_px: Pixels a unit of them.
+        pixels: Derivative of the photo's pixels by them, at the marks: with the lens, as marks err in pixels.
     """
 
     cam_from_world: Float64[np.ndarray, "n 3 4"]
     rays: Float64[np.ndarray, "n 2"]
-    focals_px: Float64[np.ndarray, " n"]
+    pixels: Float64[np.ndarray, "n 2 2"]
 
     def __len__(self) -> int:
         return len(self.rays)
 
     def only(self, chosen: Bool[np.ndarray, " n"]) -> Rays:
         """Some of them."""
-        return Rays(self.cam_from_world[chosen], self.rays[chosen], self.focals_px[chosen])
+        return Rays(self.cam_from_world[chosen], self.rays[chosen], self.pixels[chosen])
 
     def residuals_px(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 2"]:
         """Where the photos would show the point less where they do; infinite behind a camera."""
         seen = self.cam_from_world[:, :, :3] @ point + self.cam_from_world[:, :, 3]
         ahead = seen[:, 2] > 0.0
         depth = np.where(ahead, seen[:, 2], 1.0)[:, None]
-        residuals = (seen[:, :2] / depth - self.rays) * self.focals_px[:, None]
+        residuals = np.einsum("nij,nj->ni", self.pixels, seen[:, :2] / depth - self.rays)
         return np.where(ahead[:, None], residuals, np.inf)
 
     def jacobian(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 2 3"]:
@@ -50,7 +50,7 @@ class Rays:
         in_camera = np.zeros((len(self), 2, 3))
         in_camera[:, 0, 0] = in_camera[:, 1, 1] = 1.0 / seen[:, 2]
         in_camera[:, :, 2] = -seen[:, :2] / seen[:, 2:] ** 2
-        return np.asarray((in_camera @ rotations) * self.focals_px[:, None, None])
+        return np.asarray(self.pixels @ in_camera @ rotations)
 
     def directions(self) -> Float64[np.ndarray, "n 3"]:
         """Unit vectors from the cameras to the point, in the world."""
