@@ -31,6 +31,7 @@ from splatpipe.stages.options import GeorefConfig
 FAR_M = 2000.0  # from the photos: control that they are to show lies nearer
 DATUM_M = 20.0  # off the positions, and more than they are wrong: another datum
 DATUM_SIGMAS = 5.0
+DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
 SWAPPED_SHARE = 0.3  # of how far two points are off, what is left of it when their names are swapped
 LEAST_GSD = 3.0  # a point off by fewer ground pixels is none that a message helps with
 CONTROL_HINT = "--set georef.control=none goes on without control."
@@ -152,6 +153,14 @@ def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Report
         report.warning(
             f"The control of {survey.name} lies {shift.min():.0f} m beside the photos' positions.",
             f"Is {survey.crs.text} its CRS, and its datum the right one? The frame follows the control.",
+        )
+    lift = fit.offsets[:, 2]
+    heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
+    if heights and float(np.abs(lift).min()) > DATUMS_APART_M:
+        report.warning(
+            f"The heights of {survey.name} lie {abs(lift[0]):.0f} m {'below' if lift[0] > 0 else 'above'} the photos'"
+            " positions, further than vertical datums differ.",
+            "Are they in feet, or above a point of the site? The frame follows the control.",
         )
 
 

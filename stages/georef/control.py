@@ -133,8 +133,9 @@ def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, confi
     vertical = survey.crs.vertical if heights else UNKNOWN if frame is None else frame.vertical_datum
     if vertical == UNKNOWN and config.vertical != "auto":
         vertical = parse_vertical(config.vertical)
-    note = f"From {len(control)} control points"
-    note += f" and the positions of {len(site.stations)} photos." if len(site.stations) else "."
+    by = [f"{len(control)} control points"] if control else []
+    by += [f"the positions of {len(site.stations)} photos"] if len(site.stations) else []
+    note = f"From {' and '.join(by)}."
     if not heights:
         note += " Heights are the positions'." if len(site.stations) else " Heights count from the control points."
     residuals = dict(frame.residuals) if frame is not None else {}

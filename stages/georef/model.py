@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.names import match_names
 
-
 RAY_STEP = 1e-5  # of x/z: a hundredth of a pixel, for differences
 
 

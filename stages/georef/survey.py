@@ -115,7 +115,10 @@ def load_survey(
         SplatpipeError: if the file is none, or not of these photos.
     """
     file = read_control_file(path)
-    crs = parse_crs(file.crs)
+    try:
+        crs = parse_crs(file.crs)
+    except SplatpipeError as error:
+        raise SplatpipeError(f"The CRS of {path.name}: {error}", error.hint) from error
     sightings = _sightings(file, path.name, config, photos, model, report)
     points = [
         locate(SurveyPoint(point, "control", "", tuple(seen)), model, photos, config.mark_sigma_px)
