@@ -90,6 +90,19 @@ def rays(seed: int = 0) -> tuple[Rays, Array]:
     return Rays(np.array(poses), np.array(seen), np.tile(focal * np.eye(2), (6, 1, 1))), point
 
 
+def test_blunders_among_very_many_points_are_found() -> None:
+    """More points than are tried one by one."""
+    rng = np.random.default_rng(3)
+    world = rng.uniform(-50.0, 50.0, (400, 3))
+    target = world + rng.normal(size=world.shape) * 0.06
+    target[[7, 123, 399]] += [1.5, -1.0, 0.8]
+    count = len(world)
+    many = Observed(
+        TRUTH.inverse().apply(world), target, np.full((count, 3), 0.02), np.full(count, -1), np.ones(count, bool)
+    )
+    assert find_blunders(NEAR, many, Priors(np.zeros((0, 3))), 0.1) == (7, 123, 399)
+
+
 def test_point_is_where_rays_meet_as_well_as_its_covariance_says() -> None:
     normed = []
     for seed in range(60):
@@ -111,6 +124,9 @@ def test_wrong_ray_is_found_and_parallel_ones_tell_nothing() -> None:
     assert np.linalg.norm(found.xyz - point) < 0.05
     one = Rays(seen.cam_from_world[[0, 0]], seen.rays[[0, 0]], seen.pixels[[0, 0]])
     assert triangulate(one, 5.0) is None
+    back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 10.0])])
+    head_on = Rays(np.stack([np.eye(3, 4), back]), np.zeros((2, 2)), seen.pixels[:2])
+    assert triangulate(head_on, 5.0) is None
 
 
 def test_lens_weighs_marks_as_it_shows_them() -> None:

@@ -113,7 +113,9 @@ def triangulate(rays: Rays, tolerance_px: float) -> Triangulated | None:
             return None
         point = _refined(rays.only(agree), point)
         near = np.linalg.norm(rays.residuals_px(point), axis=1) <= tolerance_px
-        if near.sum() < 2 or (near == agree).all():
+        if near.sum() < 2:
+            return None
+        if (near == agree).all():
             break
         agree = near
     if point is None:
@@ -123,9 +125,9 @@ def triangulate(rays: Rays, tolerance_px: float) -> Triangulated | None:
 
 
 def _meeting(rays: Rays) -> Float64[np.ndarray, " 3"] | None:
-    """The point nearest to the rays; None where they are parallel or meet behind a camera."""
+    """The point nearest to the rays; None where they are parallel, head-on or not, or meet behind a camera."""
     directions, centres = rays.directions(), rays.centres()
-    if np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)).max() < LEAST_PARALLAX_RAD:
+    if np.arccos(np.clip(np.abs(directions @ directions.T), 0.0, 1.0)).max() < LEAST_PARALLAX_RAD:
         return None
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     point = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))
