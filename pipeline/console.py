@@ -31,6 +31,7 @@ from splatpipe.pipeline.engine.stage import JSON, Summary
 
 PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
 PLAIN_WIDTH = 120  # columns of a table in a log file
+LEAST_OFFSET_M = 0.01  # of a flight's positions, to be told
 POINTS_SHOWN = 40  # more are in metrics.json alone
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
@@ -209,11 +210,23 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
         bounds = [_bounds(table.get(f"interval_95_{name}_m")) for name in ("horizontal", "vertical")]
         shown.add_row(title, str(table["count"]), *figures, *bounds)
     console.print(shown)
+    for told in _offsets([flight for _, table in groups for flight in table.get("flights", [])]):
+        console.print(told, soft_wrap=True)
     if 0 < len(points) <= POINTS_SHOWN:
         console.print(_points_table(points, {point["name"]: point for point in splat["points"]}))
         for point in points:
             if point.get("why"):
                 console.print(f"{point['name']}: {point['why']}.", markup=False, soft_wrap=True)
+
+
+def _offsets(flights: Iterable[Mapping[str, JSON]]) -> list[str]:
+    """What the positions of each flight are off together; the table is without it."""
+    offsets = [(flight["flight"] + 1, *flight["offset_m"]) for flight in flights]
+    return [
+        f"Positions of flight {number}: all together east {east:+.3f}, north {north:+.3f}, up {up:+.3f} m off."
+        for number, east, north, up in offsets
+        if max(abs(east), abs(north), abs(up)) >= LEAST_OFFSET_M
+    ]
 
 
 def _points_table(points: Sequence[Mapping[str, JSON]], splat: Mapping[str, Mapping[str, JSON]]) -> Table:
@@ -223,14 +236,14 @@ def _points_table(points: Sequence[Mapping[str, JSON]], splat: Mapping[str, Mapp
         table.add_column(title, justify="left" if title in ("point", "") else "right", overflow="fold")
     nothing = [None, None, None]
     for point in points:
-        squares = [x * x + y * y for x, y in (seen.get("residual_px") or (0.0, 0.0) for seen in point["observations"])]
-        marked = [seen for seen in point["observations"] if seen.get("residual_px")]
-        pixels = f"{(sum(squares) / len(marked)) ** 0.5:.2f}" if marked else "–"
+        used = [seen for seen in point["observations"] if seen.get("used", True)]
+        squares = [x * x + y * y for x, y in (seen["residual_px"] for seen in used if seen.get("residual_px"))]
+        pixels = f"{(sum(squares) / len(squares)) ** 0.5:.2f}" if squares else "–"
         own = splat.get(point["name"], {}).get("residual_m") or nothing
         table.add_row(
             Text(str(point["name"])),
             Text(str(point["role"]).replace("_", " ")),
-            str(len(point["observations"])),
+            str(len(used)),
             *(_metres(value) for value in point.get("residual_m") or nothing),
             pixels,
             *(_metres(value) for value in own),

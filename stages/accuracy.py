@@ -51,7 +51,7 @@ class Surveyed:
         name: Of the point.
         role: ``control``, ``check`` or ``left_out``.
         place_m: East, north, up in the world frame; up is NaN where it was not measured.
-        observations: Those in photos of the dataset.
+        observations: Those in photos of the dataset, without marks that georef left out as wrong.
     """
 
     name: str
@@ -108,11 +108,10 @@ def georef_points(control: Path) -> list[dict[str, Any]]:
         told = []
         for point in _read(control)["points"]:
             entry = {name: point.get(name) for name in POINT_FACTS}
-            squares = [x * x + y * y for x, y in filter(None, (seen["residual_px"] for seen in point["observations"]))]
+            used = [seen for seen in point["observations"] if seen.get("used", True)]
+            squares = [x * x + y * y for x, y in filter(None, (seen["residual_px"] for seen in used))]
             rms = math.sqrt(math.fsum(squares) / len(squares)) if squares else None
-            told.append(
-                {**entry, "photos": len(point["observations"]), "rms_px": None if rms is None else round(rms, 3)}
-            )
+            told.append({**entry, "photos": len(used), "rms_px": None if rms is None else round(rms, 3)})
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise StageError(f"{control.name} is broken: {error!r}.", hint="Run again with --rerun georef.") from error
     return told
@@ -132,7 +131,7 @@ def read_surveyed(control: Path, photos: Sequence[str]) -> list[Surveyed]:
             observations = []
             for seen in point["observations"]:
                 photo = find(str(seen["photo"]))
-                if photo is not None and seen.get("ray") is not None:
+                if photo is not None and seen.get("ray") is not None and seen.get("used", True):
                     ray = np.array(seen["ray"], dtype=np.float64).reshape(2)
                     observations.append(Observation(photo, ray))
             place = np.array([east, north, math.nan if up is None else up], dtype=np.float64)

@@ -52,7 +52,7 @@ SPARSE = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=2,
+    version=3,
     config=GeorefConfig,
     reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
     parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},

@@ -146,6 +146,16 @@ def test_median_over_photos_forgives_one_floater(parts: dict[str, Path]) -> None
     assert there[0] > 1.0 and np.abs(point["residual_m"]).max() < 2.0 * RENDERED
 
 
+def test_a_mark_that_georef_left_out_says_nothing_of_the_splat(parts: dict[str, Path]) -> None:
+    told = json.loads(parts["georef.control"].read_text())
+    wrong = told["points"][0]["observations"][0]
+    wrong |= {"ray": [0.4, 0.4], "residual_px": [900.0, 0.0], "used": False}
+    rewrite(parts["georef.control"], told)
+    result = measured(parts)
+    assert wrong["photo"] not in [seen["photo"] for seen in result["splat"]["points"][0]["observations"]]
+    assert (result["points"][0]["photos"], result["points"][0]["rms_px"]) == (tiny_scene.CAMERAS - 1, None)
+
+
 def test_points_without_a_height_photo_or_surface_are_told_as_far_as_they_go(parts: dict[str, Path]) -> None:
     told = json.loads(parts["georef.control"].read_text())
     told["points"][2]["surveyed_m"][2] = None
@@ -253,7 +263,8 @@ def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixt
     check = accuracy_table(np.array([[0.012, -0.034, 0.056], [0.01, 0.02, np.nan]]))
     report = {"gsd_m": 0.0312, "tables": {"gps": None, "control": None, "check": check}, "splat": None}
     seen = {"photo": "a.jpg", "residual_px": [3.0, 4.0]}
-    point = {"name": "P[1]", "role": "check", "residual_m": [0.012, -0.034, 0.056], "observations": [seen]}
+    wrong = {"photo": "b.jpg", "residual_px": [3000.0, 4000.0], "used": False}
+    point = {"name": "P[1]", "role": "check", "residual_m": [0.012, -0.034, 0.056], "observations": [seen, wrong]}
     left = {"name": "P2", "role": "left_out", "why": "one mark", "residual_m": None, "observations": []}
     show_accuracy(report, [point, left])
     shown = capsys.readouterr().err
@@ -263,5 +274,10 @@ def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixt
     row = next(line for line in shown.splitlines() if line.startswith("P[1]"))
     assert row.split() == ["P[1]", "check", "1", "0.012", "-0.034", "0.056", "5.00", "–", "–", "–"]
     assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80
+    assert "Positions of" not in shown
+    flights = [{"flight": 0, "offset_m": [0.001, 0.0, -47.002]}, {"flight": 1, "offset_m": [0.001, 0.0, 0.002]}]
+    show_accuracy({"tables": {"gps": {**check, "flights": flights}}}, [])
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Positions of")]
+    assert told == ["Positions of flight 1: all together east +0.001, north +0.000, up -47.002 m off."]
     show_accuracy({}, [])
     assert capsys.readouterr().err == ""

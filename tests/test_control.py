@@ -365,6 +365,37 @@ def test_file_of_other_photos_is_refused_and_some_missing_ones_are_named(
     assert result.table("control")["count"] == 5
 
 
+def test_file_without_a_crs_or_with_one_place_for_all_is_refused_by_name(
+    tmp_path: Path, whole: pycolmap.Reconstruction
+) -> None:
+    with pytest.raises(SplatpipeError, match=r"CRS of gcp_list.txt.*EPSG:999999"):
+        georef(tmp_path / "a", whole, gcp_list(rows(FIVE), "EPSG:999999"))
+    lines = rows(FIVE)
+    with pytest.raises(SplatpipeError, match=r"All control points of gcp_list.txt have the same coordinates"):
+        georef(tmp_path / "b", whole, gcp_list([replace(row, place=lines[0].place) for row in lines]))
+
+
+def test_control_on_a_line_is_told_and_control_all_over_is_not(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+    control = gcp_list(rows(tuple(POINTS)))
+    for name, kept, weak in (("line", ("P06", "P12", "P14"), True), ("site", FIVE, False)):
+        others = checks(*(point for point in POINTS if point not in kept))
+        told = georef(tmp_path / name, whole, control, None, check_points=others, adjust="off").told.warnings
+        assert any("spread over the site" in warning for warning in told) == weak, name
+
+
+def test_coordinates_beyond_their_crs_are_of_a_named_file(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+    swapped = [replace(row, place=(row.place[1], row.place[0], row.place[2])) for row in rows(FIVE)]
+    with pytest.raises(SplatpipeError, match=r"^gcp_list.txt: ") as caught:
+        georef(tmp_path, whole, gcp_list(swapped), None)
+    assert "east" in caught.value.hint
+
+
+def test_heights_in_feet_are_told(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+    feet = [replace(row, place=(*row.place[:2], row.place[2] / 0.3048)) for row in rows(FIVE)]
+    result = georef(tmp_path, whole, gcp_list(feet), check_points="none", adjust="off")
+    assert [w for w in result.told.warnings if "further than vertical datums differ" in w and "feet" in w]
+
+
 def test_mark_on_the_wrong_pixel_is_named_and_left_out(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     lines = rows(FIVE)
     wrong = next(k for k, row in enumerate(lines) if row.name == "P03")

@@ -91,6 +91,8 @@ def test_height_of_exactly_zero_is_unknown_unless_the_sea_is_near(tmp_path: Path
         (b"EPSG:32633\n1 2 3 4 5 \x00.JPG", "no plain text in line 2"),
         (b"\xff\xd8\xff\xe0\x00\x10JFIF", "no UTF-8"),
         ("name,x,y,photo,px,py\nP1,1,2,A.JPG,3,4\n", "names no CRS"),
+        ("name,x,y,z\nP1,1,2,3\n", "Line 1.*header without the columns image, pixel_x, pixel_y"),
+        ("EPSG:1\nname;x;y;z;photo\nP1;1;2;3;A.JPG\n", "Line 2.*header without the columns pixel_x, pixel_y"),
         ("EPSG:1\nname,x,y,photo,px,py,role\nP1,1,2,A.JPG,3,4,boss\n", "Line 3.*neither control nor check"),
         ("EPSG:1\nname,x,y,photo,px,py,sigma_h\nP1,1,2,A.JPG,3,4,0\n", "Line 3.*standard deviation"),
         ("name,x,y,photo,px,py,crs\nP1,1,2,A.JPG,3,4,1\nP2,1,2,A.JPG,3,4,2\n", "Line 3.*another CRS"),

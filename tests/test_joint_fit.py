@@ -1,12 +1,14 @@
 """The weighted fit of control and positions, and points from rays, against made-up truth."""
 
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
 from splatpipe.pipeline.scene.joint_fit import JointFit, Observed, Priors, find_blunders, fit_jointly
 from splatpipe.pipeline.scene.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.scene.triangulation import Rays, triangulate
+from splatpipe.stages.georef.model import View
 
 Array = NDArray[np.float64]
 TRUTH = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))
@@ -85,7 +87,20 @@ def rays(seed: int = 0) -> tuple[Rays, Array]:
         x, y, z = pose @ np.append(point, 1.0)
         poses.append(pose)
         seen.append(np.array([x / z, y / z]) + rng.normal(size=2) * 0.5 / focal)
-    return Rays(np.array(poses), np.array(seen), np.full(6, focal)), point
+    return Rays(np.array(poses), np.array(seen), np.tile(focal * np.eye(2), (6, 1, 1))), point
+
+
+def test_blunders_among_very_many_points_are_found() -> None:
+    """More points than are tried one by one."""
+    rng = np.random.default_rng(3)
+    world = rng.uniform(-50.0, 50.0, (400, 3))
+    target = world + rng.normal(size=world.shape) * 0.06
+    target[[7, 123, 399]] += [1.5, -1.0, 0.8]
+    count = len(world)
+    many = Observed(
+        TRUTH.inverse().apply(world), target, np.full((count, 3), 0.02), np.full(count, -1), np.ones(count, bool)
+    )
+    assert find_blunders(NEAR, many, Priors(np.zeros((0, 3))), 0.1) == (7, 123, 399)
 
 
 def test_point_is_where_rays_meet_as_well_as_its_covariance_says() -> None:
@@ -107,5 +122,20 @@ def test_wrong_ray_is_found_and_parallel_ones_tell_nothing() -> None:
     assert found is not None
     assert found.agree.tolist() == [True, True, False, True, True, True]
     assert np.linalg.norm(found.xyz - point) < 0.05
-    one = Rays(seen.cam_from_world[[0, 0]], seen.rays[[0, 0]], seen.focals_px[[0, 0]])
+    one = Rays(seen.cam_from_world[[0, 0]], seen.rays[[0, 0]], seen.pixels[[0, 0]])
     assert triangulate(one, 5.0) is None
+    back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 10.0])])
+    head_on = Rays(np.stack([np.eye(3, 4), back]), np.zeros((2, 2)), seen.pixels[:2])
+    assert triangulate(head_on, 5.0) is None
+
+
+def test_lens_weighs_marks_as_it_shows_them() -> None:
+    """Against the derivative of x = f u (1 + k r²) by hand, in photos twice as large as the model's."""
+    f, k = 800.0, -0.2
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1200, height=900, params=[f, 600.0, 450.0, k])
+    view = View(camera, np.eye(3, 4), scale=0.5)
+    u, v = ray = np.array([0.5, -0.3])
+    radial, squares = 1.0 + k * (u * u + v * v), np.array([[u * u, u * v], [u * v, v * v]])
+    by_hand = 2.0 * f * (radial * np.eye(2) + 2.0 * k * squares)
+    np.testing.assert_allclose(view.pixels_by_ray(ray), by_hand, rtol=1e-6, atol=1e-4)
+    assert np.isnan(view.pixels_by_ray(np.full(2, np.nan))).all()

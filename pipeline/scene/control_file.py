@@ -54,6 +54,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "sigma_vertical": ("sigma_vertical", "sigma_v", "sigma_z", "accuracy_z", "vert_accuracy", "sigma_vertical_m"),
     "crs": ("crs", "epsg", "srs"),
 }
+_NEEDED = ("x", "y", "photo", "px", "py")  # columns of a table
 GEOGRAPHIC = ("lon", "longitude", "lat", "latitude")
 ROLES: Mapping[str, Role] = {
     "control": "control",
@@ -154,6 +155,8 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[_Row]]:
     fields = crs.split()
     if len(fields) >= 6 and all(is_number(field) for field in fields[:5]):
         raise LineError(first, "the first line has to name the CRS, and is an observation", _EXPECTED)
+    for number, line in written[:2]:
+        _require_no_header(number, line)
     rows = []
     for number, line in written[1:]:
         fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 5 else line.split()
@@ -171,7 +174,16 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[_Row]]:
 def _is_header(line: str) -> bool:
     delimiter = delimiter_of(line)
     columns = find_columns(next(csv.reader([line], delimiter=delimiter)), COLUMNS)
-    return {"x", "y", "photo", "px", "py"} <= set(columns)
+    return set(_NEEDED) <= set(columns)
+
+
+def _require_no_header(number: int, line: str) -> None:
+    """Refuse a table's header that lacks columns, which would pass for a line of ODM's list."""
+    columns = find_columns(next(csv.reader([line], delimiter=delimiter_of(line))), COLUMNS)
+    missing = [name for name in _NEEDED if name not in columns]
+    if missing and len(columns) >= len(_NEEDED) - 2:
+        titles = ", ".join(COLUMNS[name][1] for name in missing)
+        raise LineError(number, f"a header without the columns {titles}", _EXPECTED)
 
 
 def _csv_rows(

@@ -24,6 +24,8 @@ QUIET = 2.5  # times the stated sigmas: control that agrees so well has nothing 
 CRITICAL, CRITICAL_FEW = 4.0, 24.0  # of a studentised residual; a little over Student's t at 1 in 1000, by its degrees
 MOST_PAIRED = 40  # points of which pairs are tried, too
 LEAST_LEFT = 3
+MOST_SUSPECTS = 100  # points that are tried, those with the largest residuals; one that is off is among them
+MOST_FOUND = 50  # blunders: a file with more has another fault
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ def find_blunders(start: Similarity, observed: Observed, priors: Priors, least_m
     """
     found: list[int] = []
     candidates = np.flatnonzero(observed.is_control).tolist()
-    while len(candidates) - len(found) > LEAST_LEFT and 2 * len(found) < len(candidates):
+    while len(candidates) - len(found) > LEAST_LEFT and 2 * len(found) < min(len(candidates), 2 * MOST_FOUND):
         kept = _without(len(observed), found)
         if fit_jointly(start, observed.only(kept), priors).noise <= QUIET:
             break
@@ -195,13 +197,25 @@ def _worst(start: Similarity, observed: Observed, priors: Priors, found: Sequenc
         if len(left) - size < LEAST_LEFT or (size == 2 and len(left) > MOST_PAIRED):
             break
         best: tuple[float, tuple[int, ...], JointFit] | None = None
-        for subset in itertools.combinations(left, size):
+        for subset in itertools.combinations(_suspects(start, observed, priors, left), size):
             fit = fit_jointly(start, observed.only(_without(len(observed), [*found, *subset])), priors)
             if best is None or fit.noise < best[0]:
                 best = (fit.noise, subset, fit)
         if best is not None and best[2].degrees > 0 and all(_is_off(best[2], observed, i, least_m) for i in best[1]):
             return list(best[1])
     return []
+
+
+def _suspects(start: Similarity, observed: Observed, priors: Priors, left: Sequence[int]) -> list[int]:
+    """The points of the largest residuals, all of them where they are few."""
+    if len(left) <= MOST_SUSPECTS:
+        return list(left)
+    others = np.flatnonzero(observed.is_control & ~np.isin(np.arange(len(observed)), left))
+    kept = _without(len(observed), others.tolist())
+    residuals = fit_jointly(start, observed.only(kept), priors).residuals / observed.sigmas[kept]
+    size = np.zeros(len(observed))
+    size[kept] = (residuals**2).sum(axis=1)
+    return sorted(np.array(left)[np.argsort(-size[left], kind="stable")[:MOST_SUSPECTS]].tolist())
 
 
 def _is_off(fit: JointFit, observed: Observed, index: int, least_m: float) -> bool:

@@ -21,26 +21,26 @@ class Rays:
     Attributes:
         cam_from_world: Poses.
         rays: Undistorted image points, x/z and y/z in the camera.
-        focals_px: Pixels a unit of them.
+        pixels: Derivative of the photo's pixels by them, at the marks: with the lens, as marks err in pixels.
     """
 
     cam_from_world: Float64[np.ndarray, "n 3 4"]
     rays: Float64[np.ndarray, "n 2"]
-    focals_px: Float64[np.ndarray, " n"]
+    pixels: Float64[np.ndarray, "n 2 2"]
 
     def __len__(self) -> int:
         return len(self.rays)
 
     def only(self, chosen: Bool[np.ndarray, " n"]) -> Rays:
         """Some of them."""
-        return Rays(self.cam_from_world[chosen], self.rays[chosen], self.focals_px[chosen])
+        return Rays(self.cam_from_world[chosen], self.rays[chosen], self.pixels[chosen])
 
     def residuals_px(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 2"]:
         """Where the photos would show the point less where they do; infinite behind a camera."""
         seen = self.cam_from_world[:, :, :3] @ point + self.cam_from_world[:, :, 3]
         ahead = seen[:, 2] > 0.0
         depth = np.where(ahead, seen[:, 2], 1.0)[:, None]
-        residuals = (seen[:, :2] / depth - self.rays) * self.focals_px[:, None]
+        residuals = np.einsum("nij,nj->ni", self.pixels, seen[:, :2] / depth - self.rays)
         return np.where(ahead[:, None], residuals, np.inf)
 
     def jacobian(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 2 3"]:
@@ -50,7 +50,7 @@ class Rays:
         in_camera = np.zeros((len(self), 2, 3))
         in_camera[:, 0, 0] = in_camera[:, 1, 1] = 1.0 / seen[:, 2]
         in_camera[:, :, 2] = -seen[:, :2] / seen[:, 2:] ** 2
-        return np.asarray((in_camera @ rotations) * self.focals_px[:, None, None])
+        return np.asarray(self.pixels @ in_camera @ rotations)
 
     def directions(self) -> Float64[np.ndarray, "n 3"]:
         """Unit vectors from the cameras to the point, in the world."""
@@ -113,7 +113,9 @@ def triangulate(rays: Rays, tolerance_px: float) -> Triangulated | None:
             return None
         point = _refined(rays.only(agree), point)
         near = np.linalg.norm(rays.residuals_px(point), axis=1) <= tolerance_px
-        if near.sum() < 2 or (near == agree).all():
+        if near.sum() < 2:
+            return None
+        if (near == agree).all():
             break
         agree = near
     if point is None:
@@ -123,9 +125,9 @@ def triangulate(rays: Rays, tolerance_px: float) -> Triangulated | None:
 
 
 def _meeting(rays: Rays) -> Float64[np.ndarray, " 3"] | None:
-    """The point nearest to the rays; None where they are parallel or meet behind a camera."""
+    """The point nearest to the rays; None where they are parallel, head-on or not, or meet behind a camera."""
     directions, centres = rays.directions(), rays.centres()
-    if np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)).max() < LEAST_PARALLAX_RAD:
+    if np.arccos(np.clip(np.abs(directions @ directions.T), 0.0, 1.0)).max() < LEAST_PARALLAX_RAD:
         return None
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     point = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))

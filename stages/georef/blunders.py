@@ -31,7 +31,9 @@ from splatpipe.stages.options import GeorefConfig
 FAR_M = 2000.0  # from the photos: control that they are to show lies nearer
 DATUM_M = 20.0  # off the positions, and more than they are wrong: another datum
 DATUM_SIGMAS = 5.0
+DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
 SWAPPED_SHARE = 0.3  # of how far two points are off, what is left of it when their names are swapped
+WEAK = 4.0  # times the control's own accuracy: the model is known less well
 LEAST_GSD = 3.0  # a point off by fewer ground pixels is none that a message helps with
 CONTROL_HINT = "--set georef.control=none goes on without control."
 
@@ -49,9 +51,7 @@ def require_near(survey: Survey, config: GeorefConfig, stations: Stations) -> Fl
         geodetic = locate_survey(survey, config)
     except SplatpipeError as error:
         better = _better_reading(survey, stations)
-        if not better:
-            raise
-        raise SplatpipeError(f"{survey.name}: {error}", f"{better} {CONTROL_HINT}") from error
+        raise SplatpipeError(f"{survey.name}: {error}", f"{better or error.hint} {CONTROL_HINT}") from error
     if len(stations) == 0:
         return geodetic
     away = _distance_m(geodetic, stations)
@@ -152,6 +152,30 @@ def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Report
         report.warning(
             f"The control of {survey.name} lies {shift.min():.0f} m beside the photos' positions.",
             f"Is {survey.crs.text} its CRS, and its datum the right one? The frame follows the control.",
+        )
+    lift = fit.offsets[:, 2]
+    heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
+    if heights and float(np.abs(lift).min()) > DATUMS_APART_M:
+        report.warning(
+            f"The heights of {survey.name} lie {abs(lift[0]):.0f} m {'below' if lift[0] > 0 else 'above'} the photos'"
+            " positions, further than vertical datums differ.",
+            "Are they in feet, or above a point of the site? The frame follows the control.",
+        )
+
+
+def tell_weak(fit: JointFit, observed: Observed, model: SparseModel, report: Reporter) -> None:
+    """Warn of control that hardly tells where the model is away from it: few points, in one corner or on a line."""
+    control = observed.sigmas[observed.is_control]
+    if len(model.points) == 0 or len(control) == 0:
+        return
+    noise = max(fit.noise, 1.0)
+    worth = noise * float(np.median(control[np.isfinite(control)]))
+    measured = np.isfinite(control).any(axis=0)
+    known = noise * float(np.median(fit.sigmas_at(model.points)[:, measured].max(axis=1)))
+    if known > WEAK * worth:
+        report.warning(
+            f"The control tells where the model is to {known:.2f} m only, away from its points.",
+            "Add control points, spread over the site and not on one line.",
         )
 
 

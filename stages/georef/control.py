@@ -17,7 +17,7 @@ from splatpipe.pipeline.scene.joint_fit import SIMILARITY, JointFit, fit_jointly
 from splatpipe.pipeline.scene.photos import Photo
 from splatpipe.stages.georef.accuracy import Placed
 from splatpipe.stages.georef.adjustment import Adjusted, Target, adjust, can_adjust, moved_px
-from splatpipe.stages.georef.blunders import name_blunders, require_near, tell_datum
+from splatpipe.stages.georef.blunders import name_blunders, require_near, tell_datum, tell_weak
 from splatpipe.stages.georef.level import Positions
 from splatpipe.stages.georef.model import SparseModel, model_of
 from splatpipe.stages.georef.place import (
@@ -111,6 +111,7 @@ def place_by_control(
     require_fit(fit, observed, survey)
     factor = fit.noise if fit.noise > QUIET else 1.0
     tell_datum(fit, survey, stations, report)
+    tell_weak(fit, observed, model, report)
     placed = Placed(model, fit.similarity, fit.offsets)
     result = ByControl(_frame(frame, survey, site, fit, config), survey, site, placed, None, None, factor)
     if config.adjust == "auto" and int(observed.is_control.sum()) >= MIN_CONTROL:
@@ -133,8 +134,9 @@ def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, confi
     vertical = survey.crs.vertical if heights else UNKNOWN if frame is None else frame.vertical_datum
     if vertical == UNKNOWN and config.vertical != "auto":
         vertical = parse_vertical(config.vertical)
-    note = f"From {len(control)} control points"
-    note += f" and the positions of {len(site.stations)} photos." if len(site.stations) else "."
+    by = [f"{len(control)} control point{'s' if len(control) > 1 else ''}"] if control else []
+    by += [f"the positions of {len(site.stations)} photos"] if len(site.stations) else []
+    note = f"From {' and '.join(by)}."
     if not heights:
         note += " Heights are the positions'." if len(site.stations) else " Heights count from the control points."
     residuals = dict(frame.residuals) if frame is not None else {}

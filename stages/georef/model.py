@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.names import match_names
 
+RAY_STEP = 1e-5  # of x/z: a hundredth of a pixel, for differences
+
 
 @dataclass(frozen=True)
 class View:
@@ -31,15 +33,20 @@ class View:
     cam_from_model: Float64[np.ndarray, "3 4"]
     scale: float
 
-    @property
-    def focal_px(self) -> float:
-        """Mean focal length in the photo's pixels."""
-        return float(self.camera.mean_focal_length()) / self.scale
-
     def ray(self, pixel: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
         """x/z and y/z of the ray through a pixel of the photo; not finite where the lens model has none."""
         found = self.camera.cam_from_img((pixel * self.scale)[None])
         return np.full(2, np.nan) if found is None else np.asarray(found, np.float64).reshape(2)
+
+    def pixels_by_ray(self, ray: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "2 2"]:
+        """Derivative of the photo's pixels by a ray's x/z and y/z; not finite where the lens model has none."""
+        around = np.tile(np.append(ray, 1.0), (4, 1))
+        around[:, :2] += RAY_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        shown = self.camera.img_from_cam(around) if np.isfinite(ray).all() else None
+        if shown is None:
+            return np.full((2, 2), np.nan)
+        shown = np.asarray(shown, np.float64).reshape(4, 2)
+        return np.asarray((shown[::2] - shown[1::2]).T / (2.0 * RAY_STEP * self.scale))
 
     def pixel(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 2"]:
         """Where the photo shows a point of the model; not finite behind the camera."""

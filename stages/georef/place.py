@@ -27,6 +27,7 @@ START_SHARE = 0.05  # of the control's extent: what a hypothesis may miss a poin
 OFFSET_SIGMA_M = 2.0  # of a flight's positions at least: a base station's coordinates
 OFFSET_SIGMAS = 3.0  # times theirs
 DATUM_SIGMA_M = 1000.0  # of heights: nothing says that those of control and of receivers have one datum
+LEAST_EXTENT_M = 0.01  # of control points that are several
 MISFIT_SHARE = 0.25  # of the control's extent: a fit that is off by more is none
 
 
@@ -244,6 +245,11 @@ def require_fit(fit: JointFit, observed: Observed, survey: Survey) -> None:
     known = np.isfinite(observed.sigmas[control])
     error = float(np.sqrt((np.where(known, fit.residuals[control], 0.0) ** 2).sum(axis=1).mean()))
     extent = float(np.linalg.norm(np.ptp(observed.target[control], axis=0)))
+    if extent < LEAST_EXTENT_M:
+        raise SplatpipeError(
+            f"All control points of {survey.name} have the same coordinates.",
+            "Each name has coordinates of its own: was one line copied to all?",
+        )
     if error > MISFIT_SHARE * extent:
         raise SplatpipeError(
             f"The control points of {survey.name} do not fit the model: they are {error:,.1f} m off"

@@ -115,7 +115,10 @@ def load_survey(
         SplatpipeError: if the file is none, or not of these photos.
     """
     file = read_control_file(path)
-    crs = parse_crs(file.crs)
+    try:
+        crs = parse_crs(file.crs)
+    except SplatpipeError as error:
+        raise SplatpipeError(f"The CRS of {path.name}: {error}", error.hint) from error
     sightings = _sightings(file, path.name, config, photos, model, report)
     points = [
         locate(SurveyPoint(point, "control", "", tuple(seen)), model, photos, config.mark_sigma_px)
@@ -136,7 +139,7 @@ def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], 
     if len(placed) < 2:
         return point.left_out(_why_unseen(point, len(placed)))
     rays, error_px = _rays([point.sightings[k] for k in placed], model, photos)
-    good = np.isfinite(rays.rays).all(axis=1)
+    good = np.isfinite(rays.rays).all(axis=1) & np.isfinite(rays.pixels).all(axis=(1, 2))
     tolerance = max(LEAST_TOLERANCE_PX, MARK_TOLERANCE * mark_sigma_px, FIT_TOLERANCE * error_px)
     found = triangulate(rays.only(good), tolerance) if good.sum() >= 2 else None
     if found is None:
@@ -156,9 +159,10 @@ def _rays(sightings: Sequence[Sighting], model: SparseModel, photos: Mapping[str
     """Rays of marks in photos of the model, and the model's mean reprojection error in the photos' pixels."""
     views = [model.view(s.index, photos[s.photo].width) for s in sightings if s.index is not None]
     rays = np.stack([view.ray(np.array(s.pixel)) for view, s in zip(views, sightings, strict=True)])
-    poses, focals = np.stack([view.cam_from_model for view in views]), np.array([view.focal_px for view in views])
+    poses = np.stack([view.cam_from_model for view in views])
+    pixels = np.stack([view.pixels_by_ray(ray) for view, ray in zip(views, rays, strict=True)])
     error_px = model.reconstruction.compute_mean_reprojection_error() / min(view.scale for view in views)
-    return Rays(poses, rays, focals), error_px
+    return Rays(poses, rays, pixels), error_px
 
 
 def residual_px(
