@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.survey_text import (
     CRS_COMMENT,
     MAX_LINE_CHARS,
@@ -26,6 +25,8 @@ from splatpipe.pipeline.scene.survey_text import (
     number_in,
     read_lines,
     title_of,
+    told_by_line,
+    written_lines,
 )
 
 Role = Literal["control", "check"]
@@ -131,16 +132,11 @@ def read_control_file(path: Path) -> ControlFile:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
     lines = read_lines(path, _KIND)
-    written = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
-    if not written:
-        raise SplatpipeError(f"The control file {path.name} is empty.", _EXPECTED)
+    written = written_lines(lines, path, _KIND)
     header = next((i for i, (_, line) in enumerate(written[:2]) if _is_header(line)), None)
-    try:
+    with told_by_line(path, _KIND):
         crs, rows = _odm_rows(written) if header is None else _csv_rows(lines, written, header)
         return _assemble(crs, rows)
-    except LineError as error:
-        where = f"Line {error.line} of" if error.line else "The control file"
-        raise SplatpipeError(f"{where} {path.name}: {error}.", error.hint or _EXPECTED) from error
 
 
 _EXPECTED = (

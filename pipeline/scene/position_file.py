@@ -25,6 +25,8 @@ from splatpipe.pipeline.scene.survey_text import (
     number_in,
     read_lines,
     title_of,
+    told_by_line,
+    written_lines,
 )
 
 MAX_NAME_CHARS = 1000
@@ -99,20 +101,15 @@ def read_position_file(path: Path) -> PositionFile:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
     lines = read_lines(path, KIND)
-    written = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
-    if not written:
-        raise SplatpipeError(f"The file of positions {path.name} is empty.", EXPECTED)
+    written = written_lines(lines, path, KIND)
     header = next((at for at, (_, line) in enumerate(written[:2]) if _header(line)), None)
-    try:
+    with told_by_line(path, KIND):
         if header is None:
             crs, rows = _odm_rows(written)
         else:
             crs, rows = _csv_rows([line for _, line in lines], written, header)
         photos = [_photo(number, row) for number, row in rows]
         _require_once(photos)
-    except LineError as error:
-        where = f"Line {error.line} of" if error.line else "The file of positions"
-        raise SplatpipeError(f"{where} {path.name}: {error}.", EXPECTED) from error
     if not photos:
         raise SplatpipeError(f"The file of positions {path.name} names no photo.", EXPECTED)
     return PositionFile(crs, tuple(photos))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,6 +67,28 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
         what = f"more than {kind.max_lines:,} lines" if long is None else f"no plain text in line {long}"
         raise SplatpipeError(f"{name} has {what}.", kind.expected)
     return list(enumerate(lines, 1))
+
+
+def written_lines(lines: Sequence[tuple[int, str]], path: Path, kind: TableKind) -> list[tuple[int, str]]:
+    """Those that are neither blank nor comments.
+
+    Raises:
+        SplatpipeError: if there is none.
+    """
+    written = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if not written:
+        raise SplatpipeError(f"The {kind.what} {path.name} is empty.", kind.expected)
+    return written
+
+
+@contextmanager
+def told_by_line(path: Path, kind: TableKind) -> Iterator[None]:
+    """Turn a ``LineError`` into the message for the user, which names the file and the line."""
+    try:
+        yield
+    except LineError as error:
+        where = f"Line {error.line} of" if error.line else f"The {kind.what}"
+        raise SplatpipeError(f"{where} {path.name}: {error}.", error.hint or kind.expected) from error
 
 
 def delimiter_of(line: str) -> str:
