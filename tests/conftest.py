@@ -1,8 +1,12 @@
-"""Shared by all tests: where the real photos are, and the demo capture."""
+"""Shared by all tests: where the real photos are, and a browser."""
 
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -15,3 +19,51 @@ def captures(request: pytest.FixtureRequest) -> Path:
     folder = request.config.getoption("--captures")
     assert folder, "give the folder of real captures with --captures"
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """A real Chromium without a window, which draws WebGL2 in software; the tests that drive it fail without one."""
+    with sync_playwright() as playwright:
+        path = shutil.which("chromium") or shutil.which("google-chrome")
+        assert path, "the pages are tested in a real browser: apt install chromium"
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+        yield playwright.chromium.launch(executable_path=path, args=flags)
+
+
+@dataclass
+class Watched:
+    """A page, with all that it asked for and complained of since it was opened."""
+
+    page: Page
+    requests: list[str] = field(default_factory=list)  # addresses, the page itself and data: and blob: left out
+    errors: list[str] = field(default_factory=list)  # errors on the console, uncaught ones, failed requests
+
+    def open(self, address: str) -> None:
+        """Go to an address, and wait until its load event."""
+        self.page.on("request", lambda request: self._asked(address, request.url))
+        self.page.on("requestfailed", lambda request: self.errors.append(f"failed: {request.url[:200]}"))
+        self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(address, wait_until="load")
+
+    def _asked(self, address: str, url: str) -> None:
+        if url.split("#")[0] != address.split("#")[0] and not url.startswith(("data:", "blob:")):
+            self.requests.append(url)
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[Callable[..., Watched]]:
+    """``open_page(address, width=1440, height=900, touch=False)``: a page of a fresh profile, watched throughout."""
+    contexts = []
+
+    def open_page(address: str, width: int = 1440, height: int = 900, touch: bool = False) -> Watched:
+        context = browser.new_context(viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch)
+        contexts.append(context)
+        watched = Watched(context.new_page())
+        watched.open(address)
+        return watched
+
+    yield open_page
+    for context in contexts:
+        context.close()

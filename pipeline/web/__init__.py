@@ -1,0 +1,23 @@
+"""The scripts and styles of the pages: src/ is bundled into dist/ when splatpipe is built (build.py)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import MachineError
+
+DIST = Path(__file__).resolve().parent / "dist"
+
+
+def asset(name: str) -> str:
+    """The text of a bundled script or style, e.g. ``viewer.js``.
+
+    Raises:
+        MachineError: This installation was built without it.
+    """
+    try:
+        return (DIST / name).read_text(encoding="utf-8")
+    except OSError as error:
+        raise MachineError(
+            f"This installation of splatpipe lacks {name}.", hint="Build it again: make, or pip install of the sources."
+        ) from error

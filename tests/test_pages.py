@@ -1,0 +1,25 @@
+"""The pages' scripts as they are bundled, in a real browser."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.web import asset
+
+
+def test_the_browser_has_webgl2_and_tells_what_a_page_does_wrong(tmp_path: Path, open_page: Callable) -> None:
+    page = tmp_path / "page.html"
+    page.write_text("<!doctype html><script>fetch('https://elsewhere.invalid/x').catch(() => 0); nothing.here</script>")
+    watched = open_page(page.as_uri())
+    watched.page.wait_for_timeout(200)
+    assert watched.page.evaluate("!!document.createElement('canvas').getContext('webgl2')")
+    assert watched.requests == ["https://elsewhere.invalid/x"]
+    assert any("nothing is not defined" in error for error in watched.errors)
+
+
+def test_a_script_that_was_not_built_is_told_with_what_to_do() -> None:
+    with pytest.raises(MachineError, match=r"lacks nothing\.js"):
+        asset("nothing.js")
+    assert "--accent" in asset("page.css")
