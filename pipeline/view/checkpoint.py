@@ -62,8 +62,9 @@ class Shown:
 def newest(opened: Opened) -> Source | None:
     """The furthest that a training has come; None before it can begin."""
     if "train.model" in opened.parts:
-        path, plan, sky = (opened.parts[f"train.{name}"].path for name in ("model", "plan", "sky"))
-        return Source(path, "model", opened.parts["train.model"].digest[:16], plan, sky)
+        part = opened.parts["train.model"]
+        plan, sky = opened.parts["train.plan"].path, opened.parts["train.sky"].path
+        return Source(part.path, "model", part.digest[:16], plan, sky)
     folder = opened.working.get("train")
     if folder is not None:
         try:
@@ -74,8 +75,8 @@ def newest(opened: Opened) -> Source | None:
             pass
     if "initialize.splat" in opened.parts:
         part = opened.parts["initialize.splat"]
-        plan = folder / "plan.json" if folder is not None else None
-        return Source(part.path, "initial", part.digest[:16], plan if plan and plan.is_file() else None)
+        begun = folder is not None and (folder / "plan.json").is_file()
+        return Source(part.path, "initial", part.digest[:16], folder / "plan.json" if folder and begun else None)
     return None
 
 

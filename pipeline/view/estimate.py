@@ -24,7 +24,6 @@ from splatpipe.stages.georef.blunders import name_blunders, require_near
 from splatpipe.stages.georef.gps import NoPlaceError
 from splatpipe.stages.georef.place import (
     Site,
-    Stations,
     make_site,
     observed_in,
     require_fit,
@@ -276,7 +275,7 @@ class Projector:
             focal = view.camera.mean_focal_length() / view.scale
             spread = np.maximum(LEAST_RADIUS_PX, focal * radius_m[ahead] / seen[ahead, 2])
             margin = np.minimum(spread, 0.25 * photo.width)[:, None]
-            inside = true & ((shown >= -margin) & (shown <= [photo.width, photo.height] + margin)).all(axis=1)
+            inside = true & ((shown >= -margin) & (shown <= np.array([photo.width, photo.height]) + margin)).all(axis=1)
             rows = ahead[inside]
             pixels[rows, index], radius[rows, index], depth[rows, index] = shown[inside], spread[inside], seen[rows, 2]
             beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)

@@ -79,38 +79,34 @@ class Live:
                 ],
             }
 
-    def picture(self, stamp: str, number: int, what: str) -> bytes | None:
-        """A JPEG of a view: its ``render`` or its ``photo``; None where that model, or view, is no longer there.
+    def picture(self, number: int, what: str) -> bytes | None:
+        """A JPEG of a view: its ``render`` by the latest model or its ``photo``; None where there is no such.
 
         Raises:
             SplatpipeError: if it cannot be made.
         """
-        made = self._pictures.get((stamp, number))
-        if made is None:
-            made = self._renderer.submit(self._make, stamp, number).result()
+        made = self._renderer.submit(self._make, number).result()
         return None if made is None else made[0 if what == "render" else 1]
 
-    def _make(self, stamp: str, number: int) -> tuple[bytes, bytes] | None:
+    def _make(self, number: int) -> tuple[bytes, bytes] | None:
         from splatpipe.pipeline.view import checkpoint
 
-        if (stamp, number) in self._pictures:
-            return self._pictures[stamp, number]
         with self._lock:
             opened, views = self._look()
         source = checkpoint.newest(opened)
         if source is None or not 0 <= number < len(views):
             return None
+        if (source.stamp, number) in self._pictures:
+            return self._pictures[source.stamp, number]
         if self._model is None or self._model[0] != source.stamp:
             self._model = None  # two of them may not fit
             self._model = source.stamp, checkpoint.load(source, opened)
-        if source.stamp != stamp:
-            return None
         shown = self._model[1]
         assert isinstance(shown, checkpoint.Shown)
         if shown.megapixels is None:
             shown = replace(shown, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
         made = checkpoint.pictures(shown, views[number], RENDER_THREADS)
-        self._pictures[stamp, number] = made
+        self._pictures[source.stamp, number] = made
         while len(self._pictures) > MOST_PICTURES:
             self._pictures.popitem(last=False)
         return made

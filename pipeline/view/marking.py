@@ -194,13 +194,12 @@ class Marking:
         for photo in self._photos:
             row = self._seen(photo, index.get(photo), number, projection)
             sighting = shown.get(photo)
+            off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
             row |= {
                 "mark": list(self._shifted(marks[photo])) if photo in marks else None,
                 "hidden": (name, photo) in hidden,
                 "agrees": sighting.agrees if sighting is not None else True,
-                "residual_px": None
-                if sighting is None
-                else residual_of(sighting, estimate.survey.points[number], self.job),
+                "residual_px": off,
             }
             rows.append(row)
         rows.sort(key=lambda row: (row["predicted"] is None, row["doubtful"], row["rank"]))

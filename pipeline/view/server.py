@@ -37,9 +37,7 @@ ASSETS = {
     "mark.js": "text/javascript",
 }
 OF_RUN = {"content-security-policy": CSP_OF_RUN, "cache-control": "no-cache"}
-ALONE = {
-    "cross-origin-opener-policy": "same-origin"
-}  # no page of the run, which has our origin, holds a handle of ours
+ALONE = {"cross-origin-opener-policy": "same-origin"}  # from the run's pages, which have our origin
 
 
 @dataclass(frozen=True)
@@ -165,7 +163,9 @@ class Pages:
             Route("/", self._landing),
             Route("/live", self._live),
             Route("/api/live", self._state),
-            Route("/live/{stamp}/{number:int}/{what}.jpg", self._picture),
+            Route(
+                "/live/{stamp}/{number:int}/{what}.jpg", self._picture
+            ),  # the stamp is the page's: a new one, new pictures
             Route("/assets/{name}", self._asset),
             Route("/{path:path}", self._file),
         ]
@@ -189,10 +189,10 @@ class Pages:
         given = request.path_params
         if given["what"] not in ("render", "photo"):
             raise HTTPException(404)
-        made = self.live.picture(given["stamp"], given["number"], given["what"])
+        made = self.live.picture(given["number"], given["what"])
         if made is None:
             raise HTTPException(404)
-        return Response(made, media_type="image/jpeg", headers={"cache-control": "private, max-age=3600"})
+        return Response(made, media_type="image/jpeg", headers={"cache-control": "no-store"})
 
     def _asset(self, request: Request) -> Response:
         name = request.path_params["name"]
