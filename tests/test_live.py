@@ -78,7 +78,9 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         page = watched.page
         told = wait(page, lambda told: told["model"] and len(told["curves"].get("loss", [])) > 0)
         assert told["at_work"] and told["model"]["kind"] == "initial"
-        assert [stage["state"] for stage in told["stages"] if stage["name"] in ("ingest", "undistort")] == ["reused"] * 2
+        assert [stage["state"] for stage in told["stages"] if stage["name"] in ("ingest", "undistort")] == [
+            "reused"
+        ] * 2
         first, photo = shown(page, "render"), shown(page, "photo")
         assert first.shape == photo.shape
         follow_the_curves(page, len(told["curves"]["loss"]))
