@@ -60,9 +60,11 @@ def marking(gps_run: Path) -> Iterator[tuple[Served, Path]]:
     """The server with the control file that it writes, which begins as none."""
     file = gps_run.parent / "photos of a house" / "gcp_list.txt"
     file.unlink(missing_ok=True)
+    config = (gps_run / "config.toml").read_bytes()
     with serving(gps_run, "--mark", "--points", gps_run.parent / "points.csv") as server:
         assert server.start == "mark"
         yield server, file
+    (gps_run / "config.toml").write_bytes(config)
 
 
 def state(page: Page) -> Any:
@@ -152,16 +154,11 @@ def cameras_off_m(out: Path) -> float:
         "+proj=topocentric +ellps=WGS84 +lat_0={latitude} +lon_0={longitude} +h_0={height_m}".format(**frame)
     )
     off = []
-    for camera in json.loads((out / "cameras.json").read_text())["cameras"]:
-        place = np.array(georef["exact_path"]["matrix"]) @ np.append(camera_centre(camera), 1.0)
-        pose = true_poses()[camera["name"]]
+    for camera in json.loads((out / "cameras.json").read_text()):
+        place = np.array(georef["exact_path"]["matrix"]) @ np.append(camera["position"], 1.0)
+        pose = true_poses()[camera["img_name"]]
         off.append(np.array(to_truth.transform(*place[:3])) + pose[:3, :3].T @ pose[:3, 3])
     return float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean()))
-
-
-def camera_centre(camera: dict[str, Any]) -> np.ndarray:
-    pose = np.array(camera["cam_from_world"])
-    return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
 
 
 def test_keys_move_remove_hide_and_take_back(marking: tuple[Served, Path], open_page: Callable) -> None:

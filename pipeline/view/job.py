@@ -24,7 +24,7 @@ from splatpipe.stages.georef.gps import NoPlaceError, georeference, read_positio
 from splatpipe.stages.georef.level import Positions
 from splatpipe.stages.georef.model import SparseModel, read_model
 from splatpipe.stages.line import GEOREF, LINE
-from splatpipe.stages.options import GeorefConfig
+from splatpipe.stages.options import GeorefConfig, LineConfig
 
 LIST_NAME, CSV_NAME = "gcp_list.txt", "control.csv"
 CONTROL = "source.control"
@@ -79,7 +79,7 @@ def open_job(run: Run, points_file: Path | None) -> Job:
         SplatpipeError: if the run is not so far, or there are no points, or they do not fit together.
     """
     photos_dir, config = run.config()
-    source = open_source(photos_dir, run.out, LINE, config)
+    source = open_source(photos_dir, run.out, LINE, _without_missing_control(config))
     opened = run.look()
     missing = [name for name in ("ingest.photos", "ingest.positions", "sparse.model") if name not in opened.parts]
     if missing:
@@ -98,6 +98,14 @@ def open_job(run: Run, points_file: Path | None) -> Job:
     places = (source.folder, opened.parts["ingest.photos"].path)
     frame = _frame(model, positions, config.georef)
     return Job(points, crs, geodetic, photos, *places, model, positions, frame, config.georef, text, command)
+
+
+def _without_missing_control(config: LineConfig) -> LineConfig:
+    """The options of a run whose control file was taken away: it is begun anew where it was."""
+    setting = config.georef.control
+    if setting in (AUTO, NONE) or Path(setting).is_file():
+        return config
+    return config.model_copy(update={"georef": config.georef.model_copy(update={"control": NONE})})
 
 
 def _frame(model: SparseModel, positions: Positions, config: GeorefConfig) -> Frame | None:
