@@ -14,6 +14,7 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.crs import UNKNOWN
 from splatpipe.pipeline.scene.local_crs import LocalCrs
 from splatpipe.pipeline.scene.panorama import FULL_FROM_DEG, NOTHING_UP_TO_DEG
 from splatpipe.pipeline.web import asset
@@ -190,7 +191,8 @@ def _subtitle(scene: ViewerScene) -> str:
 
 def _crs_line(scene: ViewerScene) -> str:
     if scene.crs is not None:
-        return f"{scene.crs.name} ({scene.crs.id}), heights: {scene.crs.heights}"
+        datum = "datum not known" if scene.crs.heights == UNKNOWN else scene.crs.heights
+        return f"{scene.crs.name} ({scene.crs.id}), heights: {datum}"
     return "local east, north, up, metres" if scene.metres else "arbitrary units: the photos say nothing of the scale"
 
 

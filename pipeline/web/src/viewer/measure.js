@@ -2,6 +2,8 @@
 
 import { BufferGeometry, Group, LineBasicMaterial, LineDashedMaterial, LineSegments, Vector3 } from "three";
 
+const LABEL_ABOVE_PX = 22; // so that a label does not hide a short line
+
 export class Measuring {
   /** @param {HTMLElement} layer Holds the labels. @param {{metres: boolean}} facts */
   constructor(layer, facts, changed) {
@@ -102,15 +104,15 @@ export class Measuring {
 
   /** Move the labels to where their points are in the window. */
   update(view) {
-    const put = (element, point) => {
+    const put = (element, point, above = 0) => {
       const { x, y, depth } = view.project(point);
       element.hidden = depth <= 0;
-      element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -50%)`;
+      element.style.transform = `translate(${x.toFixed(1)}px, ${(y - above).toFixed(1)}px) translate(-50%, -50%)`;
     };
     this.dot.hidden = !this.first;
     if (this.first) put(this.dot, this.first);
     for (const { result, label, ends, middle } of this.results) {
-      put(label, middle);
+      put(label, middle, LABEL_ABOVE_PX);
       put(ends[0], result.from);
       put(ends[1], result.to);
     }
