@@ -30,7 +30,7 @@ from splatpipe.pipeline.cli_options import (
     TimeBudgetOption,
     UntilOption,
 )
-from splatpipe.pipeline.ending import Ending, exit_code, for_the_user, print_json
+from splatpipe.pipeline.ending import Ending, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
@@ -38,6 +38,7 @@ from splatpipe.pipeline.engine.errors import (
     MachineError,
     Stopped,
     UsageError,
+    exit_code,
 )
 
 if TYPE_CHECKING:
@@ -274,6 +275,21 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
         done.told = {"stages": stages}
     if not as_json:
         show_standings(standings)
+
+
+@app.command()
+def report(out: OutArgument, as_json: JsonOption = False) -> None:
+    """Write OUT/report.html anew, from what is there."""
+    from splatpipe.pipeline.console import say
+    from splatpipe.pipeline.engine.session import LOG_FILE
+    from splatpipe.pipeline.engine.store import open_store
+    from splatpipe.pipeline.report import make_report
+
+    with Ending(out, as_json) as done:
+        open_store(out, create=False)
+        path = make_report(out, out / LOG_FILE)
+        done.told = {"outputs": [str(path)]}
+    say(str(path))
 
 
 @app.command()
