@@ -307,6 +307,17 @@ def test_a_finished_run_shows_its_model_beside_the_photos(served: Served, open_p
     assert watched.errors == []
 
 
+def test_the_viewer_opens_from_here_with_its_splat_inside_or_beside_it(served: Served, open_page: Callable) -> None:
+    """The page of the finished run carries its splat; that of the training loads it from this server."""
+    page = open_page(f"{served.address}/live").page
+    page.locator("#viewer:not([hidden])").wait_for()
+    for address in ("/viewer.html", str(page.locator("#viewer").get_attribute("href"))):
+        watched = open_page(served.address + address, 390, 400)
+        watched.page.evaluate("splatpipe.ready")
+        assert watched.errors == []
+        assert [url.rpartition("/")[2] for url in watched.requests] == (["splat.spz"] if "live" in address else [])
+
+
 def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> None:
     def view(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "splatpipe.pipeline.cli", "view", *map(str, arguments), "--no-browser"]

@@ -73,23 +73,37 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
     listening = _listen(options.port)
     live, token = Live(run), secrets.token_urlsafe(32)
     pages = Pages(run, live, token)
-    routes = pages.routes()
-    if options.mark:
-        from splatpipe.pipeline.view.job import open_job
-        from splatpipe.pipeline.view.mark_routes import MarkPages
-        from splatpipe.pipeline.view.marking import Marking
+    try:
+        routes = [*(_marking(pages, options, say) if options.mark else ()), *pages.routes()]
+        start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
+        start += "mark" if options.mark else "live" if run.is_at_work() else ""
+        say(f"Open {start} (Ctrl-C ends it)")
+        if options.open_browser:
+            threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
+        uvicorn.Server(_settings(make_app(routes, token))).run(sockets=[listening])
+    except Stopped as stopped:
+        if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
+            raise
+    finally:
+        live.close()
+        listening.close()
 
-        marking = Marking(open_job(run, options.points))
-        pages.marking = True
-        routes = [*MarkPages(marking, pages).routes(), *routes]
-        say(f"Marks go into {marking.job.text.path}")
-    address = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
-    start = address + ("mark" if options.mark else "live" if run.is_at_work() else "")
-    say(f"Open {start} (Ctrl-C ends it)")
-    if options.open_browser:
-        threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
-    config = uvicorn.Config(
-        make_app(routes, token),
+
+def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> list[Route]:
+    """What marking adds."""
+    from splatpipe.pipeline.view.job import open_job
+    from splatpipe.pipeline.view.mark_routes import MarkPages
+    from splatpipe.pipeline.view.marking import Marking
+
+    marking = Marking(open_job(pages.run, options.points))
+    pages.marking = True
+    say(f"Marks go into {marking.job.text.path}")
+    return MarkPages(marking, pages).routes()
+
+
+def _settings(app: ASGIApp) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
         http="h11",
         ws="none",
         lifespan="off",
@@ -99,14 +113,6 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
         timeout_graceful_shutdown=1,
         limit_concurrency=64,
     )
-    try:
-        uvicorn.Server(config).run(sockets=[listening])
-    except Stopped as stopped:
-        if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
-            raise
-    finally:
-        live.close()
-        listening.close()
 
 
 def _listen(port: int) -> socket.socket:
@@ -166,6 +172,8 @@ class Pages:
             Route(
                 "/live/{stamp}/{number:int}/{what}.jpg", self._picture
             ),  # the stamp is the page's: a new one, new pictures
+            Route("/live/{stamp}/viewer.html", self._viewer),
+            Route("/live/{stamp}/splat.spz", self._splat),
             Route("/assets/{name}", self._asset),
             Route("/{path:path}", self._file),
         ]
@@ -193,6 +201,18 @@ class Pages:
         if made is None:
             raise HTTPException(404)
         return Response(made, media_type="image/jpeg", headers={"cache-control": "no-store"})
+
+    def _viewer(self, _request: Request) -> Response:
+        page = self.live.viewer("page")
+        if page is None:
+            raise HTTPException(404)
+        return Response(page, media_type="text/html", headers=OF_RUN)
+
+    def _splat(self, _request: Request) -> Response:
+        splat = self.live.viewer("splat")
+        if splat is None:
+            raise HTTPException(404)
+        return Response(splat, media_type="application/octet-stream", headers=OF_RUN)
 
     def _asset(self, request: Request) -> Response:
         name = request.path_params["name"]
