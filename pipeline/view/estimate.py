@@ -11,12 +11,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.scene.control_file import ControlFile
 from splatpipe.pipeline.scene.joint_fit import JointFit, fit_jointly
+from splatpipe.pipeline.scene.photos import Photo
 from splatpipe.pipeline.scene.similarity import Similarity
 from splatpipe.pipeline.view.job import Job
 from splatpipe.stages.georef.accuracy import Placed, accuracy_json
@@ -36,10 +37,11 @@ Marks = Mapping[str, Mapping[str, tuple[float, float]]]
 UNKNOWN_HEIGHT_M = 5.0  # of a point that has no height, or while the heights' datum is not known
 LEAST_RADIUS_PX = 6.0
 SURFACE_RADIUS_M = 8.0  # around a point, of whose sparse points the height is taken
-LEAST_NEAR = 3  # sparse points
+LEAST_NEAR = 3  # sparse points that tell a height or a depth
 RAY_TOLERANCE = 1e-3  # of x/z; beyond it a lens model has folded back what it does not show
 HIDING = 0.85  # of a point's depth: what the photo sees there is nearer, so hides it
-HIDING_SHARE = 0.03  # of a photo's width: how far around a point
+DEEP_SHARE = 0.75  # of a cell's points are nearer than what counts as its depth
+CELLS = 20  # along each side of a photo, in which that is told
 HELPFUL_MARKS = 4  # of a point: from there on more tell little
 
 
@@ -104,6 +106,9 @@ class Estimator:
 
     Args:
         job: What is marked.
+
+    Raises:
+        SplatpipeError: if the points lie elsewhere than the photos.
     """
 
     def __init__(self, job: Job) -> None:
@@ -111,6 +116,8 @@ class Estimator:
         self._index = {name: k for k, name in enumerate(job.model.names)}
         self._located: dict[str, tuple[object, SurveyPoint]] = {}
         self._stations = stations_of(job.model, job.positions, job.frame)
+        unmarked = [SurveyPoint(point, "control", "", ()) for point in job.points]
+        self._geodetic = require_near(self._survey(unmarked), job.config, self._stations)
         self._gsd = job.model.gsd(1.0)  # of the model's units: it takes a while, and no mark changes it
 
     def estimate(self, marks: Marks) -> Estimate:
@@ -165,7 +172,7 @@ class Estimator:
 
     def _fit(self, survey: Survey, told: Told) -> _Fitted:
         job, stations = self._job, self._stations
-        site = make_site(survey, require_near(survey, job.config, stations), stations, job.frame, job.config)
+        site = make_site(survey, self._geodetic, stations, job.frame, job.config)
         start = start_similarity(site, survey, job.model, job.positions, job.frame)
         if not survey.of_role("control"):
             start = (self._lifted(start[0], site), start[1])
@@ -251,7 +258,7 @@ class Projector:
 
     def __init__(self, job: Job) -> None:
         self._job = job
-        self._seen = [self._observed(index) for index in range(len(job.model.names))]
+        self._covers = [self._cover(index) for index in range(len(job.model.names))]
 
     def project(self, places: Float64[np.ndarray, "n 3"], radius_m: Float64[np.ndarray, " n"]) -> Projection:
         """Where photos show places of the model, known to some radius (its units)."""
@@ -279,33 +286,35 @@ class Projector:
             rows = ahead[inside]
             pixels[rows, index], radius[rows, index], depth[rows, index] = shown[inside], spread[inside], seen[rows, 2]
             beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)
-            doubtful[rows, index] = beyond | self._hidden(index, shown[inside], seen[rows, 2], photo.width)
+            column, row = _cells(shown[inside], photo).T
+            doubtful[rows, index] = beyond | (self._covers[index][row, column] < HIDING * seen[rows, 2])
         return Projection(pixels, radius, depth, doubtful)
 
-    def _observed(self, index: int) -> Float64[np.ndarray, "k 3"]:
-        """Pixels and depths of the sparse points that a photo of the model shows."""
+    def _cover(self, index: int) -> Float64[np.ndarray, "rows columns"]:
+        """How deep most of what a photo of the model shows lies, by cells of it; infinite where too little tells."""
         model = self._job.model
         photo = self._job.photos.get(model.names[index])
+        cover = np.full((CELLS, CELLS), np.inf)
         if photo is None:
-            return np.zeros((0, 3))
+            return cover
         view = model.view(index, photo.width)
         image: Any = model.reconstruction.images[model.image_ids[index]]
         shown = [point for point in image.points2D if point.has_point3D()]
         pixels = np.array([point.xy for point in shown], np.float64).reshape(-1, 2) / view.scale
         places = np.array([model.reconstruction.points3D[p.point3D_id].xyz for p in shown], np.float64).reshape(-1, 3)
         depth = places @ view.cam_from_model[2, :3] + view.cam_from_model[2, 3]
-        return np.column_stack([pixels, depth])
+        cells = _cells(pixels, photo) @ [1, CELLS]
+        order = np.lexsort((depth, cells))
+        numbers, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+        deep = depth[order][first + (DEEP_SHARE * (count - 1)).astype(np.int64)]
+        cover.flat[numbers] = np.where(count >= LEAST_NEAR, deep, np.inf)
+        return cover
 
-    def _hidden(
-        self, index: int, pixels: Float64[np.ndarray, "k 2"], depth: Float64[np.ndarray, " k"], width: int
-    ) -> Bool[np.ndarray, " k"]:
-        """Whether what a photo shows around places is nearer than they are."""
-        seen, hidden = self._seen[index], np.zeros(len(pixels), dtype=bool)
-        for k, pixel in enumerate(pixels):
-            near = np.abs(seen[:, :2] - pixel).max(axis=1, initial=0.0) < HIDING_SHARE * width
-            if near.sum() >= LEAST_NEAR:
-                hidden[k] = float(np.percentile(seen[near, 2], 75)) < HIDING * depth[k]
-        return hidden
+
+def _cells(pixels: Float64[np.ndarray, "k 2"], photo: Photo) -> Int64[np.ndarray, "k 2"]:
+    """Column and row of the cells that pixels are in, or next to."""
+    share = pixels / [photo.width, photo.height]
+    return np.clip((share * CELLS).astype(np.int64), 0, CELLS - 1)
 
 
 def residual_of(sighting: Sighting, point: SurveyPoint, job: Job) -> list[float] | None:

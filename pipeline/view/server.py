@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import signal
 import socket
 import threading
 import webbrowser
@@ -77,16 +78,39 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
         routes = [*(_marking(pages, options, say) if options.mark else ()), *pages.routes()]
         start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
         start += "mark" if options.mark else "live" if run.is_at_work() else ""
-        say(f"Open {start} (Ctrl-C ends it)")
-        if options.open_browser:
-            threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
-        uvicorn.Server(_settings(make_app(routes, token))).run(sockets=[listening])
+        _take_signals_back()
+
+        def ready() -> None:
+            say(f"Open {start} (Ctrl-C ends it)")
+            if options.open_browser:
+                threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
+
+        _Server(_settings(make_app(routes, token)), ready).run(sockets=[listening])
     except Stopped as stopped:
         if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
             raise
     finally:
         live.close()
         listening.close()
+
+
+class _Server(uvicorn.Server):
+    """Says when it listens, and to signals as well."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._ready = ready
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to listen."""
+        await super().startup(sockets)
+        self._ready()
+
+
+def _take_signals_back() -> None:
+    """Put Python's handlers in place again: pyceres, once imported, takes SIGTERM for a crash and tells its stack."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.getsignal(number))
 
 
 def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> list[Route]:
