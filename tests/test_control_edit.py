@@ -64,17 +64,7 @@ def test_only_the_marked_line_changes(tmp_path: Path) -> None:
     text.with_mark(point("P1"), "A.JPG", (1.0, 2.0)).save()
     before, after = ODM.split("\r\n"), (tmp_path / "gcp_list.txt").read_bytes().decode().split("\r\n")
     assert [k for k, (a, b) in enumerate(zip(before, after, strict=True)) if a != b] == [3]
-    assert after[3].split() == [
-        "388710.51370",
-        "5299705.20810",
-        "512.0120",
-        "1.00",
-        "2.00",
-        "a.jpg",
-        "P1",
-        "extra",
-        "7",
-    ]
+    assert after[3].split() == before[3].replace("112.14", "1.00").replace("514.11", "2.00").split()
 
 
 def test_a_new_mark_stands_with_its_point_and_repeats_its_coordinates_as_written(tmp_path: Path) -> None:
@@ -82,7 +72,8 @@ def test_a_new_mark_stands_with_its_point_and_repeats_its_coordinates_as_written
     text = text.with_mark(point("point 2", 1.0, 3.0), "A.JPG", (5.0, 6.0))
     text.save()
     lines = (tmp_path / "gcp_list.txt").read_bytes().decode().split("\r\n")
-    assert lines[6].split()[:6] == ["388710.5137", "5299705.2081", "512.0120", "1.00", "2.00", "Ö.jpg"]
+    new = next(line for line in lines if "Ö.jpg" in line)
+    assert new.split()[:6] == ["388710.5137", "5299705.2081", "512.0120", "1.00", "2.00", "Ö.jpg"]
     found = {p.name: p for p in read_control_file(tmp_path / "gcp_list.txt").points}
     assert len(found["P1"].marks) == 3 and len(found["point 2"].marks) == 2
 
