@@ -107,10 +107,10 @@ def test_twelve_points_marked_in_the_browser_georeference_the_demo(
     The bars are those of the georeferencing: check points within a ground pixel, and one and a half in height.
     """
     server, file = marking
-    watched = opened(open_page, server)
+    watched = opened(open_page, server, 1000, 640)
     page = watched.page
     page.locator("#file select").select_option("4")
-    errors = []
+    errors, unseen = [], 0
     for _ in range(400):
         now = state(page)
         done = {point["name"] for point in now["told"]["points"] if point["marks"] >= MARKS}
@@ -126,6 +126,8 @@ def test_twelve_points_marked_in_the_browser_georeference_the_demo(
             page.keyboard.press("Enter")
         else:
             page.keyboard.press("x")
+            unseen += 1
+    assert unseen <= len(TWELVE)  # the page seldom asks for a point where something hides it
     assert done >= set(TWELVE)
     assert errors[0][0] > 1.0 and errors[-1][0] < 0.03 and errors[-1][1] < 0.03
     told = now["told"]

@@ -8,21 +8,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.scene.control_file import ControlFile
 from splatpipe.pipeline.scene.joint_fit import JointFit, fit_jointly
-from splatpipe.pipeline.scene.photos import Photo
 from splatpipe.pipeline.scene.similarity import Similarity
 from splatpipe.pipeline.view.job import Job
 from splatpipe.stages.georef.accuracy import Placed, accuracy_json
 from splatpipe.stages.georef.blunders import name_blunders, require_near
 from splatpipe.stages.georef.gps import NoPlaceError
+from splatpipe.stages.georef.model import SparseModel
 from splatpipe.stages.georef.place import (
     Site,
     make_site,
@@ -37,11 +36,10 @@ Marks = Mapping[str, Mapping[str, tuple[float, float]]]
 UNKNOWN_HEIGHT_M = 5.0  # of a point that has no height, or while the heights' datum is not known
 LEAST_RADIUS_PX = 6.0
 SURFACE_RADIUS_M = 8.0  # around a point, of whose sparse points the height is taken
-LEAST_NEAR = 3  # sparse points that tell a height or a depth
+LEAST_NEAR = 3  # sparse points that tell a height
 RAY_TOLERANCE = 1e-3  # of x/z; beyond it a lens model has folded back what it does not show
-HIDING = 0.85  # of a point's depth: what the photo sees there is nearer, so hides it
-DEEP_SHARE = 0.75  # of a cell's points are nearer than what counts as its depth
-CELLS = 20  # along each side of a photo, in which that is told
+NEIGHBOURS = 30  # sparse points around a place: a photo that shows none of them most likely has something before it
+MOST_WITNESSES = 50_000  # sparse points among which they are looked for
 HELPFUL_MARKS = 4  # of a point: from there on more tell little
 
 
@@ -240,7 +238,7 @@ class Projection:
         pixels: Of each point in each photo of the model; NaN where that does not show it.
         radius_px: Around it, where it is to be looked for.
         depth: In the model's units.
-        doubtful: Whether it lies beyond the border, if only just, or something nearer seems to hide it.
+        doubtful: Whether it lies beyond the border, if only just, or something seems to hide it.
     """
 
     pixels: Float64[np.ndarray, "n m 2"]
@@ -258,14 +256,14 @@ class Projector:
 
     def __init__(self, job: Job) -> None:
         self._job = job
-        self._covers = [self._cover(index) for index in range(len(job.model.names))]
+        self._cloud, self._shows = _cloud_of(job.model)
 
     def project(self, places: Float64[np.ndarray, "n 3"], radius_m: Float64[np.ndarray, " n"]) -> Projection:
         """Where photos show places of the model, known to some radius (its units)."""
         count, photos = len(places), len(self._job.model.names)
         pixels = np.full((count, photos, 2), np.nan)
         radius, depth = np.full((count, photos), np.nan), np.full((count, photos), np.nan)
-        doubtful = np.zeros((count, photos), dtype=bool)
+        doubtful, witnessed = np.zeros((count, photos), dtype=bool), self._witnessed(places)
         for index, name in enumerate(self._job.model.names):
             photo = self._job.photos.get(name)
             if photo is None:
@@ -286,35 +284,31 @@ class Projector:
             rows = ahead[inside]
             pixels[rows, index], radius[rows, index], depth[rows, index] = shown[inside], spread[inside], seen[rows, 2]
             beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)
-            column, row = _cells(shown[inside], photo).T
-            doubtful[rows, index] = beyond | (self._covers[index][row, column] < HIDING * seen[rows, 2])
+            doubtful[rows, index] = beyond | ~witnessed[rows, index]
         return Projection(pixels, radius, depth, doubtful)
 
-    def _cover(self, index: int) -> Float64[np.ndarray, "rows columns"]:
-        """How deep most of what a photo of the model shows lies, by cells of it; infinite where too little tells."""
-        model = self._job.model
-        photo = self._job.photos.get(model.names[index])
-        cover = np.full((CELLS, CELLS), np.inf)
-        if photo is None:
-            return cover
-        view = model.view(index, photo.width)
-        image: Any = model.reconstruction.images[model.image_ids[index]]
-        shown = [point for point in image.points2D if point.has_point3D()]
-        pixels = np.array([point.xy for point in shown], np.float64).reshape(-1, 2) / view.scale
-        places = np.array([model.reconstruction.points3D[p.point3D_id].xyz for p in shown], np.float64).reshape(-1, 3)
-        depth = places @ view.cam_from_model[2, :3] + view.cam_from_model[2, 3]
-        cells = _cells(pixels, photo) @ [1, CELLS]
-        order = np.lexsort((depth, cells))
-        numbers, first, count = np.unique(cells[order], return_index=True, return_counts=True)
-        deep = depth[order][first + (DEEP_SHARE * (count - 1)).astype(np.int64)]
-        cover.flat[numbers] = np.where(count >= LEAST_NEAR, deep, np.inf)
-        return cover
+    def _witnessed(self, places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n m"]:
+        """Which photos show a sparse point close to each place: what hides that is no hindrance, then."""
+        count = min(NEIGHBOURS, len(self._cloud))
+        if count == 0:
+            return np.ones((len(places), self._shows.shape[1]), dtype=bool)
+        witnessed = np.zeros((len(places), self._shows.shape[1]), dtype=bool)
+        for k in np.flatnonzero(np.isfinite(places).all(axis=1)):
+            away = ((self._cloud - places[k]) ** 2).sum(axis=1)
+            witnessed[k] = self._shows[np.argpartition(away, count - 1)[:count]].any(axis=0)
+        return witnessed
 
 
-def _cells(pixels: Float64[np.ndarray, "k 2"], photo: Photo) -> Int64[np.ndarray, "k 2"]:
-    """Column and row of the cells that pixels are in, or next to."""
-    share = pixels / [photo.width, photo.height]
-    return np.clip((share * CELLS).astype(np.int64), 0, CELLS - 1)
+def _cloud_of(model: SparseModel) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.ndarray, "k m"]]:
+    """Sparse points, evenly thinned where there are many, and which photos show each."""
+    every = sorted(model.reconstruction.points3D.items())
+    chosen = [point for _, point in every[:: max(1, len(every) // MOST_WITNESSES)]]
+    number = {image: k for k, image in enumerate(model.image_ids)}
+    shows = np.zeros((len(chosen), len(model.image_ids)), dtype=bool)
+    for row, point in enumerate(chosen):
+        seen = (number.get(element.image_id) for element in point.track.elements)
+        shows[row, [k for k in seen if k is not None]] = True
+    return np.array([point.xyz for point in chosen], dtype=np.float64).reshape(-1, 3), shows
 
 
 def residual_of(sighting: Sighting, point: SurveyPoint, job: Job) -> list[float] | None:
