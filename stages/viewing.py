@@ -1,10 +1,10 @@
-"""What `viewer.html` shows of a run: its cameras, photos, points, sky and CRS in the world frame, and the page itself."""
+"""What `viewer.html` shows of a run: cameras, photos, points, sky and CRS in the world frame; and the page itself."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -175,7 +175,7 @@ def _thumb(picture: Pixels, height: int) -> bytes:
     done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise StageError("A photo's small picture could not be coded as JPEG.")
-    return data.tobytes()
+    return bytes(data)
 
 
 def _sky(sky: Panorama, frame: Frame) -> ViewerSky:
@@ -187,6 +187,8 @@ def _sky(sky: Panorama, frame: Frame) -> ViewerSky:
     return ViewerSky(np.rint(colours * 255.0).astype(np.uint8))
 
 
-def _directions(elevation: Sequence[float], azimuth: Sequence[float]) -> Float64[np.ndarray, "rows columns 3"]:
+def _directions(
+    elevation: Float64[np.ndarray, " rows"], azimuth: Float64[np.ndarray, " columns"]
+) -> Float64[np.ndarray, "rows columns 3"]:
     rows, columns = np.meshgrid(elevation, azimuth, indexing="ij")
     return np.stack([np.cos(rows) * np.cos(columns), np.cos(rows) * np.sin(columns), np.sin(rows)], axis=2)

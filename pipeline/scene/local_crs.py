@@ -1,4 +1,4 @@
-"""A CRS for programs without PROJ: the way from the world's metres as a polynomial, exact to much less than a millimetre.
+"""A CRS for programs without PROJ: the way from the world's metres as a polynomial, exact to a tenth of a millimetre.
 
 Over a few kilometres a projection is a power series that dies out fast: its terms of fourth order are some (L / R)³ L,
 for a scene L = 10 km wide and the earth's radius R well below a millimetre.
@@ -52,7 +52,7 @@ class LocalCrs:
 
     def coordinates(self, local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """East, north, up (metres) to the CRS."""
-        return self.origin + _terms(local / self.scale_m, self.powers) @ self.coefficients
+        return np.asarray(self.origin + _terms(local / self.scale_m, self.powers) @ self.coefficients)
 
     def facts(self) -> dict[str, Any]:
         """As JSON, for a script that evaluates it."""
