@@ -22,7 +22,8 @@ from splatpipe.pipeline.web import asset
 TEMPLATE = Path(__file__).resolve().parent / "viewer.html"
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:;"
-    " style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
+    " style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:;"
+    " base-uri 'none'; form-action 'none'"
 )
 MOST_POINTS = 150_000  # that the page carries, 15 bytes each; more are thinned out evenly
 SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis: what is within is the scene

@@ -53,8 +53,8 @@ class Viewer {
       moved();
     };
     this.frusta = new Frusta(this.photos, frustumDepth(this.photos), () => this.stage.invalidate());
-    this.measuring = new Measuring($("labels"), facts, () => this.stage.invalidate());
-    this.stage.scene.add(this.frusta.group, this.measuring.group);
+    this.measuring = new Measuring($("labels"), $("lines"), facts, () => this.stage.invalidate());
+    this.stage.scene.add(this.frusta.group);
     this.stage.beforeDraw = () => this.beforeDraw();
     this.stage.canvas.addEventListener("webglcontextlost", () => tell("The graphics card stopped drawing.", "Reload this page."));
     new ResizeObserver(() => this.stage.resize()).observe(this.stage.canvas);
@@ -172,7 +172,9 @@ class Viewer {
     const now = performance.now();
     if (now - (this.hovered ?? 0) < HOVER_MS || this.view.journey) return;
     this.hovered = now;
-    this.tellPoint(this.pick(x, y));
+    const point = this.pick(x, y);
+    this.tellPoint(point);
+    if (this.tool) this.measuring.hover(point);
   }
 
   leave() {
