@@ -31,7 +31,7 @@ THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows;
 MOST_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
 SKY_ROWS = 64  # twice the panorama's: what interpolating twice blurs is not seen
-CLEARLY_TILTED = 0.3  # of the upward direction, in the picture: else one looks straight down, and no edge is the top
+CLEARLY_TILTED = 0.6  # of the upward direction, in the picture: seen from rather above, no edge is clearly the top
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ COLOUR_SCALE = 0.15
 LEAST_LOG_SCALE, LOG_SCALE_STEPS = -10.0, 16.0
 ROTATION_STEPS = 511
 SH_STEPS = 128.0
-SH_BITS = (5, 4)  # of degree 1 and of the rest, as the reference writer keeps: the others are noise that gzip pays for
+SH_BITS = (6, 5)  # of degree 1 and of the rest, one more than the reference writer keeps: a fifth larger, 3 dB better
 GZIP_LEVEL = 6
 
 

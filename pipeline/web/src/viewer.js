@@ -56,6 +56,7 @@ class Viewer {
     this.measuring = new Measuring($("labels"), $("lines"), facts, () => this.stage.invalidate());
     this.stage.scene.add(this.frusta.group);
     this.stage.beforeDraw = () => this.beforeDraw();
+    this.stage.failed = (error) => tell(`Drawing failed: ${error.message}`, "Reload this page, or try another browser.");
     this.stage.canvas.addEventListener("webglcontextlost", () => tell("The graphics card stopped drawing.", "Reload this page."));
     new ResizeObserver(() => this.stage.resize()).observe(this.stage.canvas);
     await this.addSmallParts();
@@ -220,6 +221,7 @@ class Viewer {
   }
 
   showCameras(shown) {
+    if (shown) this.frusta.paint();
     this.frusta.group.visible = shown;
     $("cameras").setAttribute("aria-pressed", String(shown));
     this.stage.invalidate();
@@ -279,6 +281,7 @@ class Viewer {
 }
 
 function progress(share) {
+  $("bar").classList.add("known");
   $("bar").style.width = `${Math.round(100 * share)}%`;
 }
 

@@ -49,6 +49,7 @@ export class Stage {
     this.setStride = drawInBatches(this.spark);
     this.scene.add(this.spark);
     this.beforeDraw = () => {};
+    this.failed = () => {};
     this.mesh = null;
     this.wanted = 0;
     this.movedAt = -Infinity;
@@ -108,7 +109,7 @@ export class Stage {
     this.scheduled = true;
     const begin = () => {
       this.scheduled = false;
-      this.draw();
+      this.draw().catch((error) => this.failed(error));
     };
     if (document.hidden) setTimeout(begin, POLL_MS);
     else requestAnimationFrame(begin);
