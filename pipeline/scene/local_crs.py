@@ -36,7 +36,7 @@ class LocalCrs:
         scale_m: Metres.
         powers: a, b, c of each term.
         coefficients: Of each term for each coordinate, in the CRS's units.
-        largest_error: Against PROJ within the box, in the CRS's units (degrees, where it is geographic).
+        largest_error: Of each coordinate against PROJ, at the samples, in the CRS's units.
     """
 
     id: str
@@ -48,7 +48,7 @@ class LocalCrs:
     scale_m: float
     powers: Int64[np.ndarray, "terms 3"]
     coefficients: Float64[np.ndarray, "terms 3"]
-    largest_error: float
+    largest_error: Float64[np.ndarray, " 3"]
 
     def coordinates(self, local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """East, north, up (metres) to the CRS."""
@@ -94,7 +94,7 @@ def local_crs(world: World, box: Float64[np.ndarray, "2 3"]) -> LocalCrs:
         scale_m=reach,
         powers=powers,
         coefficients=coefficients,
-        largest_error=float(np.abs(terms @ coefficients - wanted).max()),
+        largest_error=np.abs(terms @ coefficients - wanted).max(axis=0),
     )
 
 
