@@ -115,13 +115,23 @@ def write_viewer(folder: Path, scene: ViewerScene, gaussians: Gaussians, largest
         gaussians: In the world frame, finite.
         largest_bytes: Of a page that carries its splat.
     """
-    upright = gaussians.transformed(1.0, torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64), torch.zeros(3))
-    splat = spz_bytes(upright, scene.antialias)
+    splat = viewer_splat(gaussians, scene.antialias)
     page = viewer_page(scene, splat)
     if len(page.encode()) > largest_bytes:
         (folder / SPLAT).write_bytes(splat)
         page = viewer_page(scene, SPLAT)
     (folder / PAGE).write_text(page, encoding="utf-8")
+
+
+def viewer_splat(gaussians: Gaussians, antialias: bool) -> bytes:
+    """The SPZ file that the page draws.
+
+    Args:
+        gaussians: In the world frame (z up), finite.
+        antialias: Whether their opacities allow for the blur on screen.
+    """
+    turn = torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64)
+    return spz_bytes(gaussians.transformed(1.0, turn, torch.zeros(3, dtype=torch.float64)), antialias)
 
 
 def upright(camera: Camera) -> tuple[Camera, int]:
