@@ -17,8 +17,14 @@ MOST_LISTED = 200  # rows of a table of photos
 LEAST_POINTS = 100  # observed by a photo that is placed well
 
 
-def capture_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter:
-    """What was captured: photos, cameras, positions, map, overlap, and what was left out and why."""
+def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: bool) -> Chapter:
+    """What was captured: photos, cameras, positions, map, overlap, and what was left out and why.
+
+    Args:
+        holdings: What there is.
+        geometry: Of the model, if there is one.
+        drawn: Whether to draw maps.
+    """
     summary = holdings.summary("ingest")
     photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
     left_out = holdings.read("ingest.left_out").get("left_out", [])
@@ -40,6 +46,12 @@ def capture_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter:
     }
     if geometry is not None:
         chapter |= _mapped(holdings, geometry)
+    elif drawn and len(positions) > 1:
+        from splatpipe.pipeline.report.charts import stated_map
+
+        places = [(float(position["latitude"]), float(position["longitude"])) for position in positions]
+        text = "Where the photos say that they were taken, joined in name order. Whereto they look is not known yet."
+        chapter["maps"] = [{"svg": stated_map(places), "text": text}]
     return chapter
 
 

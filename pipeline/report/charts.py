@@ -19,6 +19,7 @@ from splatpipe.pipeline.report.drawing import (
     GREY,
     HEIGHT,
     INK,
+    LINE,
     ORANGE,
     RED,
     WIDTH,
@@ -34,6 +35,7 @@ PAIRS_DRAWN = 3_000  # lines, the strongest
 OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # from so many photos on a colour of its own
 OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa564", "#1a6b3c")
 ARROW_SHARE = 0.12  # of the map's width, that the longest residual is drawn as
+METRES_A_DEGREE = 111_195.0  # of a sphere: enough to draw by
 MOST_NAMES = 30  # points with their names on a map
 Residual = tuple[str, Sequence[float], Sequence[float]]  # name; place and residual: east, north, up, metres
 
@@ -60,9 +62,25 @@ def survey_map(geometry: Geometry, unit: str, held_out: Sequence[str]) -> Markup
     return to_svg(figure, "Map of the photos' positions, viewing directions and footprints")
 
 
+def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
+    """Where the photos say that they were taken: all there is before the cameras are found.
+
+    Args:
+        places: Latitude and longitude, degrees.
+    """
+    degrees = np.array(places, np.float64)
+    north = METRES_A_DEGREE * (degrees[:, 0] - degrees[:, 0].mean())
+    east = METRES_A_DEGREE * math.cos(math.radians(degrees[0, 0])) * (degrees[:, 1] - degrees[:, 1].mean())
+    box = _about(np.stack([east, north], axis=1))
+    figure, axes = new_figure(*map_size(box))
+    axes.plot(east, north, "o-", ms=4, mfc=BLUE, mec="white", mew=0.5, color=LINE, lw=0.8)
+    as_map(axes, box, "m")
+    return to_svg(figure, "Map of where the photos say that they were taken")
+
+
 def overlap_map(overlap: Overlap, unit: str) -> Markup:
     """How many footprints cover each place."""
-    figure, axes = new_figure(*map_size(overlap.box))
+    figure, axes = new_figure(*map_size(overlap.box), right=1.0)
     norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
     shown = np.ma.masked_equal(overlap.counts, 0)
     axes.imshow(
@@ -139,7 +157,7 @@ def error_histogram(geometry: Geometry) -> Markup:
 def residual_field(field: Field, camera: int) -> Markup:
     """Mean residuals over the picture: a pattern tells that the lens model does not fit."""
     width, height = field.size
-    figure, axes = new_figure(WIDTH, float(np.clip(WIDTH * height / width, 2.4, 5.2)) + 0.4)
+    figure, axes = new_figure(*map_size((0.0, width, 0.0, height)))
     largest = float(np.linalg.norm(field.residuals, axis=1).max())
     scale = max(largest, 1e-6) * 14.0 / width
     axes.quiver(

@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import quote
 
 from splatpipe.pipeline.report.holdings import Holdings
-from splatpipe.pipeline.report.wording import count, duration, moment, size
+from splatpipe.pipeline.report.wording import count, duration, moment, plural, size
 from splatpipe.stages.line import LINE
 
 Chapter = dict[str, Any]
@@ -120,7 +120,7 @@ def _machine(machine: Mapping[str, Any]) -> str:
     if machine.get("cores"):
         told.append(f"{count(machine['cores'])} cores")
     if machine.get("threads"):
-        told.append(f"{count(machine['threads'])} threads used")
+        told.append(f"{plural(int(machine['threads']), 'thread')} used")
     if machine.get("device") not in (None, "auto"):
         told.append(f"device {machine['device']}")
     return ", ".join(told)

@@ -60,7 +60,7 @@ def judge(holdings: Holdings) -> Verdict:
         return Verdict(ended.level, ended.title, ended.text, findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
     if any(finding.level == "bad" for finding in doubtful):
-        return Verdict("bad", "Finished, but not fit for use as it is", text, findings)
+        return Verdict("bad", "Finished, but with a serious shortcoming", text, findings)
     if doubtful:
         return Verdict("doubt", f"Finished; {plural(len(doubtful), 'point')} to look at", text, findings)
     return Verdict("good", "Finished, and nothing looks doubtful", text, findings)
