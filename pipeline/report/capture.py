@@ -71,12 +71,12 @@ def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapt
     ]
     if not sparse:  # the stage failed or was never reached
         facts = [fact for fact in facts if "–" not in fact[1] and fact[1]]
-    unregistered = [str(name) for name in models.get("unregistered", [])] if isinstance(models, Mapping) else []
+    unregistered = [str(name) for name in models.get("unregistered", [])]
     chapter: Chapter = {
         "facts": facts,
         "unregistered": unregistered[:MOST_LISTED],
         "unregistered_more": max(0, len(unregistered) - MOST_LISTED),
-        "other_models": models.get("other_models", []) if isinstance(models, Mapping) else [],
+        "other_models": models.get("other_models", []),
         "cameras": [_calibrated(camera) for camera in sparse.get("cameras", [])],
     }
     if geometry is not None:
@@ -134,7 +134,7 @@ def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
     from splatpipe.pipeline.report import charts
 
     found = holdings.read("matches.pairs")
-    pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])] if isinstance(found, Mapping) else []
+    pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])]
     drawn = [
         (charts.observations_bars(geometry), f"Photos with fewer than {LEAST_POINTS} points (red) are placed poorly."),
         (

@@ -157,7 +157,7 @@ def error_histogram(geometry: Geometry) -> Markup:
 def residual_field(field: Field, camera: int) -> Markup:
     """Mean residuals over the picture: a pattern tells that the lens model does not fit."""
     width, height = field.size
-    figure, axes = new_figure(*map_size((0.0, width, 0.0, height)))
+    figure, axes = new_figure(*map_size((0.0, float(width), 0.0, float(height))))
     largest = float(np.linalg.norm(field.residuals, axis=1).max())
     scale = max(largest, 1e-6) * 14.0 / width
     axes.quiver(

@@ -175,7 +175,7 @@ def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, or
     return Chip(picture, TURNS.get(orientation, 0), (float(marked[0]), float(marked[1])), found, side)
 
 
-def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> UInt8[np.ndarray, "h w 3"]:
+def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> UInt8[np.ndarray, "side side 3"]:
     """A square of a photo; grey where it reaches beyond."""
     height, width = pixels.shape[:2]
     square = np.full((side, side, 3), 128, np.uint8)
@@ -185,7 +185,7 @@ def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> 
     return square
 
 
-def _shrunk(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _shrunk(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
     height, width = pixels.shape[:2]
     factor = VIEW_SIDE / max(width, height)
     if factor >= 1.0:
@@ -194,6 +194,6 @@ def _shrunk(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _turned(pixels: UInt8[np.ndarray, "h w 3"], orientation: int) -> UInt8[np.ndarray, "h w 3"]:
+def _turned(pixels: UInt8[np.ndarray, "h w 3"], orientation: int) -> UInt8[np.ndarray, "_ _ 3"]:
     turn = TURNS.get(orientation)
     return pixels if turn is None else np.asarray(cv2.rotate(pixels, CODES[turn]), np.uint8)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.report.holdings import Holdings, read_json
@@ -30,7 +31,7 @@ def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | 
         return None
     frame, control, report = (holdings.read(f"georef.{name}") for name in ("frame", "control", "accuracy"))
     points = list(control.get("points", []))
-    splat = holdings.read("evaluate.metrics").get("accuracy", {}).get("splat") or {"tables": {}, "points": []}
+    splat = _splat(holdings)
     chapter: Chapter = {
         "note": str(frame.get("note", "")),
         "facts": _frame_facts(holdings, frame, control, report),
@@ -46,6 +47,15 @@ def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | 
     if geometry is not None:
         chapter |= _drawn(holdings, geometry, frame, points)
     return chapter
+
+
+def _splat(holdings: Holdings) -> Mapping[str, Any]:
+    """What evaluate found of the splat's own accuracy; nothing where that is damaged, which its own chapter tells."""
+    with suppress(OSError, ValueError, AttributeError):
+        found = holdings.read("evaluate.metrics").get("accuracy", {}).get("splat")
+        if found:
+            return dict(found)
+    return {"tables": {}, "points": []}
 
 
 def _frame_facts(
