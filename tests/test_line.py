@@ -115,6 +115,7 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "sparse.glb",
         "config.toml",
         "events.jsonl",
+        "report.html",
         "stages",
     ):
         assert (undisturbed / name).exists(), name

@@ -23,7 +23,7 @@ BOX_PERCENTILES = (4.0, 96.0)  # of the sparse points: some lie far behind what 
 BOX_MARGIN = 0.15  # of its longer side
 GRID_CELLS = 240  # along the longer side of the overlap map
 FIELD_CELLS = 16  # along the longer side of a picture, for the mean residuals
-FIELD_PHOTOS = 60  # enough observations for them; more would cost seconds
+FIELD_PHOTOS = 24  # enough observations for them; more would cost seconds
 LEAST_IN_CELL = 5  # observations, for a mean that says something
 
 
