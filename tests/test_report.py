@@ -22,6 +22,7 @@ from splatpipe.pipeline.report import make_report, write_report
 from splatpipe.pipeline.report.holdings import open_holdings
 from splatpipe.pipeline.report.page import report_page
 from splatpipe.pipeline.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.report.verdict import judge
 from splatpipe.stages.line import LINE
 
 QUICK = ("features.extractor=opencv-sift", "features.max_image_size=700", "undistort.max_megapixels=0.03")
@@ -279,21 +280,17 @@ def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Call
             stage = "" if kind == "run_started" else "export"
             events.write(json.dumps({"kind": kind, "stage": stage, "data": data, "time_s": 1.8e9}) + "\n")
         events.write("no JSON\n[1, 2]\n" + '{"kind": "metric", "stage": "train", "data": {}, "time_s": "soon"}\n')
-    for part in ("georef.control", "ingest.left_out", "evaluate.metrics"):
-        path = holdings.part(part)
-        told = json.loads(path.read_text())
-        if part == "georef.control":
-            told["points"][0]["name"] = told["points"][0]["why"] = told["file"] = f"$x_{HOSTILE}"
-            told["points"][0]["observations"][0]["photo"] = f"../{HOSTILE}"
-        elif part == "ingest.left_out":
-            told["left_out"] = [{"name": HOSTILE, "reason": HOSTILE}]
-        else:
-            told["per_view"][0]["name"] = HOSTILE
-            told["per_view"][0]["file"] = "../../../etc/passwd"
-        size = path.stat().st_size
-        path.write_text(json.dumps(told))
-        manifest = path.parent / "manifest.json"
-        manifest.write_text(manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
+
+    def hostile_control(told: dict[str, object]) -> None:
+        point = told["points"][0]
+        point["name"] = point["why"] = told["file"] = f"$x_{HOSTILE}"
+        point["observations"][0]["photo"] = f"../{HOSTILE}"
+
+    rewrite(holdings.part("georef.control"), hostile_control)
+    left_out = [{"name": HOSTILE, "reason": HOSTILE}]
+    rewrite(holdings.part("ingest.left_out"), lambda told: told.update(left_out=left_out))
+    stolen = {"name": HOSTILE, "file": "../../../etc/passwd"}
+    rewrite(holdings.part("evaluate.metrics"), lambda told: told["per_view"][0].update(stolen))
     write_report(copy_of_run)
     watched = open_page((copy_of_run / "report.html").as_uri())
     assert (watched.requests, watched.errors) == ([], [])
@@ -311,6 +308,44 @@ def test_a_damaged_part_costs_its_chapter_and_not_the_report(copy_of_run: Path, 
     page = report_page(open_holdings(copy_of_run), drawn=False)
     assert page.count("This part could not be read") == 1
     assert "How it was made" in page
+
+
+def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
+    """Change a part of an artifact, which stays whole."""
+    told = json.loads(path.read_text())
+    size = path.stat().st_size
+    change(told)
+    path.write_text(json.dumps(told))
+    manifest = path.parent / "manifest.json"
+    manifest.write_text(manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "level", "said"),
+    [
+        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=17.0), "bad", "a poor likeness"),
+        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=22.0), "doubt", "a fair likeness"),
+        ("evaluate.metrics", lambda told: told.update(per_view=[]), "doubt", "No photo was held out"),
+        ("evaluate.metrics", lambda told: told["floaters"].update(free_space_rendered=0.2), "doubt", "20.00 %"),
+        ("georef.accuracy", lambda told: told["tables"]["check"].update(rmse_up_m=0.5), "doubt", "50.0 cm in height"),
+        ("georef.accuracy", lambda told: told["tables"].update(check=None), "doubt", "no check point proves it"),
+        (
+            "georef.accuracy",
+            lambda told: told["tables"].update(check=None, control=None),
+            "doubt",
+            "own positions alone",
+        ),
+        ("georef.frame", lambda told: told.update(kind="arbitrary"), "doubt", "neither scale nor place"),
+    ],
+)
+def test_the_verdict_follows_the_figures(
+    copy_of_run: Path, part: str, change: Callable[[dict[str, object]], None], level: str, said: str
+) -> None:
+    before = [finding.text for finding in judge(open_holdings(copy_of_run)).findings]
+    assert not any(said in text for text in before)
+    rewrite(open_holdings(copy_of_run).part(part), change)
+    found = next(finding for finding in judge(open_holdings(copy_of_run)).findings if said in finding.text)
+    assert found.level == level
 
 
 def test_a_broken_off_run_is_told_from_a_running_one(copy_of_run: Path) -> None:

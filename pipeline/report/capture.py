@@ -143,16 +143,17 @@ def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
         ),
         (charts.error_histogram(geometry), "How far the points miss their pixels."),
     ]
-    if pairs:
-        drawn.append((charts.match_map(geometry, pairs, unit_of(holdings)), "Which photos were matched with which."))
     for number_of, field in enumerate(geometry.fields[:4], start=1):
         text = "Mean residuals over the picture, much enlarged: a pattern would tell that the lens model does not fit."
         drawn.append((charts.residual_field(field, number_of), text))
+    if pairs:
+        drawn.append((charts.match_map(geometry, pairs, unit_of(holdings)), "Which photos were matched with which."))
     return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
 
 
 def _camera(camera: Mapping[str, Any]) -> dict[str, str]:
-    name = " ".join(str(camera[part]) for part in ("make", "model_name") if camera.get(part)) or "unknown camera"
+    make, model = str(camera.get("make") or ""), str(camera.get("model_name") or "")
+    name = (model if model.casefold().startswith(make.casefold()) else f"{make} {model}").strip() or "unknown camera"
     known = str(camera.get("focal_source", "")).replace("-", " ")
     focal = f"{number(camera.get('focal_px'), 1)} px" + (f" ({known})" if known else "")
     size = f"{count(camera.get('width'))} × {count(camera.get('height'))}"

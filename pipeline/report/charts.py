@@ -80,7 +80,7 @@ def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
 
 def overlap_map(overlap: Overlap, unit: str) -> Markup:
     """How many footprints cover each place."""
-    figure, axes = new_figure(*map_size(overlap.box), right=1.0)
+    figure, axes = new_figure(*map_size(overlap.box), right=1.15)
     norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
     shown = np.ma.masked_equal(overlap.counts, 0)
     axes.imshow(
@@ -142,7 +142,7 @@ def track_histogram(geometry: Geometry) -> Markup:
 
 def error_histogram(geometry: Geometry) -> Markup:
     """Mean reprojection errors of the sparse points."""
-    figure, axes = new_figure(WIDTH, 2.6)
+    figure, axes = new_figure()
     errors = geometry.errors_px[np.isfinite(geometry.errors_px)]
     top = float(np.percentile(errors, 99.5)) if len(errors) else 1.0
     axes.hist(np.clip(errors, 0.0, top), bins=48, range=(0.0, max(top, 1e-6)), color=BLUE)
@@ -227,10 +227,10 @@ def view_bars(views: Sequence[tuple[str, float]], unit: str) -> Markup:
     values = [value for _, value in views]
     axes.bar(np.arange(len(values)) + 1, values, width=0.8, color=BLUE)
     axes.axhline(float(np.mean(values)), color=ORANGE, lw=1.2, label=f"mean {np.mean(values):.2f} {unit}")
-    axes.set_ylim(bottom=max(0.0, min(values) - 5.0))
+    axes.set_ylim(max(0.0, min(values) - 5.0), max(values) + 4.0)
     axes.set_xlabel("held-out photo, the worst first")
     axes.set_ylabel(f"PSNR ({unit})")
-    axes.legend(fontsize=8, loc="lower right")
+    axes.legend(fontsize=8, loc="upper left")
     return to_svg(figure, "PSNR of the held-out photos")
 
 

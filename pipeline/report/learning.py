@@ -122,10 +122,10 @@ def _row(view: Mapping[str, Any], measures: Sequence[tuple[str, str, int]]) -> d
 def _floaters(floaters: Mapping[str, Any]) -> list[tuple[str, str]]:
     depth = floaters.get("depth_disagreement") or {}
     return [
-        ("Opacity in free space", share(floaters.get("free_space_opacity"), 3)),
-        ("of what the views show", share(floaters.get("free_space_rendered"), 3)),
-        ("Neighbouring views' depths differ by", f"{share(depth.get('median'), 2)} (median)"),
-        ("by more than 5 %", f"in {share(depth.get('share_above_5_percent'), 1)} of the pixels"),
+        ("Opacity in the air", f"{share(floaters.get('free_space_opacity'), 3)} of all"),
+        ("Share of the views", f"{share(floaters.get('free_space_rendered'), 3)} of what they show hangs in the air"),
+        ("Depths of neighbouring views", f"differ by {share(depth.get('median'), 2)} (median)"),
+        ("Depths more than 5 % off", f"in {share(depth.get('share_above_5_percent'), 1)} of the pixels"),
     ]
 
 

@@ -68,7 +68,7 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
     )
     return environment.get_template("report.html.j2").render(
         name=holdings.out.resolve().name or str(holdings.out),
-        photos_dir="" if holdings.photos_dir is None else str(holdings.photos_dir),
+        photos_dir="" if holdings.photos_dir is None else "/".join(holdings.photos_dir.parts[-2:]),
         began=moment(holdings.story.began_s) if holdings.story.began_s else "",
         version=importlib.metadata.version("splatpipe"),
         verdict=judge(holdings),
