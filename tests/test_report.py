@@ -188,12 +188,11 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     assert headline(watched) == "Stopped in train before it was finished"
     told = words(watched)
     iteration = int(re.search(r"It had come to ([\d,]+) of 100,000 iterations", told).group(1).replace(",", ""))
-    steps = [
-        json.loads(line)["data"]["done"]
-        for line in (copy_of_run / "events.jsonl").read_text()[before:].splitlines()
-        if '"what": "training"' in line
-    ]
-    assert iteration == steps[-1]
+    events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text()[before:].splitlines()]
+    progress = [event["data"]["done"] for event in events if event["data"].get("what") == "training"]
+    steps = [event["data"]["step"] for event in events if event["kind"] == "metric"]
+    assert iteration == max(*progress, *steps)
+    assert "30 trained on, 10 held out" in words(watched)  # of the plan that it had
     assert state_of(watched, "train") == "stopped" and state_of(watched, "sparse") == "made before"
     assert watched.page.locator("#training .chart").count() == 2
     assert watched.page.locator("#views").count() == 0 and "PSNR" not in watched.page.locator(".cards").inner_text()

@@ -35,6 +35,7 @@ PAIRS_DRAWN = 3_000  # lines, the strongest
 OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # from so many photos on a colour of its own
 OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa564", "#1a6b3c")
 ARROW_SHARE = 0.12  # of the map's width, that the longest residual is drawn as
+SQUASHED = 4.0  # times the iterations reached: a planned end further off leaves no room for the curve
 METRES_A_DEGREE = 111_195.0  # of a sphere: enough to draw by
 MOST_NAMES = 30  # points with their names on a map
 Residual = tuple[str, Sequence[float], Sequence[float]]  # name; place and residual: east, north, up, metres
@@ -212,7 +213,7 @@ def training_curve(name: str, curve: Mapping[float, float], planned: float | Non
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
-    if planned and steps and planned > steps[-1]:
+    if planned and SQUASHED * steps[-1] >= planned > steps[-1]:
         axes.axvline(planned, color=ORANGE, lw=1.0, ls="--", label=f"planned end: {planned:,.0f}")
         axes.legend(fontsize=8)
     axes.set_xlim(left=0)

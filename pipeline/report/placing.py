@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.report.holdings import Holdings, read_json
 from splatpipe.pipeline.report.wording import count, interval, length, metres, number
-from splatpipe.pipeline.scene.crs import describe_vertical
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.report.geometry import Geometry
@@ -34,7 +33,7 @@ def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | 
     splat = _splat(holdings)
     chapter: Chapter = {
         "note": str(frame.get("note", "")),
-        "facts": _frame_facts(holdings, frame, control, report),
+        "facts": _frame_facts(holdings, (frame, control, report), named=geometry is not None),
         "tables": _tables(report.get("tables") or {}, splat.get("tables") or {}),
         "flights": _flights(report.get("tables") or {}),
         "left_out": [str(name) for name in frame.get("left_out", [])],
@@ -59,8 +58,9 @@ def _splat(holdings: Holdings) -> Mapping[str, Any]:
 
 
 def _frame_facts(
-    holdings: Holdings, frame: Mapping[str, Any], control: Mapping[str, Any], report: Mapping[str, Any]
+    holdings: Holdings, parts: tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], *, named: bool
 ) -> list[tuple[str, str]]:
+    frame, control, report = parts
     if frame.get("kind") != "enu":
         return [("Frame", "z up; scale, place and heading are arbitrary: no metres")]
     origin = frame["origin"]
@@ -70,7 +70,7 @@ def _frame_facts(
         ("Frame", "local east, north, up in metres"),
         ("Origin", f"{place} (latitude, longitude, height)"),
         ("CRS of the coordinates", _crs(holdings, frame)),
-        ("Vertical datum", describe_vertical(str(frame.get("vertical_datum", "unknown")))),
+        ("Vertical datum", _vertical(str(frame.get("vertical_datum", "unknown")), named=named)),
         ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel"),
     ]
     if control.get("file"):
@@ -82,6 +82,15 @@ def _frame_facts(
         told = f"bent the model by {moved}" if bent else f"fits it as it is (bending would move the photos by {moved})"
         facts.append(("Control and the model", told if summary.get("moved_px") is not None else "not adjusted"))
     return facts
+
+
+def _vertical(datum: str, *, named: bool) -> str:
+    """The datum by its name, or as the frame has it where there is no time to load pyproj."""
+    if not named:
+        return datum
+    from splatpipe.pipeline.scene.crs import describe_vertical
+
+    return describe_vertical(datum)
 
 
 def _crs(holdings: Holdings, frame: Mapping[str, Any]) -> str:

@@ -99,11 +99,10 @@ def _ended(holdings: Holdings) -> tuple[Finding | None, str]:
 def _far(holdings: Holdings) -> str:
     """How far the stage came in which it ended."""
     stage = holdings.story.culprit
-    progress: Mapping[str, Any] = {} if stage is None else stage.told.progress
-    if not progress:
+    if stage is None or not stage.told.progress:
         return ""
-    unit = str(progress.get("unit", ""))
-    return f"It had come to {count(progress.get('done'))} of {count(progress.get('total'))} {unit}."
+    total, unit = stage.told.progress.get("total"), str(stage.told.progress.get("unit", ""))
+    return f"It had come to {count(stage.reached)} of {count(total)} {unit}."
 
 
 def _photos(holdings: Holdings) -> Finding | None:
