@@ -234,6 +234,26 @@ def georef(
 
 
 @app.command()
+def view(
+    out: OutArgument,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for any that is free.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    mark: Annotated[bool, typer.Option("--mark", help="Mark control points in the photos.")] = False,
+    points: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="With --mark: points and their coordinates, a CSV: name,x,y,z."),
+    ] = None,
+) -> None:
+    """Show a run in the browser: its training as it runs, its results; with --mark, mark control points."""
+    from splatpipe.pipeline.console import say
+    from splatpipe.pipeline.view.server import ViewOptions, serve
+
+    if points is not None and not mark:
+        raise UsageError("--points says what to mark.", hint="Add --mark.")
+    serve(out, ViewOptions(port, browser, mark, points), say)
+
+
+@app.command()
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Say what is there, what is stale and why."""
     from splatpipe.pipeline.console import show_standings

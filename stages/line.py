@@ -112,7 +112,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=2,
+    version=3,
     config=ExportConfig,
     reads=(
         "train.model",
@@ -132,9 +132,10 @@ EXPORT = Stage(
         "metrics": "metrics.json",
         "sparse": "sparse.glb",
         "sky": "sky",
+        "viewer": "viewer",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky"),
+    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky", "viewer"),
 )
 
 LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)

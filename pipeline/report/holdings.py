@@ -91,8 +91,10 @@ class Holdings:
             ValueError: if it is no JSON, or far too large.
         """
         story = self.story.stages.get(stage)
-        path = None if story is None or not story.key else Store(self.out).partial(stage, story.key) / file
-        return read_json(path) if path is not None and path.is_file() else {}
+        if story is None or not story.key:
+            return {}
+        path = Store(self.out).working_folder(next(each for each in LINE if each.name == stage), story.key) / file
+        return read_json(path) if path.is_file() else {}
 
     def summary(self, stage: str) -> Mapping[str, Any]:
         """What a stage returned; empty where it did not finish."""
