@@ -42,7 +42,7 @@ def orbit(capture: Capture, frames: int) -> Route:
     upright = rotation_to_up(capture.up)
     targets = np.array([np.median(capture.points[capture.seen[index]], axis=0) for index in kept])
     middle = np.median(targets @ upright.T, axis=0)
-    route = upright_route([capture.cameras[index] for index in kept], capture.up)
+    route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
     oblique = route.pitches > STEEP
     places = (route.places[oblique] if oblique.any() else route.places) - middle
     distance = float(np.median(np.linalg.norm(places, axis=1)))

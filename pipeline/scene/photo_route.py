@@ -79,10 +79,10 @@ def photo_film(capture: Capture, frames: int, seconds: float) -> Route:
     kept, distance = followed_photos(capture)
     if len(kept) < 2:
         raise UsageError("Fewer than two photos see the same things: there is no path between them.")
-    route = upright_route([capture.cameras[index] for index in kept], capture.up)
+    route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
     order = _order(route, distance)
     kept = kept[order]
-    cameras = [capture.cameras[index] for index in kept]
+    cameras = [capture.cameras[int(index)] for index in kept]
     legs = upright_route(cameras, capture.up).steps(distance)
     stretch = _stretch(capture, kept, legs, SPEED * seconds)
     cameras = cameras[stretch]
@@ -110,7 +110,7 @@ def followed_photos(capture: Capture) -> tuple[Int64[np.ndarray, " k"], float]:
     alike = enough & (depths <= ODD_DEPTH * distance) & (depths >= distance / ODD_DEPTH)
     kept = np.flatnonzero(alike)
     if 2 < len(kept) <= MOST_COMPARED:
-        route = upright_route([capture.cameras[index] for index in kept], capture.up)
+        route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
         table = _table(route, distance)
         np.fill_diagonal(table, np.inf)
         nearest = table.min(axis=1)
