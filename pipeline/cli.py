@@ -37,7 +37,7 @@ from splatpipe.pipeline.cli_options import (
     UntilOption,
     WhatOption,
 )
-from splatpipe.pipeline.ending import Ending, exit_code, for_the_user, print_json
+from splatpipe.pipeline.ending import Ending, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
@@ -45,6 +45,7 @@ from splatpipe.pipeline.engine.errors import (
     MachineError,
     Stopped,
     UsageError,
+    exit_code,
 )
 
 if TYPE_CHECKING:
@@ -261,6 +262,26 @@ def render(
 
 
 @app.command()
+def view(
+    out: OutArgument,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for any that is free.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    mark: Annotated[bool, typer.Option("--mark", help="Mark control points in the photos.")] = False,
+    points: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="With --mark: points and their coordinates, a CSV: name,x,y,z."),
+    ] = None,
+) -> None:
+    """Show a run in the browser: its training as it runs, its results; with --mark, mark control points."""
+    from splatpipe.pipeline.console import say
+    from splatpipe.pipeline.view.server import ViewOptions, serve
+
+    if points is not None and not mark:
+        raise UsageError("--points says what to mark.", hint="Add --mark.")
+    serve(out, ViewOptions(port, browser, mark, points), say)
+
+
+@app.command()
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Say what is there, what is stale and why."""
     from splatpipe.pipeline.console import show_standings
@@ -282,6 +303,21 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
         done.told = {"stages": stages}
     if not as_json:
         show_standings(standings)
+
+
+@app.command()
+def report(out: OutArgument, as_json: JsonOption = False) -> None:
+    """Write OUT/report.html anew, from what is there."""
+    from splatpipe.pipeline.console import say
+    from splatpipe.pipeline.engine.session import LOG_FILE
+    from splatpipe.pipeline.engine.store import open_store
+    from splatpipe.pipeline.report import make_report
+
+    with Ending(out, as_json) as done:
+        open_store(out, create=False)
+        path = make_report(out, out / LOG_FILE)
+        done.told = {"outputs": [str(path)]}
+    say(str(path))
 
 
 @app.command()

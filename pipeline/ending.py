@@ -12,17 +12,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.engine.errors import (
-    EXIT_MACHINE,
-    EXIT_STAGE,
-    MachineError,
-    SplatpipeError,
-    StageError,
-    Stopped,
-)
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, exit_code
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runner import Outcome
+
+STOP_S = 4.5  # after Ctrl-C everything is over, the report too: within five seconds is promised
 
 
 class Ending:
@@ -30,6 +25,7 @@ class Ending:
 
     outcome: Outcome | None = None
     told: Mapping[str, Any] | None = None
+    _reported: Path | None = None
 
     def __init__(self, out: Path, as_json: bool) -> None:
         self._out, self._as_json = out, as_json
@@ -42,10 +38,24 @@ class Ending:
         seconds = time.monotonic() - self._started_s
         if isinstance(error, GeneratorExit | SystemExit):
             return
+        if self.outcome is not None:
+            self._report(error)
         if error is None and self.outcome is not None:
             self._show(self.outcome, seconds)
         if self._as_json:
             print_json({**self._as_object(error, seconds), **(self.told or {})})
+
+    def _report(self, error: BaseException | None) -> None:
+        """Have the report written; what is wrong with it is told, and changes nothing about the run."""
+        from splatpipe.pipeline.console import say
+        from splatpipe.pipeline.engine.session import LOG_FILE
+        from splatpipe.pipeline.report import make_report
+
+        until_s = error.at_s + STOP_S if isinstance(error, Stopped) else None
+        try:
+            self._reported = make_report(self._out, self._out / LOG_FILE, until_s=until_s)
+        except SplatpipeError as trouble:
+            say(f"{trouble.message} {trouble.hint}".strip())
 
     def _show(self, outcome: Outcome, seconds: float) -> None:
         from splatpipe.pipeline.console import show_accuracy, show_outputs
@@ -58,7 +68,7 @@ class Ending:
 
         made = [(stage, outcome.artifacts[stage.name]) for stage in LINE if stage.name in outcome.artifacts]
         files = [self._out / name for stage, artifact in made for name in artifact.deliverables(stage)]
-        return [path for path in files if path.is_file()]
+        return [path for path in [*files, *filter(None, [self._reported])] if path.is_file()]
 
     def _as_object(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
         outcome = self.outcome
@@ -110,14 +120,6 @@ def _headline(outcome: Outcome) -> dict[str, Any]:
 def print_json(value: dict[str, Any]) -> None:
     sys.stdout.write(json.dumps(value) + "\n")
     sys.stdout.flush()
-
-
-def exit_code(error: BaseException | None) -> int:
-    if error is None:
-        return 0
-    if isinstance(error, SplatpipeError | Stopped):
-        return error.exit_code
-    return EXIT_MACHINE if isinstance(error, OSError) else EXIT_STAGE
 
 
 def for_the_user(error: Exception) -> SplatpipeError:

@@ -28,6 +28,7 @@ from splatpipe.pipeline.scene.georeference import georeference, scene_box, told_
 from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.options import ExportConfig
+from splatpipe.stages.viewing import look_of, viewer_scene, write_viewer
 
 Doubles = npt.NDArray[np.float64]
 Facts = dict[str, Any]
@@ -39,7 +40,7 @@ VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", 
 
 
 def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`; `sky/sky.ply` where asked for.
+    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`, `viewer/`; `sky/` where asked for.
 
     The frame is georef's: local east, north, up in metres where there are positions, of arbitrary scale elsewhere. The
     sky is a file of its own: within `splat.ply` it would be most of its bounding box, by which programs place and tile.
@@ -51,7 +52,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     points = load_points(dataset)
     cameras = [view.camera for view in load_views(dataset)]
 
-    report.progress(0, 3, "moving the model into its frame", "files")
+    report.progress(0, 4, "moving the model into its frame", "files")
     model = read_splat(inputs["train.model"])
     gaussians = in_world(model, frame)
     comments = ply_comments(frame, bool(plan["options"]["antialias"]))
@@ -63,7 +64,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         write_splat(out / "sky/sky.ply", in_world(dome, frame), comments)
     elif config.sky:
         report.warning("There is no sky to hand over.", hint="It takes train.sky=model, and photos that show the sky.")
-    report.progress(1, 3, "writing the cameras and the points", "files")
+    report.progress(1, 4, "writing the cameras and the points", "files")
     _write_json(out / "cameras.json", cameras_json(cameras, frame))
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))
     centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
@@ -72,12 +73,33 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     _write_json(out / "georef.json", placed)
     if frame.origin is not None:
         report.note(told_in_a_line(placed))
-    report.progress(2, 3, "collecting the figures", "files")
+    report.progress(2, 4, "collecting the figures", "files")
     figures = collect_metrics(inputs, plan, points, len(cameras), len(gaussians))
     _write_json(out / "metrics.json", figures)
-    report.progress(3, 3, "collecting the figures", "files")
+    report.progress(3, 4, "writing the viewer", "files")
+    write_viewer_of(inputs, gaussians, out / "viewer", config)
+    report.progress(4, 4, "writing the viewer", "files")
     summary = {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
     return summary if sky is None else summary | {"sky_gaussians": len(dome)}
+
+
+def write_viewer_of(inputs: Inputs, gaussians: Gaussians, folder: Path, config: ExportConfig) -> None:
+    """Write `viewer.html`, and `splat.spz` beside it where it is large.
+
+    Args:
+        inputs: The stage's.
+        gaussians: In the world frame.
+        folder: Made here; empty where no viewer is wanted or nothing can be shown.
+        config: The stage's.
+    """
+    folder.mkdir()
+    if config.viewer_megabytes == 0.0:
+        return
+    look = look_of(inputs["train.plan"], read_panorama(inputs["train.sky"]))
+    held_out = {view["name"] for view in _read_json(inputs["evaluate.metrics"])["per_view"]}
+    frame = load_frame(inputs["georef.frame"])
+    scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out, len(gaussians), config.title)
+    write_viewer(folder, scene, gaussians, config.viewer_megabytes * 1e6)
 
 
 def in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:

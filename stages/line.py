@@ -113,7 +113,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=2,
+    version=3,
     config=ExportConfig,
     reads=(
         "train.model",
@@ -133,9 +133,10 @@ EXPORT = Stage(
         "metrics": "metrics.json",
         "sparse": "sparse.glb",
         "sky": "sky",
+        "viewer": "viewer",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky"),
+    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky", "viewer"),
 )
 
 FLYTHROUGH = Stage(

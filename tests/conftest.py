@@ -1,12 +1,24 @@
 """Shared by all tests: where the real photos are, and a browser."""
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
+
+from splatpipe.demo import capture_path
+
+DEMO = (
+    "features.extractor=opencv-sift",
+    "features.max_image_size=1400",
+    "undistort.max_megapixels=0.1",
+    "train.iterations=600",
+    "evaluate.every=4",
+)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -19,6 +31,17 @@ def captures(request: pytest.FixtureRequest) -> Path:
     folder = request.config.getoption("--captures")
     assert folder, "give the folder of real captures with --captures"
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the whole demo capture with its control, at 0.1 megapixels: 26 dB. To be read only."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    sets = [part for text in DEMO for part in ("--set", text)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "run", str(capture_path()), str(out), *sets]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return out
 
 
 @pytest.fixture(scope="session")

@@ -62,7 +62,7 @@ def test_a_run_leaves_its_deliverable_and_a_second_one_runs_nothing(numbers: Pat
     assert (out / "telling.txt").read_text() == "3 1 False 21"
     second, events = walk(request_of(numbers, out))
     assert second.ran == []
-    assert [event.kind for event in events] == ["run_started", *["stage_reused"] * 4]
+    assert [event.kind for event in events] == ["run_started", *["stage_reused"] * 4, "run_finished"]
 
 
 def test_a_changed_option_is_felt_exactly_as_far_as_it_changes_bytes(numbers: Path, out: Path) -> None:

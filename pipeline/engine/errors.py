@@ -1,5 +1,9 @@
 """What can go wrong, said once: every error carries what to do about it and the exit code it leads to."""
 
+from __future__ import annotations
+
+import time
+
 EXIT_INPUT = 1
 EXIT_USAGE = 2
 EXIT_STAGE = 3
@@ -55,4 +59,16 @@ class Stopped(BaseException):
     def __init__(self, exit_code: int) -> None:
         super().__init__("Stopped.")
         self.exit_code = exit_code
+        self.at_s = time.monotonic()  # the end is promised within seconds of this
         self.hint = "What was finished is kept: run the same command again to go on."
+
+
+def exit_code(error: BaseException | None) -> int:
+    """What a command ends with that ended by this; None: as it should."""
+    if error is None:
+        return 0
+    if isinstance(error, SplatpipeError | Stopped):
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return EXIT_INTERRUPTED
+    return EXIT_MACHINE if isinstance(error, OSError) else EXIT_STAGE

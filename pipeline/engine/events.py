@@ -36,8 +36,10 @@ class Event:
         kind: What happened.
         stage: The stage it happened in, or empty.
         data: The details, JSON values. ``progress``: done, total, what, unit. ``metric``: name, value, step.
-            ``note``: message. ``warning``: message, hint. ``stage_started``: reason.
-            ``stage_finished``: seconds, summary.
+            ``note``: message. ``warning``: message, hint. ``run_started``: stages, machine, versions.
+            ``stage_started``: reason, key. ``stage_reused``: summary, seconds, key. ``stage_finished``: summary,
+            seconds, cpu_seconds, peak_memory_bytes, key. ``stage_failed``: message, hint, exit_code, seconds,
+            peak_memory_bytes (None: nobody knows), key. ``run_finished``: exit_code, message, hint, seconds.
         time_s: Seconds since the epoch.
     """
 

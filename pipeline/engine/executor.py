@@ -15,7 +15,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, StageError, Stopped
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.engine.worker import Task
+from splatpipe.pipeline.engine.worker import Task, peak_memory_of
 
 GRACE_S = 3.0  # a training writes its checkpoint in less; Ctrl-C promises an end within five seconds
 
@@ -71,6 +71,10 @@ class Executor:
             f"The stage {task.stage} died{_cause(code)}.",
             hint=f"{_remedy(code)} The log ends with what it said: {self._log}",
         )
+
+    def peak_memory_bytes(self) -> int | None:
+        """Peak resident memory of the worker in the stage that it runs; None if it is dead or nobody knows."""
+        return None if self._process is None else peak_memory_of(self._process.pid)
 
     def stop(self) -> None:
         """End the worker: politely, then within ``GRACE_S`` for certain."""

@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import platform
 import shutil
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -15,7 +16,7 @@ from typing import Literal
 from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.config import lookup
-from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, UsageError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, UsageError, exit_code
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary
@@ -161,20 +162,21 @@ class Runner:
         self.save_config(self.line.config)
         parts = dict(self.line.source)
         outcome = self.outcome
-        self.sink(Event("run_started", data={"stages": [stage.name for stage in self.line.needed(until)]}))
-        for stage in self.line.needed(until):
-            inputs = self.line.inputs_of(stage, parts)
-            artifact = self.store.find(stage, inputs.key)
-            if artifact is not None and stage.name not in rerun:
-                data = {"summary": artifact.summary, "seconds": artifact.manifest["seconds"]}
-                self.sink(Event("stage_reused", stage.name, data))
-            else:
-                reason = "asked for" if artifact else explain(inputs, self.store.artifacts(stage.name))
-                artifact = self._run(stage, inputs, parts, reason)
-            outcome.artifacts[stage.name] = artifact
-            parts.update(artifact.parts)
-            with self._explained():
-                self.store.deliver(artifact, stage)
+        needed = self.line.needed(until)
+        with self._told([stage.name for stage in needed]):
+            for stage in needed:
+                inputs = self.line.inputs_of(stage, parts)
+                artifact = self.store.find(stage, inputs.key)
+                if artifact is not None and stage.name not in rerun:
+                    data = {"summary": artifact.summary, "seconds": artifact.manifest["seconds"], "key": inputs.key}
+                    self.sink(Event("stage_reused", stage.name, data))
+                else:
+                    reason = "asked for" if artifact else explain(inputs, self.store.artifacts(stage.name))
+                    artifact = self._run(stage, inputs, parts, reason)
+                outcome.artifacts[stage.name] = artifact
+                parts.update(artifact.parts)
+                with self._explained():
+                    self.store.deliver(artifact, stage)
         return outcome
 
     def run_alone(self, name: str) -> Outcome:
@@ -201,17 +203,36 @@ class Runner:
                 hint=f"Run the line up to there first: splatpipe run PHOTOS {self.store.out} --until {missing[-1]}",
             )
         self.save_config(self.line.config)
-        self.sink(Event("run_started", data={"stages": [name]}))
-        artifact = self._run(stage, self.line.inputs_of(stage, parts), parts, "asked for")
-        outcome.artifacts[name] = artifact
-        with self._explained():
-            self.store.deliver(artifact, stage)
+        with self._told([name]):
+            artifact = self._run(stage, self.line.inputs_of(stage, parts), parts, "asked for")
+            outcome.artifacts[name] = artifact
+            with self._explained():
+                self.store.deliver(artifact, stage)
         return outcome
+
+    @contextmanager
+    def _told(self, stages: Sequence[str]) -> Iterator[None]:
+        """The events of a run's beginning and end, the bad one, too."""
+        began_s = time.monotonic()
+        machine = {**asdict(self.machine), **describe_machine()}
+        self.sink(Event("run_started", data={"stages": list(stages), "machine": machine, "versions": versions()}))
+        ended: BaseException | None = None
+        try:
+            yield
+        except BaseException as error:
+            ended = error
+            raise
+        finally:
+            told = {"message": "" if ended is None else str(ended), "hint": getattr(ended, "hint", "")}
+            seconds = round(time.monotonic() - began_s, 3)
+            with suppress(OSError):  # a full disk is what ended it, and is told
+                self.sink(Event("run_finished", data={"exit_code": exit_code(ended), **told, "seconds": seconds}))
 
     def _run(self, stage: Stage, inputs: StageInputs, parts: Mapping[str, Part], reason: str) -> Artifact:
         outcome = self.outcome
         outcome.failed = stage.name
-        self.sink(Event("stage_started", stage.name, {"reason": reason}))
+        began_s = time.monotonic()
+        self.sink(Event("stage_started", stage.name, {"reason": reason, "key": inputs.key}))
         try:
             with self._explained():
                 self._check_space()
@@ -236,16 +257,20 @@ class Runner:
                     "versions": versions(),
                 }
                 artifact = self.store.commit(stage, inputs, partial, summary, run)
-        except SplatpipeError as error:
-            self.sink(Event("stage_failed", stage.name, {"message": error.message, "hint": error.hint}))
-            raise
-        except (Stopped, KeyboardInterrupt):
-            self.sink(Event("stage_failed", stage.name, {"message": "Stopped.", "hint": ""}))
+        except (SplatpipeError, Stopped, KeyboardInterrupt) as error:
+            self.sink(self._failed(inputs, time.monotonic() - began_s, error))
             raise
         outcome.ran.append(stage.name)
         outcome.failed = ""
-        self.sink(Event("stage_finished", stage.name, {"summary": summary, "seconds": result["seconds"]}))
+        self.sink(Event("stage_finished", stage.name, {"summary": summary, **result, "key": inputs.key}))
         return artifact
+
+    def _failed(self, inputs: StageInputs, seconds: float, error: BaseException) -> Event:
+        """The event of a stage's bad end; the worker still lives, so that its memory can be told."""
+        told = (error.message, error.hint) if isinstance(error, SplatpipeError) else ("Stopped.", "")
+        data: dict[str, JSON] = {"message": told[0], "hint": told[1], "exit_code": exit_code(error), "key": inputs.key}
+        data |= {"seconds": round(seconds, 3), "peak_memory_bytes": self.executor.peak_memory_bytes()}
+        return Event("stage_failed", inputs.stage, data)
 
     def _check_space(self) -> None:
         free = shutil.disk_usage(self.store.out).free

@@ -105,9 +105,13 @@ class Store:
         whole = [artifact for artifact in found if artifact is not None]
         return sorted(whole, key=lambda artifact: float(artifact.manifest["finished_s"]), reverse=True)
 
+    def working_folder(self, stage: Stage, key: str) -> Path:
+        """Where a stage of that key works until it is done; it need not be there."""
+        return self.partials / _folder_name(stage.name, key)
+
     def begin(self, stage: Stage, key: str) -> Path:
         """An empty folder for a stage to work in; a resumable stage gets back what a killed run left."""
-        folder = self.partials / _folder_name(stage.name, key)
+        folder = self.working_folder(stage, key)
         if folder.exists() and not stage.resumable:
             shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)

@@ -157,11 +157,19 @@ class _Usage:
 
 def peak_memory_bytes() -> int:
     """Peak resident memory of this process since the stage began (where the kernel says so, else since its start)."""
-    with contextlib.suppress(OSError, StopIteration, ValueError):
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
+    told = peak_memory_of("self")
+    if told is not None:
+        return told
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def peak_memory_of(process: int | str) -> int | None:
+    """Peak resident memory of a process of this machine, bytes; None where the kernel does not say."""
+    with contextlib.suppress(OSError, StopIteration, ValueError, UnicodeDecodeError):
+        lines = Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
+    return None
 
 
 def _die_with_parent(parent: int) -> None:

@@ -1,1 +1,86 @@
-"""The report of a run: one page for the client, built from the events and the manifests."""
+"""The report of a run: one page for the client, built from the events and the manifests.
+
+`write_report` makes it here; `make_report` in a process of its own, as the commands do: a fault or a crash in it can
+neither spoil a good run nor hold one up that is to end, and the command does not pay for its libraries.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import MachineError
+
+REPORT_FILE = "report.html"
+PATIENCE_S = 600.0  # far more than hundreds of photos take
+LEAST_S = 1.0  # of a run that is to end: enough for the report without pictures
+
+
+def write_report(out: Path, *, drawn: bool = True) -> Path:
+    """Write OUT/report.html, whole or not at all.
+
+    Args:
+        out: The run's folder; the run may be finished, stopped, failed, or go on.
+        drawn: With charts and pictures.
+
+    Returns:
+        Its path.
+
+    Raises:
+        OSError: if it cannot be written.
+        MachineError: if this installation lacks the page's script or style.
+    """
+    from splatpipe.pipeline.engine.store import write_synced
+    from splatpipe.pipeline.report.holdings import open_holdings
+    from splatpipe.pipeline.report.page import report_page
+
+    path = out / REPORT_FILE
+    write_synced(path, report_page(open_holdings(out), drawn=drawn))
+    return path
+
+
+def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
+    """Have OUT/report.html written by a process of its own.
+
+    Args:
+        out: The run's folder.
+        log: Takes what it says if something is wrong.
+        until_s: ``time.monotonic()`` by which it has to be over: then a page without pictures comes first, which
+            stays if the time does not suffice for the other. None: there is time.
+
+    Returns:
+        Its path.
+
+    Raises:
+        MachineError: if it could not be written.
+    """
+    patience_s = PATIENCE_S if until_s is None else max(LEAST_S, until_s - time.monotonic())
+    command = [sys.executable, "-m", "splatpipe.pipeline.report", str(out), *([] if until_s is None else ["--hurry"])]
+    path = out / REPORT_FILE
+    before = _stamp(path)
+    try:
+        with log.open("a", encoding="utf-8") as said:
+            done = subprocess.run(
+                command, stdin=subprocess.DEVNULL, stdout=said, stderr=said, timeout=patience_s, check=False
+            )
+            failed = done.returncode != 0
+    except subprocess.TimeoutExpired:
+        failed = until_s is None
+    except OSError as error:
+        raise MachineError(f"The report could not be written: {error.strerror}.") from error
+    finally:
+        for unfinished in out.glob(f"{REPORT_FILE}.*.new"):
+            unfinished.unlink(missing_ok=True)
+    if failed or _stamp(path) == before:
+        raise MachineError("The report could not be written.", hint=f"{log} ends with the reason.")
+    return path
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        told = path.stat()
+    except OSError:
+        return None
+    return told.st_mtime_ns, told.st_ino

@@ -56,6 +56,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "crs": ("crs", "epsg", "srs"),
 }
 _NEEDED = ("x", "y", "photo", "px", "py")  # columns of a table
+_NEEDED_OF_POINTS = ("name", "x", "y")  # of one without marks
 GEOGRAPHIC = ("lon", "longitude", "lat", "latitude")
 ROLES: Mapping[str, Role] = {
     "control": "control",
@@ -114,7 +115,7 @@ class ControlFile:
 
 
 @dataclass(frozen=True)
-class _Row:
+class Row:
     """One observation; ``name`` is empty where the line has none."""
 
     line: int
@@ -125,18 +126,82 @@ class _Row:
     sigma_m: tuple[float | None, float | None]
 
 
+@dataclass(frozen=True)
+class Table:
+    """A control file as it is written, for those who change it line by line.
+
+    Attributes:
+        lines: All of it, numbered from 1.
+        header: Number of the header's line; None in ODM's list.
+        crs: As written.
+        rows: Its observations.
+    """
+
+    lines: tuple[tuple[int, str], ...]
+    header: int | None
+    crs: str
+    rows: tuple[Row, ...]
+
+    @property
+    def groups(self) -> dict[str, list[Row]]:
+        """The rows of each point by its name, ``point N`` where lines have none."""
+        groups: dict[object, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(row.name or row.place, []).append(row)
+        named: dict[str, list[Row]] = {}
+        for number, group in enumerate(groups.values(), 1):
+            name = group[0].name or f"point {number}"
+            named[name if name not in named else f"{name} (line {group[0].line})"] = group
+        return named
+
+
 def read_control_file(path: Path) -> ControlFile:
     """Read a file of control and check points.
 
     Raises:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
-    lines = read_lines(path, _KIND)
-    written = written_lines(lines, path, _KIND)
-    header = next((i for i, (_, line) in enumerate(written[:2]) if _is_header(line)), None)
+    table = read_table(path)
     with told_by_line(path, _KIND):
+        return _assemble(table)
+
+
+def read_points_file(path: Path) -> ControlFile:
+    """Read surveyed points that need not be marked yet: a control file, or a CSV with no more than name,x,y,z.
+
+    Raises:
+        SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
+    """
+    table = read_table(path, _NEEDED_OF_POINTS)
+    with told_by_line(path, _POINTS):
+        return _assemble(table)
+
+
+def read_table(path: Path, needed: Sequence[str] = _NEEDED) -> Table:
+    """Read a control file's lines; they may be of no observation yet.
+
+    Args:
+        path: The file.
+        needed: Columns without which a line is no header.
+
+    Raises:
+        SplatpipeError: if it is no such file.
+    """
+    return parse_table(read_lines(path, _KIND if needed == _NEEDED else _POINTS), path, needed)
+
+
+def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[str] = _NEEDED) -> Table:
+    """The same of numbered lines; the path is for messages.
+
+    Raises:
+        SplatpipeError: if they are no such file's.
+    """
+    kind = _KIND if needed == _NEEDED else _POINTS
+    written = written_lines(lines, path, kind)
+    header = next((i for i, (_, line) in enumerate(written[:2]) if _is_header(line, needed)), None)
+    with told_by_line(path, kind):
         crs, rows = _odm_rows(written) if header is None else _csv_rows(lines, written, header)
-        return _assemble(crs, rows)
+    return Table(tuple(lines), None if header is None else written[header][0], crs, tuple(rows))
 
 
 _EXPECTED = (
@@ -144,9 +209,15 @@ _EXPECTED = (
     " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo."
 )
 _KIND = TableKind("control file", _EXPECTED, max_bytes=32 << 20, max_lines=200_000)
+_POINTS = TableKind(
+    "file of points",
+    "A first line with the CRS, e.g. EPSG:32633, then a CSV with a header such as name,x,y,z; or a control file.",
+    max_bytes=_KIND.max_bytes,
+    max_lines=_KIND.max_lines,
+)
 
 
-def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[_Row]]:
+def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row]]:
     first, crs = written[0][0], written[0][1].strip()
     fields = crs.split()
     if len(fields) >= 6 and all(is_number(field) for field in fields[:5]):
@@ -163,14 +234,14 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[_Row]]:
             _name(number, fields[5]), number_in(number, "pixel x", fields[3]), number_in(number, "pixel y", fields[4])
         )
         name = _name(number, fields[6]) if len(fields) > 6 and fields[6] else ""
-        rows.append(_Row(number, name, place, mark, None, (None, None)))
+        rows.append(Row(number, name, place, mark, None, (None, None)))
     return crs, rows
 
 
-def _is_header(line: str) -> bool:
+def _is_header(line: str, needed: Sequence[str]) -> bool:
     delimiter = delimiter_of(line)
     columns = find_columns(next(csv.reader([line], delimiter=delimiter)), COLUMNS)
-    return set(_NEEDED) <= set(columns)
+    return set(needed) <= set(columns) or set(_NEEDED) <= set(columns)
 
 
 def _require_no_header(number: int, line: str) -> None:
@@ -184,7 +255,7 @@ def _require_no_header(number: int, line: str) -> None:
 
 def _csv_rows(
     lines: Sequence[tuple[int, str]], written: Sequence[tuple[int, str]], header: int
-) -> tuple[str, list[_Row]]:
+) -> tuple[str, list[Row]]:
     number, line = written[header]
     delimiter = delimiter_of(line)
     titles = next(csv.reader([line], delimiter=delimiter))
@@ -213,34 +284,31 @@ def _csv_rows(
     return crs, rows
 
 
-def _csv_row(number: int, row: Mapping[str, str]) -> _Row:
+def _csv_row(number: int, row: Mapping[str, str]) -> Row:
     role = row.get("role", "").casefold()
     if role and role not in ROLES:
         raise LineError(number, f"the role {role[:40]!r} is neither control nor check")
     place = (number_in(number, "x", row["x"]), number_in(number, "y", row["y"]), _height(number, row.get("z", "")))
     mark = None
-    if row["photo"]:  # a point may be listed without being marked
+    if row.get("photo"):  # a point may be listed without being marked
         photo = _name(number, row["photo"])
-        mark = Mark(photo, number_in(number, "pixel x", row["px"]), number_in(number, "pixel y", row["py"]))
+        mark = Mark(photo, *(number_in(number, f"pixel {key[1]}", row.get(key, "")) for key in ("px", "py")))
     sigmas = (_sigma(number, row.get("sigma_horizontal", "")), _sigma(number, row.get("sigma_vertical", "")))
-    return _Row(number, _name(number, row["name"]) if row.get("name") else "", place, mark, ROLES.get(role), sigmas)
+    return Row(number, _name(number, row["name"]) if row.get("name") else "", place, mark, ROLES.get(role), sigmas)
 
 
-def _assemble(crs: str, rows: Sequence[_Row]) -> ControlFile:
+def _assemble(table: Table) -> ControlFile:
+    crs, groups = table.crs, table.groups
     if not crs or len(crs) > MAX_LINE_CHARS:
         raise LineError(0, "it names no CRS")
-    if not rows:
+    if not groups:
         raise LineError(0, "it has no observations")
-    groups: dict[object, list[_Row]] = {}
-    for row in rows:
-        groups.setdefault(row.name or row.place, []).append(row)
     if len(groups) > MAX_POINTS:
         raise LineError(0, f"it has more than {MAX_POINTS:,} points")
     heights = [group[0].place[2] for group in groups.values()]
     at_sea = any(height and abs(height) < SEA_LEVEL_M for height in heights)
     points, zero = [], []
-    for number, group in enumerate(groups.values(), 1):
-        name = group[0].name or f"point {number}"
+    for name, group in groups.items():
         point = _point(name, group, keep_zero=at_sea)
         points.append(point)
         if point.z is None and group[0].place[2] == 0.0:
@@ -248,7 +316,7 @@ def _assemble(crs: str, rows: Sequence[_Row]) -> ControlFile:
     return ControlFile(crs, tuple(points), tuple(zero))
 
 
-def _point(name: str, rows: Sequence[_Row], keep_zero: bool) -> SurveyedPoint:
+def _point(name: str, rows: Sequence[Row], keep_zero: bool) -> SurveyedPoint:
     first = rows[0]
     marks: dict[str, Mark] = {}
     for row in rows:
@@ -264,7 +332,7 @@ def _point(name: str, rows: Sequence[_Row], keep_zero: bool) -> SurveyedPoint:
     return SurveyedPoint(name, x, y, height, (sigmas[0], sigmas[1]), role, tuple(marks.values()))
 
 
-def _require_same(name: str, first: _Row, row: _Row) -> None:
+def _require_same(name: str, first: Row, row: Row) -> None:
     for have, want in zip(row.place, first.place, strict=True):
         if (have is None) != (want is None) or (
             have is not None and want is not None and abs(have - want) > SAME_PLACE_M

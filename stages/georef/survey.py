@@ -130,7 +130,7 @@ def load_survey(
             f"{'controls' if len(file.zero_heights) == 1 else 'control'} horizontally only."
         )
     _tell_unusable(points, path.name, model, photos, report)
-    return Survey(file, crs, path.name, tuple(_with_roles(points, config.check_points)))
+    return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
 
 
 def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], mark_sigma_px: float) -> SurveyPoint:
@@ -267,8 +267,16 @@ def _tell_unusable(
             )
 
 
-def _with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]:
-    """Roles by the option, the file, or for six points and more every third."""
+def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]:
+    """Roles by the option, the file, or for six points and more every third.
+
+    Args:
+        points: With role ``control``, or left out.
+        setting: `georef.check_points`.
+
+    Raises:
+        SplatpipeError: if it names points that are not there.
+    """
     usable = [point.name for point in points if point.role != "left_out"]
     setting = setting.strip()
     if setting == "none":

@@ -1,0 +1,98 @@
+"""How the report's charts look, and how they become SVG within the page."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+INK, FAINT, LINE = "#1b1f24", "#5b6570", "#d8dde3"
+BLUE, ORANGE, GREEN, RED, GREY = "#0b66c3", "#d9730d", "#1a7f37", "#cf222e", "#8b949e"
+WIDTH, HEIGHT = 5.4, 3.5  # inches: half of a page, or the whole of a phone, with letters that can be read on both
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # letters stay letters: small, searchable, in the page's own font
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    "axes.edgecolor": LINE,
+    "axes.labelcolor": FAINT,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#eceff2",
+    "text.color": INK,
+    "text.parse_math": False,  # a point may be called $5
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "legend.frameon": False,
+    "figure.dpi": 100,
+    "savefig.dpi": 110,  # of what is drawn as pixels: clouds of points
+}
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Charts made and written within look alike, whatever the user's matplotlibrc says."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(STYLE)
+        yield
+
+
+def new_figure(width: float = WIDTH, height: float = HEIGHT) -> tuple[Figure, Axes]:
+    """An empty chart and its axes; inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasSVG(figure)
+    return figure, figure.add_subplot()
+
+
+def to_svg(figure: Figure, title: str) -> Markup:
+    """A chart as an SVG element for the page; two charts never share an id.
+
+    Args:
+        figure: The chart.
+        title: What it shows, for those who cannot see it.
+    """
+    salt = hashlib.sha256(title.encode()).hexdigest()[:12]
+    with matplotlib.rc_context({"svg.hashsalt": salt}):
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    svg = text.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r'\b(id="|href="#|url\(#)', rf"\g<1>c{salt}-", svg)
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
+    label = Markup.escape(title)
+    return Markup(svg.replace("<svg", f'<svg role="img" aria-label="{label}"', 1))
+
+
+def as_map(axes: Axes, box: tuple[float, float, float, float], unit: str) -> None:
+    """Make axes a map: equal scales, east and north.
+
+    Args:
+        axes: Of the chart.
+        box: West, east, south, north.
+        unit: ``m``, or empty for a model without a scale.
+    """
+    axes.set_xlim(box[0], box[1])
+    axes.set_ylim(box[2], box[3])
+    axes.set_aspect("equal")
+    metric = unit == "m"
+    axes.set_xlabel("east (m)" if metric else "x (model units)")
+    axes.set_ylabel("north (m)" if metric else "y (model units)")
+
+
+def map_size(box: tuple[float, float, float, float]) -> tuple[float, float]:
+    """Inches of a map of that box: no wider than the page, no higher than wide."""
+    ratio = (box[3] - box[2]) / max(box[1] - box[0], 1e-9)
+    return WIDTH, float(np.clip(WIDTH * ratio * 0.9, 2.6, 5.2)) + 0.5

@@ -1,0 +1,212 @@
+"""What happened in the last run, from `events.jsonl`: which stages came how far, and what they said."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+Facts = Mapping[str, Any]
+State = Literal["finished", "reused", "failed", "stopped", "broken off", "running", "not reached"]
+
+MAX_BYTES = 64 << 20  # of the file's end: hundreds of runs' events
+MAX_LINE = 1 << 20
+STOPPED = (130, 143)  # exit codes of Ctrl-C and of SIGTERM
+
+
+@dataclass
+class Told:
+    """What one stage said, in all attempts at one artifact.
+
+    Attributes:
+        notes: Of the last attempt.
+        warnings: Messages and hints of the last attempt.
+        metrics: Value by step, by name; of all attempts, since one goes on where the other was stopped.
+        progress: The last one: done, total, what, unit.
+    """
+
+    notes: list[str] = field(default_factory=list)
+    warnings: list[tuple[str, str]] = field(default_factory=list)
+    metrics: dict[str, dict[float, float]] = field(default_factory=dict)
+    progress: Facts = field(default_factory=dict)
+
+
+@dataclass
+class StageStory:
+    """What became of a stage in the last run.
+
+    Attributes:
+        name: The stage's.
+        state: How it ended.
+        key: Of its artifact; empty where an older version ran.
+        reason: Why it ran.
+        seconds: By the clock; None where unknown.
+        memory_bytes: Peak; None where unknown.
+        message: What it failed with.
+        hint: What to do about it.
+        told: What it said.
+    """
+
+    name: str
+    state: State
+    key: str = ""
+    reason: str = ""
+    seconds: float | None = None
+    memory_bytes: int | None = None
+    message: str = ""
+    hint: str = ""
+    told: Told = field(default_factory=Told)
+
+
+@dataclass
+class Story:
+    """The last run.
+
+    Attributes:
+        stages: Those it was to walk, in order.
+        began_s: Seconds since the epoch; 0 where there is no run.
+        ended_s: Of its last event.
+        exit_code: None where it ended without a word, or has not ended.
+        message: Why it ended badly.
+        hint: What to do about it.
+        machine: Device, threads, cores.
+        versions: Of what computes.
+        running: Whether it goes on at this moment.
+        keys: The last known key of each stage, in any run.
+    """
+
+    stages: dict[str, StageStory] = field(default_factory=dict)
+    began_s: float = 0.0
+    ended_s: float = 0.0
+    exit_code: int | None = None
+    message: str = ""
+    hint: str = ""
+    machine: Facts = field(default_factory=dict)
+    versions: Facts = field(default_factory=dict)
+    running: bool = False
+    keys: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def culprit(self) -> StageStory | None:
+        """The stage in which it ended badly, or is."""
+        bad = ("failed", "stopped", "broken off", "running")
+        return next((stage for stage in self.stages.values() if stage.state in bad), None)
+
+    @property
+    def complete(self) -> bool:
+        """Whether all that it was to walk is there."""
+        good = all(stage.state in ("finished", "reused") for stage in self.stages.values())
+        return bool(self.stages) and good and not self.exit_code and not self.running
+
+
+def read_story(path: Path, *, running: bool) -> Story:
+    """Read the events of a run's folder; lines that are none are passed over.
+
+    Args:
+        path: `events.jsonl`; it need not be there.
+        running: Whether somebody works in the folder now.
+    """
+    reader = _Reader()
+    for event in _events(path):
+        try:
+            reader.take(event)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            continue
+    return reader.finish(running)
+
+
+def _events(path: Path) -> Iterator[Facts]:
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - MAX_BYTES))
+            while line := file.readline(MAX_LINE):
+                try:
+                    event = json.loads(line)
+                except (ValueError, RecursionError):
+                    continue
+                if isinstance(event, dict) and isinstance(event.get("data"), dict):
+                    yield event
+    except OSError:
+        return
+
+
+class _Reader:
+    """Takes one event after the other."""
+
+    def __init__(self) -> None:
+        self._story = Story()
+        self._told: dict[tuple[str, str], Told] = {}
+        self._keys: dict[str, str] = {}
+
+    def take(self, event: Facts) -> None:
+        data, name = event["data"], str(event["stage"])
+        self._story.ended_s = float(event["time_s"])
+        take = getattr(self, f"_{event['kind']}", None)
+        if take is not None:
+            take(name, data)
+
+    def finish(self, running: bool) -> Story:
+        story = self._story
+        story.running, story.keys = running, dict(self._keys)
+        for stage in story.stages.values():
+            if stage.state == "running" and not running:
+                stage.state = "broken off"
+        return story
+
+    def _run_started(self, _name: str, data: Facts) -> None:
+        stages = {str(name): StageStory(str(name), "not reached") for name in data["stages"]}
+        self._story = Story(stages, self._story.ended_s, self._story.ended_s)
+        self._story.machine, self._story.versions = data.get("machine", {}), data.get("versions", {})
+
+    def _run_finished(self, _name: str, data: Facts) -> None:
+        self._story.exit_code = int(data["exit_code"])
+        self._story.message, self._story.hint = str(data["message"]), str(data["hint"])
+
+    def _stage_started(self, name: str, data: Facts) -> None:
+        stage = self._stage(name, "running", data)
+        stage.reason = str(data["reason"])
+        before = stage.told if stage.key else Told()
+        # what it says again counts, and not what it said before; the curves go on
+        stage.told = self._told[name, stage.key] = Told(metrics=before.metrics, progress=before.progress)
+
+    def _stage_reused(self, name: str, data: Facts) -> None:
+        self._stage(name, "reused", data).seconds = float(data["seconds"])
+
+    def _stage_finished(self, name: str, data: Facts) -> None:
+        stage = self._stage(name, "finished", data)
+        stage.seconds = float(data["seconds"])
+        stage.memory_bytes = data.get("peak_memory_bytes")
+
+    def _stage_failed(self, name: str, data: Facts) -> None:
+        code = data.get("exit_code")
+        stopped = code in STOPPED if code is not None else data["message"] == "Stopped."
+        stage = self._stage(name, "stopped" if stopped else "failed", data)
+        stage.message, stage.hint = str(data["message"]), str(data["hint"])
+        stage.seconds, stage.memory_bytes = data.get("seconds"), data.get("peak_memory_bytes")
+
+    def _progress(self, name: str, data: Facts) -> None:
+        self._heard(name).progress = data
+
+    def _metric(self, name: str, data: Facts) -> None:
+        curve = self._heard(name).metrics.setdefault(str(data["name"]), {})
+        curve[float(data["step"] or 0)] = float(data["value"])
+
+    def _note(self, name: str, data: Facts) -> None:
+        self._heard(name).notes.append(str(data["message"]))
+
+    def _warning(self, name: str, data: Facts) -> None:
+        self._heard(name).warnings.append((str(data["message"]), str(data["hint"])))
+
+    def _stage(self, name: str, state: State, data: Facts) -> StageStory:
+        stage = self._story.stages.setdefault(name, StageStory(name, state))
+        stage.state = state
+        stage.key = str(data.get("key", "")) or stage.key
+        self._keys[name] = stage.key
+        stage.told = self._told.setdefault((name, stage.key), Told())
+        return stage
+
+    def _heard(self, name: str) -> Told:
+        stage = self._story.stages.get(name)
+        return stage.told if stage is not None else Told()

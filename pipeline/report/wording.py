@@ -1,0 +1,93 @@
+"""Figures in words: lengths, sizes, durations and counts with their units, a dash where there is none."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import TypeGuard
+
+NONE = "–"
+
+
+def number(value: object, digits: int = 3) -> str:
+    """A figure with a fixed number of digits after the point."""
+    return f"{value:,.{digits}f}" if _finite(value) else NONE
+
+
+def count(value: object) -> str:
+    """A whole number with its thousands set apart."""
+    return f"{value:,.0f}" if _finite(value) else NONE
+
+
+def metres(value: object) -> str:
+    """A residual, to the millimetre."""
+    return f"{round(value, 3) + 0.0:.3f}" if _finite(value) else NONE
+
+
+def length(value: object) -> str:
+    """A length in the unit that people would say it in."""
+    if not _finite(value):
+        return NONE
+    longest = abs(value)
+    if longest < 0.01:
+        return f"{value * 1000:.1f} mm"
+    if longest < 1.0:
+        return f"{value * 100:.1f} cm"
+    return f"{value:.2f} m" if longest < 100.0 else f"{value:,.0f} m"
+
+
+def share(value: object, digits: int = 0) -> str:
+    """A share in per cent."""
+    return f"{value:.{digits}%}".replace("%", " %") if _finite(value) else NONE
+
+
+def duration(seconds: object) -> str:
+    """A time in seconds, minutes or hours."""
+    if not _finite(seconds):
+        return NONE
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def size(value: object) -> str:
+    """Bytes, by powers of ten."""
+    if not _finite(value):
+        return NONE
+    rest = float(value)
+    for unit in ("B", "kB", "MB"):
+        if rest < 1000:
+            return f"{rest:.0f} B" if unit == "B" else f"{rest:.1f} {unit}"
+        rest /= 1000
+    return f"{rest:.2f} GB"
+
+
+def moment(seconds: object) -> str:
+    """A point in time, UTC."""
+    try:
+        return f"{datetime.fromtimestamp(float(seconds), UTC):%Y-%m-%d %H:%M UTC}"
+    except (TypeError, ValueError, OverflowError, OSError):
+        return NONE
+
+
+def interval(bounds: object) -> str:
+    """The interval that holds the true value with 95 %."""
+    if not isinstance(bounds, list | tuple) or len(bounds) != 2:
+        return NONE
+    return f"{metres(bounds[0])} to {metres(bounds[1])}"
+
+
+def some(names: list[str], shown: int = 12) -> str:
+    """The first names of a list, and how many more there are."""
+    rest = len(names) - shown
+    return ", ".join(names[:shown]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def plural(amount: int, one: str, more: str = "") -> str:
+    """``1 photo``, ``2 photos``."""
+    return f"{amount:,} {one if amount == 1 else more or one + 's'}"
+
+
+def _finite(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

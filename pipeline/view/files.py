@@ -1,0 +1,140 @@
+"""Files sent over HTTP: opened without following any link, whole or by a range, never more than was asked for."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from anyio import to_thread
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+CHUNK_BYTES = 1 << 18
+RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".json": "application/json",
+    ".ply": "application/octet-stream",
+    ".spz": "application/octet-stream",
+    ".glb": "model/gltf-binary",
+    ".mp4": "video/mp4",
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+}
+
+
+class NotThereError(Exception):
+    """A path that is no file inside its folder, for whatever reason: who asks need not know."""
+
+
+@dataclass(frozen=True)
+class OpenFile:
+    """A file that is being sent; its descriptor is closed by whoever sends it."""
+
+    descriptor: int
+    size: int
+    tag: str
+
+
+def open_inside(folder: Path, relative: str) -> OpenFile:
+    """Open a regular file below a folder; a link on the way, or at its end, is no way.
+
+    Args:
+        folder: Where it must lie; it is trusted itself.
+        relative: POSIX path below it.
+
+    Raises:
+        NotThereError: if it is not there, or not there without leaving the folder.
+    """
+    parts = PurePosixPath(relative).parts
+    if not parts or any(part in ("..", "/") or "\0" in part for part in parts):
+        raise NotThereError
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK  # a pipe is not waited for
+    descriptor = -1
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        for part in parts:
+            above = descriptor
+            descriptor = os.open(part, flags | (os.O_DIRECTORY if part is not parts[-1] else 0), dir_fd=above)
+            os.close(above)
+        facts = os.fstat(descriptor)
+        if not stat.S_ISREG(facts.st_mode):
+            raise NotThereError
+    except (OSError, NotThereError, ValueError) as error:
+        if descriptor >= 0:
+            os.close(descriptor)
+        raise NotThereError from error
+    return OpenFile(descriptor, facts.st_size, f'"{facts.st_ino:x}-{facts.st_size:x}-{facts.st_mtime_ns:x}"')
+
+
+def wanted_range(header: str | None, size: int) -> tuple[int, int] | None:
+    """First byte and the one after the last that a Range header asks for; None for the whole file.
+
+    Several ranges, and what is no range of bytes, are answered by the whole file (RFC 9110, 14.2).
+
+    Raises:
+        IndexError: if the file has no such bytes.
+    """
+    found = None if header is None else RANGE.fullmatch(header.strip())
+    if found is None or found.groups() == ("", ""):
+        return None
+    first, last = found.groups()
+    if first == "":  # the last so many
+        if int(last) == 0 or size == 0:
+            raise IndexError
+        return max(0, size - int(last)), size
+    begin, end = int(first), min(int(last) + 1, size) if last else size
+    if last and int(last) < begin:
+        return None
+    if begin >= size:
+        raise IndexError
+    return begin, end
+
+
+class FileAnswer(Response):
+    """A file, or the range of it that the request asks for; closes it."""
+
+    def __init__(self, file: OpenFile, kind: str, headers: Mapping[str, str]) -> None:
+        super().__init__(headers=dict(headers), media_type=kind)
+        self._file = file
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self._answer(Request(scope, receive), send)
+        finally:
+            os.close(self._file.descriptor)
+
+    async def _answer(self, request: Request, send: Send) -> None:
+        asked, size, tag = request.headers, self._file.size, self._file.tag
+        self.headers["etag"], self.headers["accept-ranges"] = tag, "bytes"
+        begin, end, status = 0, size, 200
+        if tag in [each.strip() for each in asked.get("if-none-match", "").split(",")]:
+            end, status = 0, 304
+        elif asked.get("if-range", tag) == tag:
+            try:
+                found = wanted_range(asked.get("range"), size)
+            except IndexError:
+                end, status = 0, 416
+                self.headers["content-range"] = f"bytes */{size}"
+            else:
+                if found is not None:
+                    (begin, end), status = found, 206
+                    self.headers["content-range"] = f"bytes {begin}-{end - 1}/{size}"
+        if status != 304:
+            self.headers["content-length"] = str(end - begin)
+        else:
+            del self.headers["content-length"]
+        await send({"type": "http.response.start", "status": status, "headers": self.raw_headers})
+        if request.method != "HEAD":
+            while begin < end:
+                chunk = await to_thread.run_sync(os.pread, self._file.descriptor, min(CHUNK_BYTES, end - begin), begin)
+                if not chunk:
+                    raise OSError("the file became shorter while it was sent")
+                begin += len(chunk)
+                await send({"type": "http.response.body", "body": chunk, "more_body": True})
+        await send({"type": "http.response.body", "body": b""})

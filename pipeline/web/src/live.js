@@ -1,0 +1,173 @@
+// A training as it runs: asks the server every other second, while anybody looks.
+//
+// For scripts: window.splatpipe.live.state() is what the server said last, and updates how many times that was new.
+
+import uPlot from "uplot";
+
+const $ = (id) => document.getElementById(id);
+const EVERY_MS = 2000;
+const NAMES = { waiting: "waits", running: "at work", done: "done", reused: "reused", failed: "failed" };
+const MODELS = { initial: "the start, before training", checkpoint: "iteration", model: "finished, iteration" };
+
+let told = null;
+let updates = 0;
+let view = null; // name of the photo that is shown
+let pictured = "";
+const plots = {};
+
+async function ask() {
+  try {
+    const answer = await fetch("/api/live");
+    if (!answer.ok) throw new Error();
+    const text = await answer.text();
+    const next = JSON.parse(text);
+    if (!told || JSON.stringify({ ...next, now_s: 0 }) !== JSON.stringify({ ...told, now_s: 0 })) updates += 1;
+    told = next;
+    show();
+  } catch {
+    $("state").textContent = "The server does not answer.";
+    $("state").className = "state failed";
+  }
+  setTimeout(wait, EVERY_MS);
+}
+
+function wait() {
+  if (document.hidden) document.addEventListener("visibilitychange", ask, { once: true });
+  else ask();
+}
+
+function duration(seconds) {
+  if (seconds < 90) return `${Math.max(1, Math.round(seconds))} s`;
+  const minutes = Math.round(seconds / 60);
+  return minutes < 90 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+}
+
+const make = (tag, name, text) => Object.assign(document.createElement(tag), { className: name, textContent: text });
+
+function show() {
+  const running = told.stages.find((stage) => stage.state === "running");
+  const failed = told.stages.find((stage) => stage.state === "failed");
+  showState(running, failed);
+  $("stages").replaceChildren(
+    ...told.stages.map((stage) => {
+      const item = make("li", stage.state, stage.name);
+      item.title = NAMES[stage.state] + (stage.seconds == null ? "" : `, ${duration(stage.seconds)}`);
+      return item;
+    }),
+  );
+  showProgress(running);
+  showViews();
+  showCurves();
+  $("notes").replaceChildren(
+    ...told.notes.toReversed().map((note) => make("li", note.kind, [`${note.stage}:`, note.message, note.hint].filter(Boolean).join(" "))),
+  );
+}
+
+function showState(running, failed) {
+  const all = told.stages.length > 0 && told.stages.every((stage) => ["done", "reused"].includes(stage.state));
+  const [kind, text] = told.at_work
+    ? ["running", running ? running.name : "beginning"]
+    : failed
+      ? ["failed", `${failed.name}: ${failed.message}`]
+      : all
+        ? ["done", "finished"]
+        : ["failed", "not at work"];
+  $("state").className = `state ${kind}`;
+  $("state").textContent = text;
+  $("left").textContent = told.at_work && running?.seconds_left != null ? `${duration(running.seconds_left)} left in ${running.name}` : "";
+}
+
+function showProgress(running) {
+  const stage = told.at_work ? running : null;
+  const share = stage?.total ? Math.min(1, stage.done / stage.total) : 0;
+  $("progress").hidden = !stage?.total;
+  $("progress").setAttribute("aria-valuenow", String(Math.round(100 * share)));
+  $("progress").firstElementChild.style.width = `${100 * share}%`;
+  const count = (value) => value.toLocaleString("en", { maximumFractionDigits: 1 });
+  $("progress").lastElementChild.textContent = stage ? `${stage.what}: ${count(stage.done)} of ${count(stage.total)} ${stage.unit}` : "";
+}
+
+function showViews() {
+  const select = $("view");
+  const names = told.views.map((each) => each.name + (each.held_out ? " (held out)" : ""));
+  if (names.join() !== [...select.options].map((option) => option.textContent).join()) {
+    select.replaceChildren(...told.views.map((each, k) => Object.assign(make("option", "", names[k]), { value: each.name })));
+  }
+  view = told.views.some((each) => each.name === view) ? view : (told.views.find((each) => each.held_out) ?? told.views[0])?.name;
+  if (view) select.value = view;
+  const number = told.views.findIndex((each) => each.name === view);
+  const model = told.model;
+  for (const id of ["view", "previous", "next"]) $(id).disabled = number < 0;
+  $("nothing").hidden = Boolean(model);
+  $("iteration").textContent = model ? [MODELS[model.kind], model.kind === "initial" ? "" : model.iteration?.toLocaleString("en")].join(" ") : "";
+  if (model && number >= 0) picture(model.stamp, number);
+}
+
+// The picture before stays until the new one is there; one at a time.
+async function picture(stamp, number) {
+  const wanted = `/live/${stamp}/${number}`;
+  if (pictured.startsWith(wanted)) return;
+  pictured = `${wanted} loading`;
+  try {
+    for (const what of ["render", "photo"]) {
+      const image = new Image();
+      image.src = `${wanted}/${what}.jpg`;
+      await image.decode();
+      if (!pictured.startsWith(wanted)) return;
+      $(what).src = image.src;
+      $(what).hidden = false;
+    }
+    pictured = wanted;
+  } catch {
+    if (pictured.startsWith(wanted)) pictured = ""; // the model went on meanwhile: the next answer names it
+  }
+}
+
+function showCurves() {
+  for (const [name, points] of Object.entries(told.curves)) {
+    const node = $(name);
+    if (!node || !points.length) continue;
+    const data = [points.map((point) => point[0]), points.map((point) => point[1])];
+    plots[name] ??= plot(node, name);
+    plots[name].setData(data);
+  }
+}
+
+function plot(node, name) {
+  const colour = getComputedStyle(document.documentElement).getPropertyValue("--accent").trim();
+  const value = (_, each) => (each == null ? "" : each.toLocaleString("en", { maximumFractionDigits: name === "loss" ? 4 : 0 }));
+  const size = () => ({ width: Math.max(240, node.clientWidth), height: 220 });
+  const made = new uPlot(
+    {
+      ...size(),
+      scales: { x: { time: false } },
+      series: [{ label: "iteration" }, { label: name, stroke: colour, width: 1.5, value, points: { show: false } }],
+      axes: [{ grid: { stroke: "#e6eaee" } }, { size: 62, grid: { stroke: "#e6eaee" }, values: (_, ticks) => ticks.map((tick) => tick.toLocaleString("en")) }],
+    },
+    [[], []],
+    node,
+  );
+  addEventListener("resize", () => made.setSize(size()));
+  return made;
+}
+
+function choose(by) {
+  const at = told.views.findIndex((each) => each.name === view);
+  view = told.views[(at + by + told.views.length) % told.views.length].name;
+  showViews();
+}
+
+$("view").addEventListener("change", (event) => {
+  view = event.target.value;
+  showViews();
+});
+$("previous").addEventListener("click", () => choose(-1));
+$("next").addEventListener("click", () => choose(1));
+document.addEventListener("keydown", (event) => {
+  if (event.target.matches("select") || !told?.views.length) return;
+  if (event.key === "ArrowLeft") choose(-1);
+  if (event.key === "ArrowRight") choose(1);
+});
+
+window.splatpipe = { live: { state: () => told, updates: () => updates } };
+ask();

@@ -1,0 +1,332 @@
+// Marking control points: one point, one photo, one click; the next photo comes by itself.
+//
+// For scripts: window.splatpipe.mark has ready (a promise), state(), goTo(pointName, photoName), screenAt([x, y]) in the
+// window's pixels of a place in the photo, and settled(), a promise that all is on the disk and shown.
+
+import { element, isLeft, showEstimate, showPhotos, showPoints } from "./mark/panels.js";
+import { paintOver } from "./mark/crosses.js";
+import { Photos, Picture } from "./mark/picture.js";
+import { Outbox, fetchJson, post } from "./mark/server.js";
+
+const $ = (id) => document.getElementById(id);
+const CLOSE_ZOOM = 4; // screen pixels a photo's pixel, where the place is known well
+const ROOM = 2.8; // radii of uncertainty that the view shows
+const KEYS = [
+  ["Click", "mark the point; again to correct"],
+  ["Arrows", "move the mark by a pixel; with Shift by a tenth, with Alt by ten"],
+  ["Enter", "accept, and on to the next photo that remains"],
+  ["Del", "remove the mark"],
+  ["X", "the point is not visible in this photo (again: it is)"],
+  ["N  P", "next, previous photo"],
+  ["J  K", "next, previous point"],
+  ["+  -  wheel", "zoom"],
+  ["F  C", "the whole photo; back to the point"],
+  ["U  Ctrl+Z", "undo"],
+  ["R  Ctrl+Y", "redo"],
+];
+
+const state = { told: null, detail: null, point: 0, photo: -1, moved: null, order: new Map(), wanted: 6 };
+const photos = new Photos();
+const picture = new Picture($("canvas"), $("overall"), {
+  click: (place) => mark(place, false),
+  paint: (context, view) => paintOver(context, view, row(), state.moved),
+});
+let outbox;
+
+const row = (photo = state.photo) => state.detail?.photos.find((each) => each.photo === photo);
+const pointName = () => state.told.points[state.point].name;
+const place = () => row()?.mark ?? state.moved ?? row()?.predicted;
+
+async function begin() {
+  state.told = await fetchJson("/api/mark");
+  state.wanted = Number(localStorage.getItem("splatpipe.wanted")) || state.wanted;
+  outbox = new Outbox(state.told.file, numbers, hear);
+  await outbox.send();
+  const first = state.told.points.findIndex(needsMore);
+  await choosePoint(Math.max(0, first));
+}
+
+function numbers({ point, photo }) {
+  const at = (list, name) => list.findIndex((each) => each.name === name);
+  return [at(state.told.points, point), at(state.told.photos, photo)];
+}
+
+const needsMore = (point) => point.marks < state.wanted && point.left > 0;
+
+// What the server says: taken over unless changes of ours are still on their way.
+function hear({ answer, refused }) {
+  if (refused) hint(refused, true);
+  if (answer && outbox.count === 0) take(answer);
+  showSaved();
+}
+
+function take(answer) {
+  state.told = answer.overview;
+  if (answer.detail && answer.detail.name === pointName()) setDetail(answer.detail);
+  showAll();
+}
+
+// The order of a point's photos stays as it was when one came to it: nothing moves under the hand.
+function setDetail(detail) {
+  const known = state.order.get(detail.name);
+  if (known) detail.photos.sort((a, b) => known.indexOf(a.photo) - known.indexOf(b.photo));
+  else state.order.set(detail.name, detail.photos.map((each) => each.photo));
+  state.detail = detail;
+}
+
+async function choosePoint(number, photo) {
+  state.point = number;
+  state.order.delete(pointName());
+  const wanted = number;
+  const detail = await fetchJson(`/api/mark/${number}`);
+  if (state.point !== wanted) return;
+  setDetail(detail);
+  const rows = detail.photos;
+  const first = rows.find(isLeft) ?? rows.find((each) => each.mark) ?? rows[0];
+  document.body.classList.remove("drawn");
+  $("drawer").setAttribute("aria-expanded", "false");
+  await choosePhoto(photo ?? first.photo);
+}
+
+async function choosePhoto(number) {
+  state.photo = number;
+  state.moved = null;
+  hint("");
+  showAll();
+  const size = state.told.photos[number];
+  try {
+    const bitmap = await photos.get(number, size);
+    if (state.photo !== number) return;
+    picture.show(bitmap, size);
+    home();
+    const next = nextLeft();
+    if (next) photos.get(next.photo, state.told.photos[next.photo]).catch(() => 0);
+  } catch (error) {
+    if (state.photo === number) hint(error.message, true);
+  }
+}
+
+function home() {
+  const at = place();
+  if (!at) return picture.fitAll();
+  const { predicted, radius_px: radius, mark } = row();
+  const room = Math.min(picture.width, picture.height) / (ROOM * Math.max(1, mark ? 1 : (radius ?? 1)));
+  const inside = mark || (predicted[0] >= 0 && predicted[1] >= 0);
+  picture.look(at[0], at[1], Math.min(CLOSE_ZOOM, inside ? room : room / 2));
+}
+
+// The next photo that remains, after the one that is shown.
+function nextLeft() {
+  const rows = state.detail.photos;
+  const at = rows.findIndex((each) => each.photo === state.photo);
+  return [...rows.slice(at + 1), ...rows.slice(0, at)].find((each) => isLeft(each));
+}
+
+function send(change) {
+  const photo = state.told.photos[state.photo].name;
+  outbox.add({ point: pointName(), photo, ...change });
+}
+
+function mark([x, y], nudge) {
+  const size = state.told.photos[state.photo];
+  const inside = (value, most) => Math.round(Math.min(most, Math.max(0, value)) * 100) / 100;
+  const here = row();
+  here.mark = [inside(x, size.width), inside(y, size.height)];
+  Object.assign(here, { hidden: false, agrees: true, residual_px: null });
+  state.moved = null;
+  hint("");
+  send({ action: "mark", x: here.mark[0], y: here.mark[1], nudge });
+  showAll();
+}
+
+function nudge(dx, dy) {
+  const at = place() ?? [picture.x, picture.y];
+  const to = [at[0] + dx, at[1] + dy];
+  if (row().mark) mark(to, true);
+  else state.moved = to;
+  picture.keepInSight(to);
+  picture.draw();
+}
+
+async function accept() {
+  const here = row();
+  if (!here.mark) {
+    if (!state.moved) return hint("Click where the point is, or move the cross onto it with the arrows: the expected place alone is no measurement.");
+    mark(state.moved, false);
+  }
+  await outbox.send();
+  await onward();
+}
+
+// To the next photo of the point while it wants more, then to the next point that does.
+async function onward() {
+  const next = nextLeft();
+  if (next && state.detail.photos.filter((each) => each.mark).length < state.wanted) return choosePhoto(next.photo);
+  const { points } = state.told;
+  const order = [...points.keys()].map((k) => (state.point + 1 + k) % points.length);
+  const other = order.find((k) => k !== state.point && needsMore(points[k]));
+  if (other != null) return choosePoint(other);
+  if (next) return choosePhoto(next.photo);
+  return hint("Every point is marked wherever it is likely to be seen.");
+}
+
+function remove() {
+  const here = row();
+  if (!here.mark) return;
+  Object.assign(here, { mark: null, residual_px: null });
+  send({ action: "unmark" });
+  showAll();
+}
+
+async function hide() {
+  const here = row();
+  here.hidden = !here.hidden;
+  if (here.hidden) Object.assign(here, { mark: null, residual_px: null });
+  send({ action: here.hidden ? "hide" : "unmark" });
+  showAll();
+  if (here.hidden) await onward();
+}
+
+async function turnBack(what) {
+  await outbox.send();
+  try {
+    const answer = await post(`/api/mark/${what}`, {});
+    if (answer.point == null) return hint(`Nothing to ${what}.`);
+    state.told = answer.overview;
+    if (answer.point !== state.point) await choosePoint(answer.point, answer.photo);
+    else {
+      setDetail(answer.detail);
+      if (answer.photo !== state.photo) await choosePhoto(answer.photo);
+      else showAll();
+    }
+  } catch (error) {
+    hint(error.message, true);
+  }
+}
+
+function step(by) {
+  const rows = state.detail.photos;
+  const at = rows.findIndex((each) => each.photo === state.photo);
+  choosePhoto(rows[(at + by + rows.length) % rows.length].photo);
+}
+
+const stepPoint = (by) => choosePoint((state.point + by + state.told.points.length) % state.told.points.length);
+
+function hint(text, bad = false) {
+  $("hint").textContent = text;
+  $("hint").classList.toggle("bad", bad);
+}
+
+function showSaved() {
+  const waiting = outbox?.count ?? 0;
+  const node = $("saved");
+  node.className = waiting ? (outbox.trouble ? "bad" : "busy") : "good";
+  const many = `${waiting} change${waiting > 1 ? "s" : ""}`;
+  node.textContent = !waiting ? "All saved" : outbox.trouble ? `${many} not saved: ${outbox.trouble} Kept here, and tried again.` : "Saving…";
+}
+
+function showAll() {
+  const { told, detail } = state;
+  showEstimate($("estimate"), told);
+  showPoints($("list"), told, state.point, state.wanted, (number) => choosePoint(number));
+  showFile();
+  $("undo").disabled = !told.can_undo && !outbox?.count;
+  $("redo").disabled = !told.can_redo;
+  if (detail) {
+    showPhotos(document.querySelector("#photos ol"), detail.photos, state.photo, (number) => choosePhoto(number));
+    $("point").textContent = detail.name;
+    const marked = detail.photos.filter((each) => each.mark).length;
+    const left = detail.photos.filter(isLeft).length;
+    $("about").textContent = `marked in ${marked}, ${left} to do`;
+    $("photo").textContent = state.told.photos[state.photo]?.name ?? "";
+  }
+  picture.draw();
+  showSaved();
+}
+
+function showFile() {
+  const wanted = element("select", { "aria-label": "Marks a point", onchange: (event) => setWanted(event.target.value) });
+  for (const count of [4, 6, 8, 100]) {
+    const text = count === 100 ? "every photo" : `${count} photos`;
+    wanted.append(element("option", { value: count, selected: count === state.wanted }, text));
+  }
+  $("file").replaceChildren(
+    element("p", {}, "Mark each point in ", wanted),
+    element("p", {}, "Marks go into ", element("code", {}, state.told.file), ` in ${state.told.crs}.`),
+    element("p", {}, "Then: ", element("code", {}, state.told.command)),
+  );
+}
+
+function setWanted(value) {
+  state.wanted = Number(value);
+  localStorage.setItem("splatpipe.wanted", value);
+  showAll();
+}
+
+const actions = {
+  left: () => nudge(-1, 0),
+  right: () => nudge(1, 0),
+  up: () => nudge(0, -1),
+  down: () => nudge(0, 1),
+  accept,
+  remove,
+  hide,
+  home,
+  next: () => step(1),
+  previous: () => step(-1),
+};
+
+function onKey(event) {
+  if (event.target.matches("select, input") || $("keys").open || !state.detail) return;
+  const control = event.ctrlKey || event.metaKey;
+  const size = event.shiftKey ? 0.1 : event.altKey ? 10 : 1;
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const moves = { ArrowLeft: [-size, 0], ArrowRight: [size, 0], ArrowUp: [0, -size], ArrowDown: [0, size] };
+  const plain = {
+    Enter: accept, Delete: remove, Backspace: remove, x: hide, n: actions.next, p: actions.previous,
+    j: () => stepPoint(1), k: () => stepPoint(-1), PageDown: () => stepPoint(1), PageUp: () => stepPoint(-1),
+    u: () => turnBack("undo"), r: () => turnBack("redo"), c: home, f: () => picture.fitAll(),
+    "+": () => picture.zoomBy(1.5), "=": () => picture.zoomBy(1.5), "-": () => picture.zoomBy(1 / 1.5), "?": help,
+  };
+  const turned = { z: event.shiftKey ? "redo" : "undo", y: "redo" };
+  const act = control ? turned[key] && (() => turnBack(turned[key])) : moves[key] ? () => nudge(...moves[key]) : plain[key];
+  if (!act) return;
+  event.preventDefault();
+  act();
+}
+
+function help() {
+  const rows = KEYS.map(([keys, text]) => element("tr", {}, element("th", {}, keys), element("td", {}, text)));
+  const close = element("button", { onclick: () => $("keys").close() }, "Close");
+  $("keys").replaceChildren(element("h2", {}, "Keys"), element("table", {}, ...rows), close);
+  $("keys").showModal();
+}
+
+document.addEventListener("keydown", onKey);
+$("pad").addEventListener("click", (event) => actions[event.target.closest("button")?.dataset.do]?.());
+$("undo").addEventListener("click", () => turnBack("undo"));
+$("redo").addEventListener("click", () => turnBack("redo"));
+$("help").addEventListener("click", help);
+$("drawer").addEventListener("click", () => {
+  const open = document.body.classList.toggle("drawn");
+  $("drawer").setAttribute("aria-expanded", String(open));
+});
+addEventListener("beforeunload", (event) => outbox?.count && event.preventDefault());
+
+const ready = begin().catch((error) => hint(error.message, true));
+window.splatpipe = {
+  mark: {
+    ready,
+    state: () => ({ point: pointName(), photo: state.told.photos[state.photo].name, told: state.told, detail: state.detail, waiting: outbox.count }),
+    goTo: (point, photo) => choosePoint(...numbers({ point, photo })),
+    screenAt: (at) => {
+      const box = $("canvas").getBoundingClientRect();
+      const [x, y] = picture.screenAt(at);
+      return [x + box.left, y + box.top];
+    },
+    settled: async () => {
+      await outbox.send();
+      return new Promise((done) => requestAnimationFrame(() => done(outbox.count)));
+    },
+  },
+};

@@ -1,0 +1,105 @@
+// The lists beside the photo: points with what the marks tell of them, and the photos of a point.
+
+export const element = (tag, attributes = {}, ...children) => {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value === true) made.setAttribute(name, "");
+    else if (value !== false && value != null) made.setAttribute(name, value);
+  }
+  made.append(...children.filter((child) => child != null && child !== ""));
+  return made;
+};
+
+export function metres(value) {
+  if (value == null || !Number.isFinite(value)) return "–";
+  const size = Math.abs(value);
+  if (size >= 10) return `${value.toFixed(0)} m`;
+  return size >= 0.995 ? `${value.toFixed(1)} m` : `${(value * 100).toFixed(size >= 0.0995 ? 0 : 1)} cm`;
+}
+
+const inGsd = (value, gsd) => (gsd && Number.isFinite(value) && value < 100 * gsd ? ` (${(value / gsd).toFixed(1)} GSD)` : "");
+
+export function showEstimate(root, told) {
+  root.replaceChildren(element("h2", {}, "What the marks tell"));
+  if (!told.placed) {
+    root.append(element("p", {}, "No frame yet: mark three points, each in two photos or more."));
+  } else {
+    const [horizontal, vertical] = told.expected_m ?? [NaN, NaN];
+    const row = (title, h, v, count) =>
+      element("tr", {}, element("th", {}, title), element("td", {}, count ?? ""), element("td", {}, metres(h) + inGsd(h, told.gsd_m)), element("td", {}, metres(v) + inGsd(v, told.gsd_m)));
+    const head = ["", "points", "horizontal", "height"].map((text) => element("th", {}, text));
+    const table = element("table", {}, element("tr", {}, ...head));
+    const { control, check } = told.tables;
+    if (control) table.append(row("control, rms", control.rmse_horizontal_m, control.rmse_up_m, control.count));
+    if (check) table.append(row("check, rms", check.rmse_horizontal_m, check.rmse_up_m, check.count));
+    table.append(row("expected (σ)", horizontal, told.heights_tied ? vertical : NaN));
+    root.append(table);
+    if (!told.heights_tied) root.append(element("p", {}, "Heights are not tied to the survey yet: mark one point in two photos."));
+  }
+  for (const warning of told.warnings) root.append(element("p", { class: "warning" }, warning));
+}
+
+export function showPoints(root, told, chosen, wanted, choose) {
+  const rows = told.points.map((point, number) => {
+    const [state, text] = stateOf(point, wanted);
+    const size = point.residual_m && Math.hypot(...point.residual_m.map((value) => value ?? 0));
+    return element(
+      "li",
+      { class: state, "aria-current": number === chosen ? "true" : null, title: title(point), onclick: () => choose(number) },
+      element("strong", {}, point.name),
+      element("span", { class: "role" }, point.role === "check" ? "check" : point.role === "left_out" && point.marks > 1 ? "left out" : ""),
+      element("span", { class: "count" }, text),
+      element("span", { class: "off" }, size == null ? "" : metres(size)),
+    );
+  });
+  root.replaceChildren(...rows);
+  root.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+}
+
+function stateOf(point, wanted) {
+  const count = `${point.marks} of ${point.marks + point.left}`;
+  if (point.wrong || (point.role === "left_out" && point.marks > 1)) return ["wrong", count];
+  if (point.marks >= Math.min(wanted, point.marks + point.left) && point.marks > 1) return ["done", count];
+  return [point.marks ? "begun" : "open", count];
+}
+
+function title(point) {
+  const [x, y, z] = point.coordinates;
+  const lines = [`${point.name}: ${x}  ${y}  ${z ?? "(no height)"}`];
+  if (point.residual_m) lines.push(`found less surveyed: ${point.residual_m.map(metres).join(", ")} (east, north, up)`);
+  if (point.why) lines.push(point.why);
+  if (point.wrong) lines.push(`${point.wrong} of its marks do not agree with the others`);
+  return lines.join("\n");
+}
+
+export const isLeft = (row) => row.predicted != null && !row.mark && !row.hidden && !row.doubtful;
+
+export function showPhotos(root, rows, chosen, choose) {
+  const groups = [
+    ["to do", (row) => isLeft(row)],
+    ["marked", (row) => row.mark],
+    ["perhaps", (row) => row.predicted && !row.mark && !row.hidden && row.doubtful],
+    ["not visible", (row) => row.hidden],
+    ["elsewhere", (row) => !row.predicted && !row.mark && !row.hidden],
+  ];
+  root.replaceChildren();
+  for (const [name, belongs] of groups) {
+    const members = rows.filter(belongs);
+    if (!members.length) continue;
+    root.append(element("li", { class: "group" }, `${name} ${members.length}`));
+    for (const row of members) {
+      const off = row.residual_px && Math.hypot(...row.residual_px);
+      const current = row.photo === chosen ? "true" : null;
+      root.append(
+        element(
+          "li",
+          { class: `photo ${row.mark ? (row.agrees ? "marked" : "wrong") : row.hidden ? "hidden" : "open"}`, "aria-current": current, onclick: () => choose(row.photo) },
+          element("span", {}, row.name),
+          element("span", { class: "off" }, off == null ? "" : `${off.toFixed(1)} px`),
+        ),
+      );
+    }
+  }
+  root.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest", inline: "nearest" });
+}

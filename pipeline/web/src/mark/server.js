@@ -1,0 +1,106 @@
+// What the page asks of the server. A change that did not reach the disk stays in the browser's storage and is sent
+// again, also by the page that is opened next: no mark is lost when the server, or the machine, goes down.
+
+const RETRY_MS = 2000;
+const token = document.querySelector("meta[name=splatpipe-token]").content;
+
+export async function fetchJson(path) {
+  const answer = await fetch(path);
+  if (!answer.ok) throw new Error(await whyNot(answer));
+  return answer.json();
+}
+
+async function whyNot(answer) {
+  const text = (await answer.text()).trim();
+  try {
+    const { message, hint } = JSON.parse(text);
+    return `${message} ${hint}`.trim();
+  } catch {
+    return text || `The server answered ${answer.status}.`;
+  }
+}
+
+export async function post(path, body) {
+  const headers = { "content-type": "application/json", "x-splatpipe-token": token };
+  const answer = await fetch(path, { method: "POST", headers, body: JSON.stringify(body) });
+  if (answer.ok) return answer.json();
+  const error = new Error(await whyNot(answer));
+  error.status = answer.status;
+  throw error;
+}
+
+export class Outbox {
+  // Changes on their way to the disk, in order; `hear` is told of answers and of trouble.
+  constructor(key, numbers, hear) {
+    this.key = `splatpipe.marks:${key}`;
+    this.numbers = numbers;
+    this.hear = hear;
+    this.waiting = [];
+    this.sending = null;
+    this.trouble = "";
+    try {
+      this.waiting = JSON.parse(localStorage.getItem(this.key)) ?? [];
+    } catch {
+      localStorage.removeItem(this.key);
+    }
+    if (this.waiting.length) this.send();
+  }
+
+  get count() {
+    return this.waiting.length;
+  }
+
+  add(change) {
+    const last = this.waiting.at(-1);
+    const same = last && last.point === change.point && last.photo === change.photo;
+    if (same && change.nudge && last.action === "mark" && this.waiting.length > (this.sending ? 1 : 0)) {
+      this.waiting[this.waiting.length - 1] = { ...change, nudge: last.nudge };
+    } else {
+      this.waiting.push(change);
+    }
+    this.keep();
+    return this.send();
+  }
+
+  keep() {
+    try {
+      if (this.waiting.length) localStorage.setItem(this.key, JSON.stringify(this.waiting));
+      else localStorage.removeItem(this.key);
+    } catch {
+      // A browser without storage: the page itself still has them.
+    }
+    this.hear({});
+  }
+
+  // Resolves when nothing waits any more, or when something has to wait.
+  send() {
+    this.sending ??= this.sendAll().finally(() => (this.sending = null));
+    return this.sending;
+  }
+
+  async sendAll() {
+    while (this.waiting.length) {
+      const change = this.waiting[0];
+      const [point, photo] = this.numbers(change);
+      try {
+        if (point < 0 || photo < 0) throw Object.assign(new Error("No longer in this run."), { status: 400 });
+        const answer = await post("/api/mark/change", { ...change, point, photo });
+        this.trouble = "";
+        this.waiting.shift();
+        this.keep();
+        this.hear({ answer });
+      } catch (error) {
+        if (error.status === 400) {
+          this.waiting.shift(); // it will never be right
+          this.keep();
+          this.hear({ refused: `${change.point} in ${change.photo}: ${error.message}` });
+          continue;
+        }
+        this.trouble = error.status ? error.message : "The server does not answer.";
+        this.hear({});
+        setTimeout(() => this.send(), RETRY_MS);
+        return;
+      }
+    }
+  }
+}

@@ -1,0 +1,320 @@
+// viewer.html: the splat in any browser, without a network. viewer.py writes the page; the parts are in viewer/.
+//
+// For scripts and tests there is `window.splatpipe`:
+//   ready                 a promise: the first complete frame is on the screen (rejected where loading failed)
+//   complete()            a promise: a complete frame of the present view is on the screen
+//   cameraState()         {position, yaw, pitch, roll, fx, fy, cx, cy, width, height, photo}: world units, radians, CSS px
+//   setCamera({position, target} or {position, yaw, pitch, roll})   look from there, at once
+//   goToCamera(name, atOnce = true)   the view of a photo; false where there is none of that name
+//   project([x, y, z])    {x, y, depth}: where a world point is in the window, CSS px
+//   pick(x, y)            [x, y, z]: the world point under a place in the window, or null
+//   crsOf([x, y, z])      its coordinates in the run's CRS, or null where there is none
+//   measure(from, to, kind = "distance")   {distance, horizontal, height}, drawn like one made by hand
+//   showPoints(on), showCameras(on), showInterface(on)
+//   picture()             a promise: the present view as a PNG data URL
+//   facts                 what the page was made with
+
+import { Vector3 } from "three";
+import { fillStrip, Frusta, frustumDepth } from "./viewer/cameras.js";
+import { told, toCrs } from "./viewer/crs.js";
+import { Measuring } from "./viewer/measure.js";
+import { Navigation } from "./viewer/navigation.js";
+import { bytesOf, LoadError, readFacts, readSplat } from "./viewer/page.js";
+import { makePoints, nearestPoint } from "./viewer/points.js";
+import { RayCaster } from "./viewer/ray.js";
+import { makeSky } from "./viewer/sky.js";
+import { Stage } from "./viewer/stage.js";
+import { View } from "./viewer/view.js";
+
+const FAR_PER_SIZE = 1e4; // of the scene: what is behind everything else must not be cut off
+const HOVER_MS = 60;
+
+const $ = (id) => document.getElementById(id);
+const array = (vector) => [vector.x, vector.y, vector.z];
+const vector = (values) => new Vector3(...values);
+
+class Viewer {
+  constructor(facts) {
+    this.facts = facts;
+    this.photos = facts.cameras;
+    this.view = new View({ near: facts.near, far: facts.size * FAR_PER_SIZE });
+    this.centre = vector(facts.centre);
+    this.photo = null; // whose view it is
+    this.tool = null;
+  }
+
+  async start() {
+    const { facts, view } = this;
+    this.stage = new Stage($("canvas"), facts);
+    const moved = () => this.stage.invalidate(true);
+    view.changed = () => {
+      this.photo = null;
+      this.choose?.(null);
+      moved();
+    };
+    this.frusta = new Frusta(this.photos, frustumDepth(this.photos), () => this.stage.invalidate());
+    this.measuring = new Measuring($("labels"), facts, () => this.stage.invalidate());
+    this.stage.scene.add(this.frusta.group, this.measuring.group);
+    this.stage.beforeDraw = () => this.beforeDraw();
+    this.stage.canvas.addEventListener("webglcontextlost", () => tell("The graphics card stopped drawing.", "Reload this page."));
+    new ResizeObserver(() => this.stage.resize()).observe(this.stage.canvas);
+    await this.addSmallParts();
+    this.goTo(this.photos[facts.start], true);
+    this.controls();
+    const bytes = this.given ?? (await readSplat(facts, progress));
+    await this.show(bytes);
+  }
+
+  async addSmallParts() {
+    const { facts } = this;
+    if (facts.sky) this.stage.scene.add(makeSky(await bytesOf(facts.sky.colours), facts.sky, facts.background));
+    const [xyz, rgb] = [await bytesOf(facts.points.xyz), await bytesOf(facts.points.rgb)];
+    this.points = makePoints(new Float32Array(xyz.buffer, xyz.byteOffset, xyz.length / 4), rgb);
+    this.stage.scene.add(this.points);
+  }
+
+  async show(bytes) {
+    this.rays = new RayCaster(await this.stage.load(bytes));
+    this.stage.invalidate();
+    await this.stage.complete();
+    document.body.classList.add("ready");
+    $("loading").hidden = true;
+  }
+
+  beforeDraw() {
+    const { view, stage } = this;
+    view.size = { width: stage.width, height: stage.height };
+    view.apply(stage.camera);
+    this.frusta.update(view);
+    this.measuring.update(view);
+    $("north").style.transform = `rotate(${view.yaw - Math.PI / 2}rad)`;
+  }
+
+  controls() {
+    const { facts } = this;
+    this.navigation = new Navigation(this.stage.canvas, this.view, {
+      size: facts.size,
+      pick: (x, y) => this.pick(x, y),
+      centre: () => this.centre.clone(),
+      click: (x, y) => this.click(x, y),
+      hover: (x, y) => this.hover(x, y),
+      leave: () => this.leave(),
+    });
+    this.choose = fillStrip($("strip"), this.photos, (photo) => this.goTo(photo));
+    this.choose(this.photo);
+    const actions = {
+      home: () => this.goTo(this.photos[facts.start]),
+      fly: () => this.setFlying(!this.navigation.flying),
+      points: () => this.showPoints(!this.points.visible),
+      cameras: () => this.showCameras(!this.frusta.group.visible),
+      distance: () => this.use("distance"),
+      height: () => this.use("height"),
+      undo: () => this.measuring.undo(),
+      screenshot: () => this.screenshot(),
+      help_button: () => ($("help").open ? $("help").close() : $("help").showModal()),
+    };
+    const keys = { h: "home", f: "fly", p: "points", c: "cameras", m: "distance", t: "height", x: "screenshot", "?": "help_button", Backspace: "undo", Delete: "undo" };
+    for (const [name, action] of Object.entries(actions)) $(name)?.addEventListener("click", action);
+    $("close").addEventListener("click", () => $("help").close());
+    addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (event.key === "Escape") this.use(null);
+      else if (event.key === "Tab" || $("help").open) return;
+      else actions[keys[event.key.length === 1 ? event.key.toLowerCase() : event.key]]?.();
+      if (event.key === "n" || event.key === "b") this.step(event.key === "n" ? 1 : -1);
+    });
+    this.showCameras(false);
+  }
+
+  /** The next or previous photo's view. */
+  step(by) {
+    const now = this.photos.indexOf(this.photo);
+    this.goTo(this.photos[(now + by + this.photos.length) % this.photos.length]);
+  }
+
+  goTo(photo, atOnce) {
+    if (!photo) return false;
+    this.view.travel(this.view.poseOf(photo), atOnce, () => {
+      this.photo = photo;
+      this.choose?.(photo);
+    });
+    return true;
+  }
+
+  pick(x, y) {
+    const { view } = this;
+    if (this.points.visible) return nearestPoint(this.points, view, x, y);
+    if (!this.rays) return null;
+    const { forward } = view.axes();
+    return this.rays.meet(view.position, view.ray(x, y), forward, { near: this.facts.near, pixel: 1 / view.intrinsics().fx });
+  }
+
+  click(x, y) {
+    const photo = this.tool ? null : this.frusta.at(this.view, x, y);
+    if (photo) return this.goTo(photo);
+    const point = this.pick(x, y);
+    this.tellPoint(point);
+    if (!this.tool || !point) return;
+    const result = this.measuring.click(point);
+    this.tellTool(result);
+  }
+
+  hover(x, y) {
+    const photo = this.tool ? null : this.frusta.at(this.view, x, y);
+    if (this.frusta.mark(photo)) this.stage.invalidate();
+    $("canvas").classList.toggle("on-camera", photo !== null);
+    const tip = $("tip");
+    tip.hidden = !photo;
+    if (photo) {
+      tip.textContent = photo.held_out ? `${photo.name} · held out` : photo.name;
+      tip.style.transform = `translate(${Math.min(x + 14, this.stage.width - 180)}px, ${Math.max(8, y - 30)}px)`;
+    }
+    const now = performance.now();
+    if (now - (this.hovered ?? 0) < HOVER_MS || this.view.journey) return;
+    this.hovered = now;
+    this.tellPoint(this.pick(x, y));
+  }
+
+  leave() {
+    $("tip").hidden = true;
+    if (this.frusta.mark(null)) this.stage.invalidate();
+  }
+
+  tellPoint(point) {
+    const values = point ? told(this.facts, array(point)) : [];
+    $("coordinates").textContent = values.map(([label, value]) => `${label} ${value}`).join("   ");
+    $("where").classList.toggle("off", !point);
+  }
+
+  use(kind) {
+    this.tool = this.tool === kind ? null : kind;
+    this.measuring.use(this.tool);
+    for (const name of ["distance", "height"]) $(name).setAttribute("aria-pressed", String(this.tool === name));
+    document.body.classList.toggle("measuring", this.tool !== null);
+    this.tellTool(null);
+  }
+
+  tellTool(result) {
+    const { measuring } = this;
+    const hint = $("hint");
+    hint.hidden = !this.tool && !result;
+    if (result) {
+      const { distance, horizontal, height } = result;
+      hint.textContent = `Length ${measuring.told(distance)} · horizontal ${measuring.told(horizontal)} · height ${measuring.told(height, true)}`;
+    } else if (this.tool) {
+      hint.textContent = measuring.first ? "Click the second point." : "Click the first point. Esc ends, Backspace takes back.";
+    }
+  }
+
+  setFlying(flying) {
+    this.navigation.flying = flying;
+    $("fly").setAttribute("aria-pressed", String(flying));
+  }
+
+  showPoints(shown) {
+    this.points.visible = shown;
+    this.stage.showSplats(!shown);
+    $("points").setAttribute("aria-pressed", String(shown));
+  }
+
+  showCameras(shown) {
+    this.frusta.group.visible = shown;
+    $("cameras").setAttribute("aria-pressed", String(shown));
+    this.stage.invalidate();
+  }
+
+  async picture() {
+    const canvas = await this.stage.picture();
+    this.measuring.draw(canvas, canvas.width / this.stage.width);
+    return canvas;
+  }
+
+  async screenshot() {
+    const canvas = await this.picture();
+    const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(blob);
+    link.download = `${this.facts.title.replace(/[^\p{L}\p{N}_-]+/gu, "_") || "view"}.png`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+  }
+
+  /** window.splatpipe, see the top of this file. */
+  api(ready) {
+    return {
+      ready,
+      facts: this.facts,
+      complete: () => this.stage.complete(),
+      cameraState: () => {
+        const { position, yaw, pitch, roll, size } = this.view;
+        return { position: array(position), yaw, pitch, roll, ...this.view.intrinsics(), ...size, photo: this.photo?.name ?? null };
+      },
+      setCamera: ({ position, target, yaw, pitch, roll = 0 }) => {
+        const to = this.view.poseOf(this.view.lens.rotation ? this.view.lens : this.photos[this.facts.start]);
+        to.position = vector(position);
+        if (target) to.face(vector(target).sub(to.position).normalize(), this.view.axes().right);
+        if (target) to.roll = 0;
+        else Object.assign(to, { yaw, pitch, roll });
+        this.view.travel(to, true);
+      },
+      goToCamera: (name, atOnce = true) => this.goTo(this.photos.find((photo) => photo.name === name), atOnce),
+      project: (point) => this.view.project(vector(point)),
+      pick: (x, y) => {
+        const point = this.pick(x, y);
+        return point && array(point);
+      },
+      crsOf: (point) => (this.facts.crs ? toCrs(this.facts.crs, point) : null),
+      measure: (from, to, kind = "distance") => {
+        const { distance, horizontal, height } = this.measuring.add(kind, vector(from), vector(to));
+        return { distance, horizontal, height };
+      },
+      showPoints: (on) => this.showPoints(on),
+      showCameras: (on) => this.showCameras(on),
+      showInterface: (on) => document.body.classList.toggle("bare", !on),
+      picture: async () => (await this.picture()).toDataURL("image/png"),
+    };
+  }
+}
+
+function progress(share) {
+  $("bar").style.width = `${Math.round(100 * share)}%`;
+}
+
+/** A message in the middle of the page. */
+function tell(message, hint, choose = false) {
+  $("loading").hidden = false;
+  $("loading").classList.add("failed");
+  $("message").textContent = message;
+  $("advice").textContent = hint;
+  $("choose").hidden = !choose;
+}
+
+/** A splat that is dropped on the page or chosen, where the page cannot read it itself. */
+function acceptFile(viewer) {
+  const take = async (file) => {
+    if (!file) return;
+    $("loading").classList.remove("failed");
+    $("message").textContent = "Reading…";
+    $("advice").textContent = "";
+    try {
+      await viewer.show(new Uint8Array(await file.arrayBuffer()));
+    } catch (error) {
+      tell(error.message, error.hint ?? "", true);
+    }
+  };
+  $("file").addEventListener("change", (event) => take(event.target.files[0]));
+  addEventListener("dragover", (event) => event.preventDefault());
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    take(event.dataTransfer.files[0]);
+  });
+}
+
+const viewer = new Viewer(readFacts());
+const ready = viewer.start();
+window.splatpipe = viewer.api(ready);
+ready.catch((error) => {
+  const known = error instanceof LoadError;
+  tell(known ? error.message : `The model cannot be shown: ${error.message}`, known ? error.hint : "Try another browser.", !viewer.facts.splat.inlined);
+  if (viewer.stage && !viewer.facts.splat.inlined) acceptFile(viewer);
+});

@@ -1,0 +1,98 @@
+// What a ray meets: the median depth of the Gaussians along it, as our rasterizer measures (RenderOptions.for_depths).
+
+import { Vector3 } from "three";
+
+const ALPHA_MIN = 1 / 255;
+const ALPHA_MAX = 0.99;
+const BLUR_PX2 = 0.3;
+const MEDIAN = 0.5; // of the light is left: there the surface is
+const SHIFT_MAX = 0.5; // share of its centre's depth by which a Gaussian's depth on the ray may differ from it
+const SIGMAS2 = 2 * Math.log(255);
+
+let halves = null; // value of every half float
+
+function halfValues() {
+  const values = new Float32Array(65536);
+  for (let bits = 0; bits < 65536; bits++) {
+    const exponent = (bits >> 10) & 31;
+    const fraction = bits & 1023;
+    const sign = bits & 32768 ? -1 : 1;
+    if (exponent === 31) values[bits] = fraction ? NaN : sign * Infinity;
+    else values[bits] = sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
+  }
+  return values;
+}
+
+export class RayCaster {
+  /** @param splats Spark's ExtSplats; their frame is the world's turned to y up (x, z, -y). */
+  constructor(splats) {
+    this.splats = splats;
+    this.places = null;
+  }
+
+  /** Centres and squared reach, read once: the search goes through nothing else. */
+  prepare() {
+    halves ??= halfValues();
+    const count = this.splats.numSplats;
+    const [first, second] = this.splats.extArrays;
+    this.centres = new Float32Array(first.buffer, first.byteOffset, first.length);
+    this.reach2 = new Float32Array(count);
+    for (let i = 0; i < count; i++) {
+      const a = halves[second[4 * i + 1] >>> 16];
+      const b = halves[second[4 * i + 2] & 65535];
+      const c = halves[second[4 * i + 2] >>> 16];
+      this.reach2[i] = Math.exp(2 * Math.max(a, b, c)) * SIGMAS2;
+    }
+  }
+
+  /**
+   * @param {Vector3} origin @param {Vector3} direction Unit, world.
+   * @param {Vector3} forward The view's axis: Gaussians are passed in the order of their depth along it.
+   * @param {{near: number, pixel: number}} limits Nearest depth, and a pixel's angle.
+   * @returns {Vector3 | null} The point in the world.
+   */
+  meet(origin, direction, forward, { near, pixel }) {
+    if (!this.reach2) this.prepare();
+    const [ox, oy, oz] = [origin.x, origin.z, -origin.y];
+    const [dx, dy, dz] = [direction.x, direction.z, -direction.y];
+    const [fx, fy, fz] = [forward.x, forward.z, -forward.y];
+    const { centres, reach2 } = this;
+    const cosine = direction.dot(forward);
+    const blur2 = BLUR_PX2 * pixel * pixel;
+    const met = [];
+    for (let i = 0, j = 0; i < reach2.length; i++, j += 4) {
+      const [x, y, z] = [centres[j] - ox, centres[j + 1] - oy, centres[j + 2] - oz];
+      const along = x * dx + y * dy + z * dz;
+      const off2 = x * x + y * y + z * z - along * along;
+      if (off2 > reach2[i] + SIGMAS2 * blur2 * along * along || along <= 0) continue;
+      const depth = x * fx + y * fy + z * fz;
+      if (depth < near) continue;
+      const hit = this.response(i, [x, y, z], [dx, dy, dz], blur2 * along * along);
+      if (hit.alpha < ALPHA_MIN) continue;
+      const limit = SHIFT_MAX * depth;
+      met.push({ depth, alpha: hit.alpha, at: Math.min(Math.max(hit.at * cosine, depth - limit), depth + limit) });
+    }
+    met.sort((a, b) => a.depth - b.depth);
+    let light = 1;
+    for (const { alpha, at } of met) {
+      light *= 1 - alpha;
+      if (light <= MEDIAN) return new Vector3().copy(origin).addScaledVector(direction, at / cosine);
+    }
+    return null;
+  }
+
+  /** A Gaussian's alpha on a ray, and where along it it is largest. */
+  response(i, [x, y, z], [dx, dy, dz], blur2) {
+    const { scales, quaternion, opacity } = this.splats.getSplat(i);
+    const place = new Vector3(x, y, z).applyQuaternion(quaternion.conjugate()); // in the Gaussian's own axes
+    const ray = new Vector3(dx, dy, dz).applyQuaternion(quaternion);
+    let [aa, ab, bb] = [0, 0, 0]; // of the place and the ray, over the sigmas
+    for (const axis of ["x", "y", "z"]) {
+      const weight = 1 / (scales[axis] * scales[axis] + blur2);
+      aa += weight * place[axis] * place[axis];
+      ab += weight * place[axis] * ray[axis];
+      bb += weight * ray[axis] * ray[axis];
+    }
+    return { alpha: Math.min(ALPHA_MAX, opacity * Math.exp(-0.5 * Math.max(0, aa - (ab * ab) / bb))), at: ab / bb };
+  }
+}

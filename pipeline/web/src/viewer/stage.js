@@ -1,0 +1,184 @@
+// The canvas: draws when something has changed, one frame at a time, and says when a frame is whole.
+
+import { PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { SparkRenderer, SplatMesh, ExtSplats } from "@sparkjsdev/spark";
+import { drawInBatches } from "./batches.js";
+import { LoadError } from "./page.js";
+
+const BLUR_PX2 = 0.3; // and the two below: what our rasterizer does, pipeline/raster/definitions.py
+const ALPHA_MIN = 1 / 255;
+const SIGMAS = Math.sqrt(2 * Math.log(255)); // an opaque Gaussian is fainter than ALPHA_MIN beyond
+const REST_MS = 160; // without a movement: then the picture is drawn in full
+const POLL_MS = 4;
+const SLOW_MS = 120; // a frame that takes longer is drawn as a draft while the view moves
+const DRAFT_MS = 150; // what a draft may take
+const MOST_STRIDE = 12;
+const DRAFT_RESOLUTION = 0.5;
+const MOST_PIXEL_RATIO = 2;
+
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
+export class Stage {
+  /** @param {HTMLCanvasElement} canvas @param {{antialias: boolean, background: number[]}} facts */
+  constructor(canvas, facts) {
+    const context = canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" });
+    if (!context) {
+      throw new LoadError(
+        "This browser has no WebGL 2, which draws the model.",
+        "Use a current Firefox, Chrome, Edge or Safari, and allow hardware acceleration in its settings.",
+      );
+    }
+    this.canvas = canvas;
+    this.renderer = new WebGLRenderer({ canvas, context, antialias: false, alpha: false });
+    this.renderer.debug.checkShaderErrors = false; // asking holds up the page until the driver has compiled
+    this.renderer.setClearColor((facts.background[0] * 255 << 16) | (facts.background[1] * 255 << 8) | (facts.background[2] * 255), 1);
+    this.scene = new Scene();
+    this.camera = new PerspectiveCamera();
+    this.camera.matrixAutoUpdate = false;
+    this.spark = new SparkRenderer({
+      renderer: this.renderer,
+      autoUpdate: false,
+      enableLod: false,
+      blurAmount: facts.antialias ? BLUR_PX2 : 0,
+      preBlurAmount: facts.antialias ? 0 : BLUR_PX2,
+      minAlpha: ALPHA_MIN,
+      maxStdDev: SIGMAS,
+      maxPixelRadius: 4096,
+      sortRadial: false,
+    });
+    this.setStride = drawInBatches(this.spark);
+    this.scene.add(this.spark);
+    this.beforeDraw = () => {};
+    this.mesh = null;
+    this.wanted = 0;
+    this.movedAt = -Infinity;
+    this.fullMs = 0;
+    this.splatsShown = true;
+    this.waiting = [];
+    this.whole = false;
+    this.resize();
+  }
+
+  /** Decode an SPZ file (y up) and show it in the world (z up). */
+  async load(bytes) {
+    const splats = new ExtSplats({ fileBytes: bytes, fileType: "spz" }); // float32 centres: half floats are cm apart
+    try {
+      await splats.initialized;
+    } catch {
+      throw new LoadError("The splat cannot be read.", "It may be damaged or cut off: copy it again, or make it anew.");
+    }
+    if (this.mesh) this.scene.remove(this.mesh);
+    this.mesh = new SplatMesh({ extSplats: splats });
+    this.mesh.quaternion.set(Math.SQRT1_2, 0, 0, Math.SQRT1_2);
+    await this.mesh.initialized;
+    this.mesh.updateMatrixWorld(true);
+    this.scene.add(this.mesh);
+    this.showSplats(this.splatsShown);
+    return splats;
+  }
+
+  showSplats(shown) {
+    this.splatsShown = shown;
+    this.spark.visible = shown;
+    if (this.mesh) this.mesh.visible = shown;
+    this.invalidate();
+  }
+
+  resize() {
+    this.width = Math.max(1, this.canvas.clientWidth);
+    this.height = Math.max(1, this.canvas.clientHeight);
+    this.invalidate();
+  }
+
+  /** Draw again; `moving`: a draft will do where drawing is slow. */
+  invalidate(moving = false) {
+    this.wanted++;
+    this.whole = false;
+    if (moving) this.movedAt = performance.now();
+    this.schedule();
+  }
+
+  /** Resolves when a frame of the present view is on the screen, sorted and in full. */
+  complete() {
+    return this.whole ? Promise.resolve() : new Promise((resolve) => this.waiting.push(resolve));
+  }
+
+  schedule() {
+    if (this.scheduled || this.drawing) return;
+    this.scheduled = true;
+    const begin = () => {
+      this.scheduled = false;
+      this.draw();
+    };
+    if (document.hidden) setTimeout(begin, POLL_MS);
+    else requestAnimationFrame(begin);
+  }
+
+  async draw() {
+    this.drawing = true;
+    const wanted = this.wanted;
+    const resting = performance.now() - this.movedAt > REST_MS;
+    const slow = this.fullMs > SLOW_MS;
+    this.beforeDraw();
+    this.camera.updateMatrixWorld(true);
+    const began = performance.now();
+    if (this.splatsShown && this.mesh) {
+      if (resting || slow) await this.sortNow();
+      else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate());
+    }
+    this.setQuality(!resting && slow);
+    this.renderer.render(this.scene, this.camera);
+    await this.fence();
+    if (resting) this.fullMs = performance.now() - began;
+    this.drawing = false;
+    if (wanted !== this.wanted) this.schedule();
+    else if (resting) this.finish();
+    else setTimeout(() => this.schedule(), REST_MS);
+  }
+
+  /** Colours and order of the splats for this very view. */
+  async sortNow() {
+    while (this.spark.sorting) await pause(POLL_MS);
+    await this.spark.update(this);
+    while (this.spark.sorting || this.spark.sortDirty) await pause(POLL_MS);
+  }
+
+  setQuality(draft) {
+    const stride = draft ? Math.min(MOST_STRIDE, Math.max(1, Math.round(this.fullMs / DRAFT_MS))) : 1;
+    this.setStride(stride);
+    const ratio = Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO) * (draft ? DRAFT_RESOLUTION : 1);
+    const { width, height } = this;
+    const drawn = this.drawn;
+    if (drawn && drawn.ratio === ratio && drawn.width === width && drawn.height === height) return;
+    this.drawn = { ratio, width, height };
+    this.renderer.setPixelRatio(ratio);
+    this.renderer.setSize(width, height, false);
+  }
+
+  /** Wait until the GPU is done, without holding up the page: no frame is begun before. */
+  async fence() {
+    const gl = this.renderer.getContext();
+    const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (sync && !gl.isContextLost() && gl.clientWaitSync(sync, 0, 0) === gl.TIMEOUT_EXPIRED) await pause(POLL_MS);
+    gl.deleteSync(sync);
+  }
+
+  finish() {
+    this.whole = true;
+    const waiting = this.waiting;
+    this.waiting = [];
+    for (const resolve of waiting) resolve();
+  }
+
+  /** The present picture as a canvas of its own, in full. */
+  async picture() {
+    await this.complete();
+    this.renderer.render(this.scene, this.camera);
+    const copy = document.createElement("canvas");
+    copy.width = this.canvas.width;
+    copy.height = this.canvas.height;
+    copy.getContext("2d").drawImage(this.canvas, 0, 0);
+    return copy;
+  }
+}

@@ -1,0 +1,205 @@
+"""`viewer.html`: a splat in one page that opens anywhere, also from a disk and offline."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+from jinja2 import Environment
+from markupsafe import Markup
+
+from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.crs import UNKNOWN
+from splatpipe.pipeline.scene.local_crs import LocalCrs
+from splatpipe.pipeline.scene.panorama import FULL_FROM_DEG, NOTHING_UP_TO_DEG
+from splatpipe.pipeline.web import asset
+
+TEMPLATE = Path(__file__).resolve().parent / "viewer.html"
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; style-src 'unsafe-inline';"
+    " img-src data: blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
+)
+MOST_POINTS = 150_000  # that the page carries, 15 bytes each; more are thinned out evenly
+SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis: what is within is the scene
+NEAR_PER_SIZE = 1e-3  # where the caller states no near plane
+
+
+@dataclass(frozen=True, eq=False)
+class ViewerCamera:
+    """A photo and where it was taken.
+
+    Attributes:
+        camera: In the world frame; ``camera.name`` is shown. Upright: the picture's top is where people are to see it.
+        thumb: A small JPEG of the photo, turned like the camera; None for none.
+        held_out: Whether training left it out.
+    """
+
+    camera: Camera
+    thumb: bytes | None = None
+    held_out: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ViewerSky:
+    """What is behind the scene, by direction.
+
+    Attributes:
+        colours: Red, green, blue by elevation (rows, from straight down) and azimuth (columns, from west by south), of
+            the cells' centres; twice as many columns as rows. Below the horizon the background is shown instead.
+    """
+
+    colours: UInt8[np.ndarray, "rows columns 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewerScene:
+    """All that a page shows besides the splat, in the world frame (z up).
+
+    Attributes:
+        title: The page's.
+        cameras: The photos; at least one.
+        points: The sparse points.
+        point_colours: Theirs.
+        gaussians: How many the splat has.
+        metres: Whether a world unit is a metre; else lengths mean nothing.
+        crs: The CRS that coordinates are shown in; None for the world frame's own.
+        antialias: Whether the splat was trained with opacities that allow for the blur on screen.
+        background: Red, green, blue behind everything, 0..1.
+        near: Gaussians nearer than this are not drawn, world units; 0 for a share of the scene's size.
+        sky: In front of the background; None for none.
+        note: A sentence about the frame and its accuracy, for the help.
+    """
+
+    title: str
+    cameras: tuple[ViewerCamera, ...]
+    points: Float64[np.ndarray, "n 3"]
+    point_colours: UInt8[np.ndarray, "n 3"]
+    gaussians: int
+    metres: bool
+    crs: LocalCrs | None = None
+    antialias: bool = False
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    near: float = 0.0
+    sky: ViewerSky | None = None
+    note: str = ""
+
+
+def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
+    """The page as HTML text, with no reference to anything but the splat's address, if that is given.
+
+    Args:
+        scene: What to show.
+        splat: An SPZ file in its own frame (y up, see ``scene.spz``) to carry along; or its address, relative to the
+            page's, from where the page loads it: that needs a server, or the user drops the file on the page.
+
+    Raises:
+        ValueError: if there is no camera.
+        MachineError: if this installation was built without the page's script.
+    """
+    if not scene.cameras:
+        raise ValueError("a viewer needs a camera to begin from")
+    inlined = isinstance(splat, bytes)
+    carried = f'<script type="text/plain" id="splat">{_base64(splat)}</script>' if isinstance(splat, bytes) else ""
+    facts = _facts(scene) | {"splat": {"inlined": inlined, "address": "" if inlined else splat}}
+    environment = Environment(autoescape=True, keep_trailing_newline=True)
+    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+    return template.render(
+        policy=POLICY,
+        title=scene.title,
+        subtitle=_subtitle(scene),
+        crs=_crs_line(scene),
+        note=scene.note,
+        north=scene.metres,
+        style=Markup(asset("viewer.css")),  # noqa: S704
+        facts=Markup(_script_safe(json.dumps(facts, ensure_ascii=False, allow_nan=False))),  # noqa: S704
+        splat=Markup(carried),  # noqa: S704
+        script=Markup(asset("viewer.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")),  # noqa: S704
+    )
+
+
+def start_camera(scene: ViewerScene) -> int:
+    """The camera to begin from: the one that shows the most sparse points, the first of equals."""
+    if not len(scene.points):
+        return 0
+    return int(np.argmax([_points_shown(shown.camera, scene.points) for shown in scene.cameras]))
+
+
+def _points_shown(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> int:
+    in_camera = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    in_camera = in_camera[in_camera[:, 2] > 0.0]
+    pixels = in_camera[:, :2] / in_camera[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return int(((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1).sum())
+
+
+def _facts(scene: ViewerScene) -> dict[str, Any]:
+    points, colours = _thinned(scene)
+    centres = np.array([shown.camera.centre() for shown in scene.cameras])
+    least, most = np.quantile(points if len(points) else centres, SIZE_QUANTILES, axis=0)
+    size = float(np.linalg.norm(most - least)) or 1.0
+    return {
+        "title": scene.title,
+        "metres": scene.metres,
+        "antialias": scene.antialias,
+        "background": list(scene.background),
+        "near": scene.near if scene.near > 0.0 else NEAR_PER_SIZE * size,
+        "size": size,
+        "centre": ((least + most) / 2.0).tolist(),
+        "start": start_camera(scene),
+        "cameras": [_camera(shown) for shown in scene.cameras],
+        "points": {"xyz": _base64(points.astype("<f4").tobytes()), "rgb": _base64(colours.tobytes())},
+        "crs": None if scene.crs is None else scene.crs.facts(),
+        "sky": None if scene.sky is None else _sky(scene.sky),
+    }
+
+
+def _camera(shown: ViewerCamera) -> dict[str, Any]:
+    camera = shown.camera
+    return {
+        "name": camera.name,
+        **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "rotation": camera.cam_from_world[:3, :3].T.ravel().tolist(),
+        "centre": camera.centre().tolist(),
+        "thumb": None if shown.thumb is None else f"data:image/jpeg;base64,{_base64(shown.thumb)}",
+        "held_out": shown.held_out,
+    }
+
+
+def _sky(sky: ViewerSky) -> dict[str, Any]:
+    return {
+        "rows": sky.colours.shape[0],
+        "colours": _base64(np.ascontiguousarray(sky.colours).tobytes()),
+        "nothing_up_to_deg": NOTHING_UP_TO_DEG,
+        "full_from_deg": FULL_FROM_DEG,
+    }
+
+
+def _thinned(scene: ViewerScene) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    usable = np.flatnonzero(np.isfinite(scene.points).all(axis=1))
+    step = max(1, -(-len(usable) // MOST_POINTS))
+    return scene.points[usable[::step]], scene.point_colours[usable[::step]]
+
+
+def _subtitle(scene: ViewerScene) -> str:
+    photos = len(scene.cameras)
+    return f"{scene.gaussians:,} Gaussians from {photos} photo{'' if photos == 1 else 's'}"
+
+
+def _crs_line(scene: ViewerScene) -> str:
+    if scene.crs is not None:
+        datum = "datum not known" if scene.crs.heights == UNKNOWN else scene.crs.heights
+        return f"{scene.crs.name} ({scene.crs.id}), heights: {datum}"
+    return "local east, north, up, metres" if scene.metres else "arbitrary units: the photos say nothing of the scale"
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+def _script_safe(text: str) -> str:
+    """JSON that cannot end the script element that it stands in."""
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
