@@ -15,7 +15,7 @@ WHAT = {
     "splat.ply": "the splat, for any viewer of Gaussian splats",
     "splat.spz": "the splat, compressed, for viewer.html",
     "viewer.html": "the splat to walk around and measure in, in any browser, offline",
-    "flythrough.mp4": "a film through the scene",
+    "flythrough.webm": "a film through the scene",
     "georef.json": "where the splat is: CRS, datum, matrices",
     "cameras.json": "the cameras in the splat's frame",
     "metrics.json": "every figure of this report, for programs",

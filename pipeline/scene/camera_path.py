@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,8 +24,9 @@ from splatpipe.pipeline.scene.upright import rotation_to_up
 
 STEEP = math.radians(-60.0)  # looking down more steeply, a camera has no heading of its own: the horizon is far away
 TILTED = 0.1  # horizontal part of the mean view of cameras that look down, from which on it is their common heading
-FINE_STEPS = 4000  # of a way, between which it is a line
+FINE_STEPS, FINE_STEPS_A_PLACE = 4000, 10  # of a way, between which it is a line
 START_SHARE, START_S = 0.2, 1.0  # of a film's time, and at most, to come up to speed, and as long to stop
+SLOW = 0.5  # of the median speed: where a route's own is below, the film's follows it down
 REACH_SIGMAS = 4.0  # of the Gaussian that smooths
 LEAST_LENGTH = 1e-6  # of a way: below, nothing moves
 
@@ -154,15 +155,19 @@ def cameras_along(route: Route, lenses: Lens | Sequence[Lens], up: Float64[np.nd
     return cameras
 
 
-def smoothed(route: Route, distance: float, width: float) -> Route:
-    """The broken line through a route, in many small steps, its corners rounded by a Gaussian.
+def smoothed(route: Route, distance: float, width: float) -> tuple[Route, Doubles]:
+    """The broken line through a route, in many small steps, its corners rounded.
 
-    The ends stay where they are.
+    By a Gaussian, applied once more to what it took away and added (Tukey's twicing): it rounds corners as well, and a
+    circle keeps its radius. The ends stay where they are.
 
     Args:
         route: At least two.
         distance: Of what is looked at, world units: see ``Route.steps``.
         width: The Gaussian's standard deviation, in lengths of the way.
+
+    Returns:
+        The way, and which of its steps each place of the route has become, counted with fractions.
 
     Raises:
         UsageError: if nothing moves.
@@ -170,20 +175,25 @@ def smoothed(route: Route, distance: float, width: float) -> Route:
     along = np.append(0.0, np.cumsum(route.steps(distance)))
     if not along[-1] > LEAST_LENGTH:
         raise UsageError("All photos were taken from one place: there is no path between them.")
-    fine = np.linspace(0.0, along[-1], FINE_STEPS + 1)
-    values = np.column_stack([np.interp(fine, along, column) for column in route.values().T])
-    reach = min(FINE_STEPS, math.ceil(REACH_SIGMAS * width / along[-1] * FINE_STEPS))
-    if reach == 0:
-        return route_of(values)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (reach / REACH_SIGMAS)) ** 2)
-    kernel /= kernel.sum()
+    count = max(FINE_STEPS, FINE_STEPS_A_PLACE * len(route))
+    values = np.column_stack([np.interp(np.linspace(0.0, along[-1], count + 1), along, v) for v in route.values().T])
+    own = along / along[-1] * count
+    half = min(count // 2, math.ceil(REACH_SIGMAS * width / along[-1] * count))
+    if half == 0:
+        return route_of(values), own
+    once = np.exp(-0.5 * (np.arange(-half, half + 1) / (half / REACH_SIGMAS)) ** 2)
+    once /= once.sum()
+    kernel = 2.0 * np.pad(once, half) - np.convolve(once, once)
+    reach = 2 * half
     before, after = 2.0 * values[0] - values[reach:0:-1], 2.0 * values[-1] - values[-2 : -reach - 2 : -1]
     padded = np.vstack((before, values, after))
-    return route_of(np.column_stack([np.convolve(column, kernel, mode="valid") for column in padded.T]))
+    return route_of(np.column_stack([np.convolve(column, kernel, mode="valid") for column in padded.T])), own
 
 
 def evenly_timed(route: Route, distance: float, frames: int, seconds: float) -> Doubles:
-    """Where on a fine route each frame of a film is: at an even speed, with a soft start and a soft stop.
+    """Where on a fine route each frame of a film is: at a nearly even speed, with a soft start and a soft stop.
+
+    Where the route slows down by itself, as a smoothed one does in sharp turns, the film slows down, too.
 
     Args:
         route: So fine that lines between its places do.
@@ -194,7 +204,8 @@ def evenly_timed(route: Route, distance: float, frames: int, seconds: float) -> 
     Returns:
         In places of the route from the first, for ``sampled``.
     """
-    along = np.append(0.0, np.cumsum(route.steps(distance)))
+    steps = route.steps(distance)
+    along = np.append(0.0, np.cumsum(np.hypot(steps, SLOW * np.median(steps))))
     start = min(START_S, START_SHARE * seconds) / seconds
     at = along[-1] * soft_progress(np.linspace(0.0, 1.0, frames), start)
     return np.asarray(np.interp(at, along, np.arange(len(route))))
@@ -254,16 +265,12 @@ def spline(
     )
 
 
-def through(route: Route, distance: float, steps: int = FINE_STEPS) -> tuple[Route, Doubles]:
-    """A fine way through every place and direction of a route.
+def centripetal_knots(route: Route, distance: float) -> Doubles:
+    """Knots for a spline through a route: roots of its lengths, rising.
 
     Args:
         route: At least two.
         distance: As for ``smoothed``.
-        steps: Of the fine way.
-
-    Returns:
-        The way, and how far along each of its places is, in places of the route from the first.
 
     Raises:
         UsageError: if nothing moves.
@@ -271,11 +278,11 @@ def through(route: Route, distance: float, steps: int = FINE_STEPS) -> tuple[Rou
     gaps = route.steps(distance)
     if not gaps.sum() > LEAST_LENGTH:
         raise UsageError("All places of the path are one: there is no path between them.")
-    knots = np.append(0.0, np.cumsum(np.sqrt(np.maximum(gaps, LEAST_LENGTH**2))))
-    at = np.linspace(0.0, knots[-1], steps + 1)
-    return route_of(spline(route.values(), knots, at)), np.interp(at, knots, np.arange(len(route)))
+    return np.append(0.0, np.cumsum(np.sqrt(np.maximum(gaps, LEAST_LENGTH**2))))
 
 
-def turned_least(route: Route) -> Route:
-    """The same directions, each heading less than half a turn from the one before."""
-    return replace(route, headings=np.unwrap(route.headings))
+def towards(places: Float64[np.ndarray, "n 3"], targets: Float64[np.ndarray, "n 3"]) -> Route:
+    """The route of a camera that looks at targets."""
+    ahead = targets - places
+    headings = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    return Route(places, headings, np.arctan2(ahead[:, 2], np.hypot(ahead[:, 0], ahead[:, 1])))

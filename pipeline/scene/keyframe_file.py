@@ -20,7 +20,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.scene.camera_path import Route, evenly_timed, route_of, sampled, spline, through, turned_least
+from splatpipe.pipeline.scene.camera_path import (
+    FINE_STEPS,
+    Route,
+    centripetal_knots,
+    evenly_timed,
+    route_of,
+    spline,
+    towards,
+)
 from splatpipe.pipeline.scene.survey_text import (
     LARGEST,
     UNKNOWN,
@@ -43,6 +51,7 @@ KIND = TableKind(
 MOST_KEYFRAMES = 10_000
 LONGEST_S = 3600.0
 WIDEST_DEG, NARROWEST_DEG = 150.0, 1.0
+STEEPEST_DEG, LEAST_TILT_DEG = 90.0, 89.999  # straight down there still is a heading
 FULL_TURNS_DEG = 36_000.0  # of a heading: no way turns more often
 SPELLINGS = {
     "x": ("x", "east", "e"),
@@ -66,16 +75,20 @@ class Keyframes:
 
     Attributes:
         route: In the world of `splat.ply`, x east.
+        targets: That are looked at; None where a keyframe has none.
         times_s: Rising from 0; None where the file has none.
         angles_deg: Seen along the picture's longer side; None where the file has none.
     """
 
     route: Route
+    targets: Float64[np.ndarray, "n 3"] | None
     times_s: Float64[np.ndarray, " n"] | None
     angles_deg: Float64[np.ndarray, " n"] | None
 
     def film(self, distance: float, fps: int, seconds: float) -> tuple[Route, Float64[np.ndarray, " frames"] | None]:
         """A smooth way through the keyframes: at their times, else at an even speed.
+
+        Where all have targets, what is looked at moves as smoothly; else the direction does.
 
         Args:
             distance: Of what is looked at, world units: see ``Route.steps``.
@@ -90,16 +103,23 @@ class Keyframes:
         """
         if len(self.route) < 2:
             raise UsageError("A film takes two keyframes at least.", hint="Take --stills for a single one.")
-        if self.times_s is None:
-            fine, place = through(self.route, distance)
-            at = evenly_timed(fine, distance, max(1, round(seconds * fps)), seconds)
-            return sampled(fine, at), self._angles(np.interp(at, np.arange(len(fine)), place))
-        moments = np.linspace(0.0, self.times_s[-1], max(2, round(float(self.times_s[-1]) * fps)))
-        route = route_of(spline(self.route.values(), self.times_s, moments))
-        return route, self._angles(np.interp(moments, self.times_s, np.arange(len(self.route))))
+        if self.times_s is not None:
+            moments = np.linspace(0.0, self.times_s[-1], max(2, round(float(self.times_s[-1]) * fps)))
+            return self._at(self.times_s, moments)
+        knots = centripetal_knots(self.route, distance)
+        fine = np.linspace(0.0, knots[-1], FINE_STEPS + 1)
+        way, _ = self._at(knots, fine)
+        at = evenly_timed(way, distance, max(1, round(seconds * fps)), seconds)
+        return self._at(knots, np.interp(at, np.arange(len(fine)), fine))
 
-    def _angles(self, at: Float64[np.ndarray, " frames"]) -> Float64[np.ndarray, " frames"] | None:
-        return None if self.angles_deg is None else np.interp(at, np.arange(len(self.angles_deg)), self.angles_deg)
+    def _at(
+        self, knots: Float64[np.ndarray, " n"], at: Float64[np.ndarray, " m"]
+    ) -> tuple[Route, Float64[np.ndarray, " m"] | None]:
+        angles = None if self.angles_deg is None else np.interp(at, knots, self.angles_deg)
+        if self.targets is None:
+            return route_of(spline(self.route.values(), knots, at)), angles
+        values = spline(np.hstack((self.route.places, self.targets)), knots, at)
+        return towards(values[:, :3], values[:, 3:]), angles
 
 
 def read_keyframes(path: Path) -> Keyframes:
@@ -171,8 +191,10 @@ def _keyframes(items: Sequence[tuple[int, Numbers]]) -> Keyframes:
     """Keyframes of numbers; in messages the first of each pair is its line, or its number in JSON."""
     if not 1 <= len(items) <= MOST_KEYFRAMES:
         raise LineError(0, f"it has {len(items):,} keyframes, and there are 1 to {MOST_KEYFRAMES:,} in a path")
-    poses = np.array([_pose(number, item) for number, item in items])
-    route = turned_least(Route(poses[:, :3], poses[:, 3], poses[:, 4]))
+    places = np.array([_place(number, item) for number, item in items])
+    targets = np.array([_target(number, item) for number, item in items])
+    ahead = np.array([_ahead(number, item) for number, item in items])
+    route = towards(places, places + ahead)
     times, angles = _all_or_none(items, "time"), _all_or_none(items, "fov")
     if times is not None:
         if not (np.diff(times) > 0.0).all() or times[0] < 0.0 or times[-1] > LONGEST_S:
@@ -180,25 +202,37 @@ def _keyframes(items: Sequence[tuple[int, Numbers]]) -> Keyframes:
         times = times - times[0]
     if angles is not None and not ((angles >= NARROWEST_DEG) & (angles <= WIDEST_DEG)).all():
         raise LineError(0, f"a fov is not between {NARROWEST_DEG:.0f} and {WIDEST_DEG:.0f} degrees")
-    return Keyframes(route, times, angles)
+    return Keyframes(route, None if np.isnan(targets).any() else targets, times, angles)
 
 
-def _pose(number: int, item: Numbers) -> list[float]:
-    """Place, heading and pitch, radians from east to north."""
+def _place(number: int, item: Numbers) -> list[float]:
     if not all(name in item for name in PLACE):
         raise LineError(number, "a keyframe has no position of three numbers")
-    place = np.array([item[name] for name in PLACE])
-    if all(name in item for name in TARGET):
-        ahead = np.array([item[name] for name in TARGET]) - place
-        flat = math.hypot(ahead[0], ahead[1])
-        if not np.linalg.norm(ahead) > 0.0:
+    return [item[name] for name in PLACE]
+
+
+def _target(number: int, item: Numbers) -> list[float]:
+    """NaN without one."""
+    found = [item.get(name, math.nan) for name in TARGET]
+    if 0 < sum(math.isnan(value) for value in found) < 3:
+        raise LineError(number, "a keyframe has a part of a target")
+    return found
+
+
+def _ahead(number: int, item: Numbers) -> list[float]:
+    """The way that a keyframe looks, of any length."""
+    if TARGET[0] in item:
+        ahead = [item[target] - item[place] for target, place in zip(TARGET, PLACE, strict=True)]
+        if not any(ahead):
             raise LineError(number, "a keyframe's target is its position")
-        return [*place, math.atan2(ahead[1], ahead[0]) if flat > 0.0 else 0.5 * math.pi, math.atan2(ahead[2], flat)]
+        return ahead
     if "heading" not in item or "pitch" not in item:
         raise LineError(number, "a keyframe has neither a target nor heading and pitch")
-    if not -90.0 <= item["pitch"] <= 90.0 or abs(item["heading"]) > FULL_TURNS_DEG:
+    heading, pitch = math.radians(item["heading"]), math.radians(item["pitch"])
+    if abs(item["pitch"]) > STEEPEST_DEG or abs(item["heading"]) > FULL_TURNS_DEG:
         raise LineError(number, "a pitch is not between -90 and 90 degrees, or a heading absurd")
-    return [*place, math.radians(90.0 - item["heading"]), math.radians(item["pitch"])]
+    flat = math.cos(min(abs(pitch), math.radians(LEAST_TILT_DEG)))
+    return [flat * math.sin(heading), flat * math.cos(heading), math.sin(pitch)]
 
 
 def _all_or_none(items: Sequence[tuple[int, Numbers]], key: str) -> Float64[np.ndarray, " n"] | None:

@@ -20,14 +20,16 @@ from splatpipe.pipeline.scene.clearance import Clearance
 from splatpipe.pipeline.scene.upright import rotation_to_up
 
 SPEED = 0.7  # comfortable, lengths of the way (see ``camera_path``) a second: around a building, 28° a second
-CORNER_S = 0.7  # standard deviation of the Gaussian that rounds corners, seconds at that speed
-CORNER_LEGS = 0.45  # the same in legs from photo to photo, where these are longer
-ALONE_LEGS, ALONE_LENGTH = 6.0, 0.5  # a stray's way to the nearest photo: in medians of that, and in lengths
+CORNER_S = 1.0  # standard deviation of the Gaussian that rounds corners, seconds at that speed
+CORNER_LEGS = 0.6  # the same in legs from photo to photo, where these are longer
+ALONE_LEGS, ALONE_LENGTH = 4.0, 0.5  # a stray's way to the nearest photo: in medians of that, and in lengths
 FEWEST_SEEN = 10  # sparse points; a photo that sees fewer hangs in the air
 ODD_DEPTH = 5.0  # times nearer or farther than the others': the ground at take-off, a test shot of the sky
-LONG_LEG = 8.0  # medians: no flight goes on there
+LONG_LEG = 5.0  # medians: no flight goes on there
 LONGEST_LEG = 2.0  # lengths; some 80° around a building
-DETOUR = 1.6  # names are the order unless they make the way so many times longer
+DETOUR_TIMES, DETOUR_LEGS = 3.0, 1.5  # a photo aside: there and back over straight on; each over the median leg
+FEWEST_LEGS = 4  # to know what is aside
+LONGER = 1.6  # names are the order unless they make the way so many times longer
 CLEAR = 0.5  # of the photos' own distance from what is solid, all the way
 CLEAR_STEPS = 4.0  # looked at so many times within that distance
 MOST_COMPARED = 3000  # photos, each with each: tables of 72 MB
@@ -80,22 +82,45 @@ def photo_film(capture: Capture, frames: int, seconds: float) -> Route:
     if len(kept) < 2:
         raise UsageError("Fewer than two photos see the same things: there is no path between them.")
     route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
-    order = _order(route, distance)
-    kept = kept[order]
-    cameras = [capture.cameras[int(index)] for index in kept]
-    legs = upright_route(cameras, capture.up).steps(distance)
-    stretch = _stretch(capture, kept, legs, SPEED * seconds)
-    cameras = cameras[stretch]
-    route, legs = upright_route(cameras, capture.up), legs[stretch.start : stretch.stop - 1]
-    width = max(CORNER_S * min(SPEED, float(legs.sum()) / seconds), CORNER_LEGS * float(np.median(legs)))
-    own = capture.clearance.at(np.array([camera.centre() for camera in cameras])).min()
+    kept = kept[_order(route, distance)]
+    kept = kept[_no_detours(upright_route([capture.cameras[int(index)] for index in kept], capture.up), distance)]
+    whole = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
+    legs = whole.steps(distance)
+    way, own = smoothed(whole, distance, CORNER_S * SPEED)  # photos taken to and fro come to no length
+    length = np.append(0.0, np.cumsum(way.steps(distance)))
+    lengths = np.diff(np.interp(own, np.arange(len(way)), length))
+    stretch = _stretch(capture, kept, legs, lengths, SPEED * seconds)
+    cameras = [capture.cameras[int(index)] for index in kept[stretch]]
+    chosen = slice(stretch.start, stretch.stop - 1)
+    detour = float(legs[chosen].sum()) / max(float(lengths[chosen].sum()), 1e-9)
+    speed = min(SPEED, float(lengths[chosen].sum()) / seconds)
+    width = max(detour * CORNER_S * speed, CORNER_LEGS * float(np.median(legs[chosen])))
+    way = _clear_way(capture, upright_route(cameras, capture.up), distance, width)
+    return sampled(way, evenly_timed(way, distance, frames, seconds))
+
+
+def _clear_way(capture: Capture, route: Route, distance: float, width: float) -> Route:
+    """A route smoothed as far as it stays away from what is solid."""
     upright = rotation_to_up(capture.up)
+    wanted = CLEAR * float(capture.clearance.at(route.places @ upright).min())
+    way, _ = smoothed(route, distance, width)
     for _ in range(SOFTER):
-        way = smoothed(route, distance, width)
-        if bool((capture.clearance.at(way.places @ upright) >= CLEAR * own).all()):
+        if bool((capture.clearance.at(way.places @ upright) >= wanted).all()):
             break
         width *= 0.5
-    return sampled(way, evenly_timed(way, distance, frames, seconds))
+        way, _ = smoothed(route, distance, width)
+    return way
+
+
+def _no_detours(route: Route, distance: float) -> Int64[np.ndarray, " k"]:
+    """All but single photos from which the way leads back at once: a close-up, a shot of something else."""
+    legs = route.steps(distance)
+    if len(legs) < FEWEST_LEGS:
+        return np.arange(len(route))
+    past = np.array([route[index : index + 3 : 2].steps(distance)[0] for index in range(len(legs) - 1)])
+    there, back = legs[:-1], legs[1:]
+    odd = (there + back > DETOUR_TIMES * past) & (np.minimum(there, back) > DETOUR_LEGS * float(np.median(legs)))
+    return np.flatnonzero(~np.concatenate(([False], odd, [False])))
 
 
 def followed_photos(capture: Capture) -> tuple[Int64[np.ndarray, " k"], float]:
@@ -143,7 +168,7 @@ def _order(route: Route, distance: float) -> Int64[np.ndarray, " n"]:
         legs = np.sort(table[order[:-1], order[1:]])
         return float(legs[: max(1, -(-9 * len(legs) // 10))].sum())
 
-    return other if typical(named) > DETOUR * typical(other) else named
+    return other if typical(named) > LONGER * typical(other) else named
 
 
 def _open(capture: Capture, photos: Int64[np.ndarray, " n"], legs: Float64[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
@@ -160,9 +185,20 @@ def _open(capture: Capture, photos: Int64[np.ndarray, " n"], legs: Float64[np.nd
 
 
 def _stretch(
-    capture: Capture, photos: Int64[np.ndarray, " n"], legs: Float64[np.ndarray, " m"], longest: float
+    capture: Capture,
+    photos: Int64[np.ndarray, " n"],
+    legs: Float64[np.ndarray, " m"],
+    lengths: Float64[np.ndarray, " m"],
+    longest: float,
 ) -> slice:
     """The photos, one after the other without a break, within a length, that see the most points.
+
+    Args:
+        capture: That they are of.
+        photos: In the order of the way.
+        legs: From each to the next.
+        lengths: The same of the smooth way.
+        longest: Of these together.
 
     Raises:
         UsageError: if no two are left.
@@ -177,14 +213,14 @@ def _stretch(
         rows = capture.seen[photos[end]]
         seen += int((counts[rows] == 0).sum())
         counts[rows] += 1
-        length += legs[end - 1]
+        length += lengths[end - 1]
         while start < end and (not is_open[end - 1] or length > longest):
             if start == end - 1 and is_open[end - 1]:
                 break  # a single leg may take longer than is comfortable
             rows = capture.seen[photos[start]]
             counts[rows] -= 1
             seen -= int((counts[rows] == 0).sum())
-            length -= legs[start]
+            length -= lengths[start]
             start += 1
         if end > start and seen > most:
             best, most = slice(start, end + 1), seen

@@ -20,7 +20,7 @@ from splatpipe.pipeline.scene.images import reduced_view
 from splatpipe.pipeline.scene.panorama import Panorama, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.pipeline.view.opened import Opened
-from splatpipe.stages.evaluate import as_trained, render_pixels
+from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.smoothing import smoothed
 
