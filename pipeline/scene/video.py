@@ -93,14 +93,14 @@ class VideoWriter:
         self._partial.replace(self._path)
 
     def _check(self) -> None:
-        """OpenCV does not tell of a full disk: read back what the file says of itself."""
+        """OpenCV does not tell of a full disk: play the film once, a thirtieth of the time it took to write."""
         film = cv2.VideoCapture(str(self._partial), cv2.CAP_FFMPEG)
-        width, height, frames = (
-            round(film.get(which))
-            for which in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
-        )
+        size = (round(film.get(cv2.CAP_PROP_FRAME_WIDTH)), round(film.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        frames = 0
+        while film.grab():
+            frames += 1
         film.release()
-        if (width, height, frames) != (*self._size, self._frames):
+        if (size, frames) != (self._size, self._frames):
             with suppress(OSError):
                 self._partial.unlink()
             raise MachineError(
