@@ -19,14 +19,17 @@ SCRIPT = """async ([bytes, type, times]) => {
   });
   video.src = URL.createObjectURL(new Blob([data], {type}));
   await loaded;
+  document.body.append(video);
   const canvas = document.createElement('canvas');
   [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
   const pen = canvas.getContext('2d', {willReadFrequently: true});
   const pictures = [];
   for (const time of times) {
     const there = new Promise(done => { video.onseeked = done; });
+    const shown = new Promise(done => video.requestVideoFrameCallback(done));
     video.currentTime = time;
     await there;
+    await Promise.race([shown, new Promise(done => setTimeout(done, 500))]);  // no callback where it was shown before
     pen.drawImage(video, 0, 0);
     const pixels = pen.getImageData(0, 0, canvas.width, canvas.height).data;
     let text = '';
