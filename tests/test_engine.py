@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,8 @@ import pytest
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.runner import Outcome, survey
+from splatpipe.pipeline.engine.lineage import delivered, lineage
+from splatpipe.pipeline.engine.runner import Line, Outcome, survey
 from splatpipe.pipeline.engine.session import Request, load_run, open_session, survey_line
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.engine.store import open_store
@@ -356,3 +358,30 @@ def test_a_photo_that_cannot_be_read_is_for_ingest_to_name(numbers: Path, out: P
     (numbers / "dangling.md").symlink_to(numbers / "nothing")
     (numbers / "pipe.md").symlink_to("/proc/self/mem")
     assert walk(request_of(numbers, out))[0].ran == ["read", "add", "count", "tell"]
+
+
+def test_a_run_walks_to_every_deliverable_and_no_further_than_asked(numbers: Path, out: Path) -> None:
+    """Two stages that nobody reads: both are wanted, since both leave something for people."""
+    side = replace(arithmetic.ADD, deliverables=("total",))
+    stages = (arithmetic.READ, arithmetic.COUNT, arithmetic.TELL, side)
+    request = replace(request_of(numbers, out), stages=(arithmetic.READ, side, *arithmetic.LINE[2:]))
+    assert walk(request)[0].ran == ["read", "add", "count", "tell"]
+    line = Line(stages, request.config, {}, numbers)
+    assert [stage.name for stage in line.needed("read")] == ["read"]
+    assert [stage.name for stage in line.needed()] == ["read", "count", "tell", "add"]
+
+
+def test_what_belongs_together_is_found_without_configuration_and_source(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    walk(request_of(numbers, out, add={"offset": 2}))
+    walk(request_of(numbers, out))  # reused: what OUT shows is not the newest
+    shutil.rmtree(numbers)
+    store = open_store(out, create=False)
+    made = delivered(store, arithmetic.TELL)
+    assert made is not None and (made.folder / "telling.txt").read_text() == (out / "telling.txt").read_text()
+    parts = lineage(store, made)
+    assert parts["add.total"].path.read_text() == "21" and {"read.numbers", "count.count"} <= parts.keys()
+    (out / "telling.txt").write_text("something else")
+    newest = delivered(store, arithmetic.TELL)
+    assert newest is not None and lineage(store, newest)["add.total"].path.read_text() == "23"
+    assert delivered(open_store(out, create=False), replace(arithmetic.TELL, name="none")) is None

@@ -24,7 +24,7 @@ from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.frames import Frame, Origin, Similarity, load_frame
 from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, panorama_of, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages.evaluate import as_trained, render_pixels
+from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.viewing import Look, upright, viewer_scene, write_viewer
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

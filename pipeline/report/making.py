@@ -15,14 +15,14 @@ WHAT = {
     "splat.ply": "the splat, for any viewer of Gaussian splats",
     "splat.spz": "the splat, compressed, for viewer.html",
     "viewer.html": "the splat to walk around and measure in, in any browser, offline",
-    "flythrough.mp4": "a film through the scene",
+    "flythrough.webm": "a film through the scene",
     "georef.json": "where the splat is: CRS, datum, matrices",
     "cameras.json": "the cameras in the splat's frame",
     "metrics.json": "every figure of this report, for programs",
     "sparse.glb": "sparse points and cameras, for any 3D viewer",
     "sky.ply": "the sky as a dome of Gaussians",
 }
-FIRST = ("viewer.html", "flythrough.mp4", "splat.ply")  # what people want to open, so linked at the top, too
+FIRST = ("viewer.html", "flythrough.webm", "splat.ply")  # what people want to open, so linked at the top, too
 FOLDERS = {
     "undistort.dataset": "undistorted photos and cameras, as other trainers take them",
     "evaluate.views": "held-out photos, renders and errors in full size",
