@@ -19,7 +19,7 @@ from splatpipe.pipeline.scene.dataset import View, load_views, split_views
 from splatpipe.pipeline.scene.images import Pixels, reduced_camera
 from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages.evaluate import Model, as_trained, render_pixels
+from splatpipe.stages.rendering import Model, as_trained, render_pixels
 
 STAGES = ("ingest", "georef", "undistort", "train")
 

@@ -1,7 +1,7 @@
 """Frames along a smooth path between a run's photos, to look at: ``path_frames.py OUT --frames 120 --save FOLDER``.
 
-Rendered as `evaluate` does it, at the size of training, with the first photo's intrinsics. Leaves PNG frames, a contact
-sheet, and:
+Rendered as `evaluate` does it, level, at the size of training, with the first photo's intrinsics. Leaves PNG frames,
+a contact sheet, and:
 
 - each frame's mean luminance and the step from the frame before, in 8-bit steps as all here;
 - the same places in consecutive frames, found through the median depths of both: the median difference of their colours
@@ -16,21 +16,32 @@ import argparse
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float64
 from opened_run import OpenedRun, open_run, write_png
-from smooth_path import nearest_first, path
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.camera import Camera
+from splatpipe.pipeline.scene.camera_path import (
+    FINE_STEPS,
+    Lens,
+    cameras_along,
+    centripetal_knots,
+    evenly_timed,
+    route_of,
+    spline,
+    upright_route,
+)
 from splatpipe.pipeline.scene.consistency import AGREEMENT
 from splatpipe.pipeline.scene.dataset import load_points_and_tracks
 from splatpipe.pipeline.scene.images import Pixels
+from splatpipe.pipeline.scene.photo_route import Capture, followed_photos
+from splatpipe.stages.filming import open_scene
 from splatpipe.stages.threads import same_bits
 
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, of coded values
@@ -40,6 +51,7 @@ IN_THE_AIR = 0.5  # of the nearest points' depth: the sparse cloud has holes, bu
 LARGEST_IN_THE_AIR = 0.01  # of a frame: more of it counts as a floater that crosses
 MUCH_NEARER = 0.7  # of the smaller median depth of the two photos around
 SHEET_COLUMNS, SHEET_FRAMES, SHEET_WIDTH = 6, 48, 300
+FPS = 25
 SHOWN = 8  # frames in the table; all are in the JSON
 
 COLUMNS = {
@@ -134,13 +146,46 @@ def _median(depth: Depth) -> float | None:
     return float(np.median(surface)) if surface.size else None
 
 
+def path(capture: Capture, cameras: Sequence[Camera], frames: int) -> list[tuple[float, Camera]]:
+    """Cameras along a smooth way through all of some, level, with the first one's intrinsics.
+
+    Args:
+        capture: That they are of.
+        cameras: In the order of the way, at least two, not all in one place.
+        frames: At least two.
+
+    Returns:
+        How far along each is, in cameras from the first, and the camera.
+    """
+    distance = followed_photos(capture)[1]
+    route = upright_route(cameras, capture.up)
+    knots = centripetal_knots(route, distance)
+    fine = np.linspace(0.0, knots[-1], FINE_STEPS + 1)
+    even = evenly_timed(route_of(spline(route.values(), knots, fine)), distance, frames, frames / FPS)
+    at = np.interp(even, np.arange(len(fine)), fine)
+    along = cameras_along(route_of(spline(route.values(), knots, at)), Lens(1, 1, 1.0), capture.up)
+    places = np.interp(at, knots, np.arange(len(cameras))).tolist()
+    found = [replace(cameras[0], cam_from_world=camera.cam_from_world) for camera in along]
+    return list(zip(places, found, strict=True))
+
+
+def nearest_first(cameras: Sequence[Camera]) -> list[Camera]:
+    """From the first on, always to the nearest that is left."""
+    ordered, left = [cameras[0]], list(cameras[1:])
+    while left:
+        here = ordered[-1].centre()
+        ordered.append(left.pop(int(np.argmin([np.linalg.norm(camera.centre() - here) for camera in left]))))
+    return ordered
+
+
 def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder: Path) -> list[Row]:
     """Render and write the frames and their contact sheet; a row a frame."""
+    capture = open_scene({name: part.path for name, part in run.parts.items()}, 1).capture
     surroundings = Surroundings(run, cameras)
     rows: list[Row] = []
     small: list[Pixels] = []
     before: Frame | None = None
-    for number, (place, camera) in enumerate(path(cameras, frames)):
+    for number, (place, camera) in enumerate(path(capture, cameras, frames)):
         frame = Frame(camera, run.picture(camera), run.median_depth(camera))
         index = min(int(place), len(cameras) - 2)
         names = " ".join(Path(photo.name).stem for photo in cameras[index : index + 2])

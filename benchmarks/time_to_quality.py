@@ -21,8 +21,9 @@ from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.images import load_colour, load_mask
 from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages.evaluate import as_trained, measure, render_pixels
+from splatpipe.stages.evaluate import measure
 from splatpipe.stages.options import LineConfig, TrainConfig
+from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
 from splatpipe.stages.train.depth import supervised

@@ -17,18 +17,25 @@ import typer
 from splatpipe.pipeline.cli_options import (
     ConfigOption,
     DeviceOption,
+    FpsOption,
     JsonOption,
     MaxMemoryOption,
     OutArgument,
+    PathOption,
     PhotosArgument,
     PresetOption,
     RerunFromOption,
     RerunOption,
+    SecondsOption,
     SeedOption,
     SetOption,
+    SizeOption,
+    StillsOption,
+    TargetOption,
     ThreadsOption,
     TimeBudgetOption,
     UntilOption,
+    WhatOption,
 )
 from splatpipe.pipeline.ending import Ending, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
@@ -231,6 +238,27 @@ def georef(
         with _Session(_request(photos, out, resolved, device, threads)) as runner:
             done.outcome = runner.outcome
             runner.walk()
+
+
+@app.command()
+def render(
+    out: OutArgument,
+    path: PathOption = "cameras",
+    what: WhatOption = "colour",
+    stills: StillsOption = False,
+    size: SizeOption = "",
+    seconds: SecondsOption = 10.0,
+    fps: FpsOption = 25,
+    target: TargetOption = None,
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a film or stills of a finished run, along its cameras, around it, or by a file of keyframes."""
+    with Ending(out, as_json) as done:
+        from splatpipe.pipeline.renders import Wanted, render_run
+
+        wanted = Wanted(path, what, stills, size, seconds, fps, target)
+        done.told = {"render": render_run(out, wanted, threads or available_cores())}
 
 
 @app.command()

@@ -36,3 +36,25 @@ MaxMemoryOption = Annotated[
 UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
 RerunOption = Annotated[list[str] | None, typer.Option(metavar="STAGE", help="Run this stage again. Repeatable.")]
 RerunFromOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage and all after it again.")]
+PathOption = Annotated[
+    str,
+    typer.Option(metavar="cameras|orbit|FILE", help="The way: through the cameras, around, or keyframes (JSON, CSV)."),
+]
+WhatOption = Annotated[str, typer.Option(metavar="colour|depth|normals", help="What is shown.")]
+StillsOption = Annotated[
+    bool, typer.Option("--stills", help="Pictures, not a film: every photo's view, 12 around, or every keyframe.")
+]
+SizeOption = Annotated[
+    str, typer.Option(metavar="WxH", help="In pixels; else 16:9, as many as photos had in training.")
+]
+SecondsOption = Annotated[float, typer.Option(min=0.1, max=600.0, help="Length of a film whose path has no times.")]
+FpsOption = Annotated[int, typer.Option(min=1, max=120, help="Frames a second.")]
+TargetOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        callback=lambda path: path and _expand(path),
+        help="A film (.webm, or .mp4, four times slower) or the stills' folder; else below OUT/renders.",
+    ),
+]

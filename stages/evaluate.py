@@ -12,28 +12,25 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.scene import metrics
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import load_views, split_views
-from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
-from splatpipe.pipeline.scene.panorama import Panorama, laid_over, read_panorama
+from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages.accuracy import measure_accuracy
 from splatpipe.stages.floaters import measure_floaters
 from splatpipe.stages.options import EvaluateConfig
+from splatpipe.stages.rendering import as_trained, render_depth, render_pixels
 from splatpipe.stages.threads import same_bits
 
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
 EQUAL_DB = 100.0  # stands for the infinite PSNR of pictures that are equal: JSON has no infinity
 MASKED_GREY = 128
-Model = tuple[Gaussians, Panorama | None]
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
@@ -75,46 +72,6 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     summary: dict[str, Any] = {"test_views": len(per_view)}
     summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
     return summary | {"free_space_opacity": floaters["free_space_opacity"]}
-
-
-def as_trained(plan: Path, gaussians: Gaussians) -> tuple[raster.RenderOptions, float | None]:
-    """How the model was trained to be rendered, and the megapixels that photos were reduced to, from `plan.json`.
-
-    Raises:
-        StageError: if the plan is not one.
-    """
-    try:
-        fields = json.loads(plan.read_text(encoding="utf-8"))
-        white = fields["options"]["background"] == "white"
-        options = raster.RenderOptions(
-            sh_degree=gaussians.sh_degree,
-            background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
-            antialias=bool(fields["options"]["antialias"]),
-            near=float(fields["near"]),
-            depth=False,
-        )
-        return options, None if fields["megapixels"] is None else float(fields["megapixels"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StageError("Training's plan.json cannot be read.", hint="Run again with --rerun-from train.") from error
-
-
-def render_pixels(model: Model, camera: Camera, options: raster.RenderOptions) -> Pixels:
-    """Render a camera's view, with the sky if there is one, to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
-    gaussians, sky = model
-    with torch.no_grad():
-        rendered = raster.render(gaussians, camera, options)
-        colour = rendered.colour
-        if sky is not None:
-            behind = sky.behind(camera, options.background)
-            colour = laid_over(colour, rendered.alpha, options.background, behind)
-        return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
-
-
-def render_depth(gaussians: Gaussians, camera: Camera, options: raster.RenderOptions) -> Float[np.ndarray, "h w"]:
-    """A camera's median depth, world units along the view axis; 0 where the model has none."""
-    with torch.no_grad():
-        rendered = raster.render(gaussians, camera, options.for_depths())
-    return np.asarray(rendered.median_depth.cpu().numpy())
 
 
 def evaluate_view(view: tuple[Camera, Pixels, Mask | None], render: Pixels, stem: Path) -> dict[str, Any]:

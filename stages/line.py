@@ -7,6 +7,7 @@ from splatpipe.stages.options import (
     EvaluateConfig,
     ExportConfig,
     FeaturesConfig,
+    FlythroughConfig,
     GeorefConfig,
     IngestConfig,
     InitializeConfig,
@@ -138,4 +139,15 @@ EXPORT = Stage(
     deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky", "viewer"),
 )
 
-LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT)
+FLYTHROUGH = Stage(
+    "flythrough",
+    version=1,
+    config=FlythroughConfig,
+    reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
+    parts={"film": "film"},
+    entry="splatpipe.stages.flythrough:run",
+    borrows=("train.time_budget_s",),
+    deliverables=("film",),
+)
+
+LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT, FLYTHROUGH)

@@ -16,6 +16,7 @@ NonNegativeFloat = Annotated[float, Field(ge=0.0)]
 Length = Literal["auto"] | PositiveInt
 LONGEST_BUDGET_S = 30 * 86_400.0
 LARGEST_MEMORY = 1 << 50
+FILM_FROM_BUDGET_S = 600.0  # a shorter time budget has no time for a film
 LengthOrZero = Literal["auto"] | NonNegativeInt
 
 
@@ -264,10 +265,33 @@ class EvaluateConfig(StageConfig):
 class ExportConfig(StageConfig):
     sky: bool = False
     """Hand over the sky of `train.sky`, too: `sky.ply`, a dome of Gaussians around the splat, in its frame."""
-    title: str = Field("3D model", max_length=200)
+    title: Annotated[str, Field(max_length=200)] = "3D model"
     """What `viewer.html` is called, e.g. the building and the date."""
-    viewer_megabytes: float = Field(60.0, ge=0.0)
-    """A `viewer.html` that would be larger reads `splat.spz` beside it, for which it takes `splatpipe view`; 0: no viewer."""
+    viewer_megabytes: NonNegativeFloat = 60.0
+    """A `viewer.html` that would be larger reads `splat.spz` beside it, which takes `splatpipe view`; 0 for none."""
+
+
+class FlythroughConfig(StageConfig):
+    seconds: Annotated[float, Field(ge=0.0, le=600.0)] = 10.0
+    """Length of `flythrough.webm`, a film along a smooth way through the cameras; 0: none. A time budget keeps time for
+    10 seconds, from ten minutes on."""
+    fps: Annotated[int, Field(ge=1, le=120)] = 25
+    """Frames a second."""
+    size: Annotated[str, Field(pattern=r"^(auto|[0-9]{2,4}x[0-9]{2,4})$")] = "auto"
+    """Width and height in pixels, even, such as 1280x720. Auto: 16:9, as many pixels as the photos have in training."""
+
+    @field_validator("size")
+    @classmethod
+    def _even(cls, text: str) -> str:
+        if text != "auto" and any(int(side) % 2 or not 16 <= int(side) <= 8192 for side in text.split("x")):
+            raise ValueError("a film's width and height are even, from 16 to 8192")
+        return text
+
+    @property
+    def film_size(self) -> tuple[int, int] | None:
+        """``size`` as numbers; None for auto."""
+        width, _, height = self.size.partition("x")
+        return (int(width), int(height)) if height else None
 
 
 class LineConfig(StageConfig):
@@ -283,3 +307,4 @@ class LineConfig(StageConfig):
     train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     export: ExportConfig = ExportConfig()
+    flythrough: FlythroughConfig = FlythroughConfig()

@@ -17,6 +17,7 @@ DEMO = (
     "features.max_image_size=1400",
     "undistort.max_megapixels=0.1",
     "train.iterations=600",
+    "flythrough.seconds=4.0",
     "evaluate.every=4",
 )
 

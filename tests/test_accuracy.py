@@ -86,7 +86,7 @@ def rewrite(path: Path, value: dict[str, Any]) -> None:
 
 def measured(parts: dict[str, Path], held_out: tuple[str, ...] = (), gaussians: Gaussians | None = None) -> Any:
     options = raster.RenderOptions(sh_degree=0)
-    depth_of = partial(evaluate.render_depth, gaussians or wall(), options=options)
+    depth_of = partial(rendering.render_depth, gaussians or wall(), options=options)
     return measure_accuracy(parts, cameras(), held_out, depth_of)
 
 

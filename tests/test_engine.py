@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,8 @@ import pytest
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.runner import Outcome, survey
+from splatpipe.pipeline.engine.lineage import delivered, lineage
+from splatpipe.pipeline.engine.runner import Line, Outcome, survey
 from splatpipe.pipeline.engine.session import Request, load_run, open_session, survey_line
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.engine.store import open_store
@@ -306,6 +308,27 @@ def test_events_are_logged_as_json_lines(numbers: Path, out: Path) -> None:
     assert kinds.count("stage_started") == kinds.count("stage_finished") == 4
 
 
+def test_how_a_run_and_its_stages_ended_is_in_the_events(numbers: Path, out: Path) -> None:
+    """A good end, a bad one, a death: with exit code, memory, time and the artifact's key."""
+
+    def last(kind: str) -> dict[str, object]:
+        events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+        return next(event["data"] for event in reversed(events) if event["kind"] == kind)  # type: ignore[no-any-return]
+
+    first, _ = walk(request_of(numbers, out))
+    assert last("run_finished")["exit_code"] == 0 and last("run_started")["versions"]
+    finished = last("stage_finished")
+    assert finished["key"] == first.artifacts["tell"].key
+    assert finished["peak_memory_bytes"] == first.artifacts["tell"].manifest["peak_memory_bytes"]
+    for fail, memory_is_known in (("raise", True), ("kill", False)):
+        with pytest.raises(StageError) as caught:
+            walk(request_of(numbers, out, count={"fail": fail}))
+        ended, failed = last("run_finished"), last("stage_failed")
+        assert (ended["exit_code"], ended["message"]) == (3, caught.value.message)
+        assert failed["message"] == caught.value.message and failed["seconds"] >= 0.0  # type: ignore[operator]
+        assert (failed["peak_memory_bytes"] is not None) is memory_is_known
+
+
 def test_hostile_names_do_not_disturb(numbers: Path, out: Path) -> None:
     for name in ("näme mit leer", "写真", "new\nline", "quote'\"`$(x)"):
         (numbers / f"{name}.txt").write_text("1")
@@ -335,3 +358,30 @@ def test_a_photo_that_cannot_be_read_is_for_ingest_to_name(numbers: Path, out: P
     (numbers / "dangling.md").symlink_to(numbers / "nothing")
     (numbers / "pipe.md").symlink_to("/proc/self/mem")
     assert walk(request_of(numbers, out))[0].ran == ["read", "add", "count", "tell"]
+
+
+def test_a_run_walks_to_every_deliverable_and_no_further_than_asked(numbers: Path, out: Path) -> None:
+    """Two stages that nobody reads: both are wanted, since both leave something for people."""
+    side = replace(arithmetic.ADD, deliverables=("total",))
+    stages = (arithmetic.READ, arithmetic.COUNT, arithmetic.TELL, side)
+    request = replace(request_of(numbers, out), stages=(arithmetic.READ, side, *arithmetic.LINE[2:]))
+    assert walk(request)[0].ran == ["read", "add", "count", "tell"]
+    line = Line(stages, request.config, {}, numbers)
+    assert [stage.name for stage in line.needed("read")] == ["read"]
+    assert [stage.name for stage in line.needed()] == ["read", "count", "tell", "add"]
+
+
+def test_what_belongs_together_is_found_without_configuration_and_source(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    walk(request_of(numbers, out, add={"offset": 2}))
+    walk(request_of(numbers, out))  # reused: what OUT shows is not the newest
+    shutil.rmtree(numbers)
+    store = open_store(out, create=False)
+    made = delivered(store, arithmetic.TELL)
+    assert made is not None and (made.folder / "telling.txt").read_text() == (out / "telling.txt").read_text()
+    parts = lineage(store, made)
+    assert parts["add.total"].path.read_text() == "21" and {"read.numbers", "count.count"} <= parts.keys()
+    (out / "telling.txt").write_text("something else")
+    newest = delivered(store, arithmetic.TELL)
+    assert newest is not None and lineage(store, newest)["add.total"].path.read_text() == "23"
+    assert delivered(open_store(out, create=False), replace(arithmetic.TELL, name="none")) is None

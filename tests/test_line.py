@@ -25,6 +25,7 @@ QUICK = (
     "undistort.max_megapixels=0.03",
     "train.iterations=60",
     "evaluate.every=4",
+    "flythrough.seconds=0.2",
 )
 STAGES = [stage.name for stage in LINE]
 KILLED_RUN = Path(__file__).with_name("killed_run.py")
@@ -113,8 +114,10 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "cameras.json",
         "metrics.json",
         "sparse.glb",
+        "viewer.html",
         "config.toml",
         "events.jsonl",
+        "report.html",
         "stages",
     ):
         assert (undisturbed / name).exists(), name
@@ -154,13 +157,13 @@ def test_a_second_run_does_nothing(photos: Path, copy_of_run: Path) -> None:
 
 def test_changed_option_reruns_only_downstream(photos: Path, copy_of_run: Path) -> None:
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK, "train.iterations=40"))
-    assert ran(told) == ["train", "evaluate", "export"]
+    assert ran(told) == ["train", "evaluate", "export", "flythrough"]
 
 
 def test_a_budget_is_planned_shown_and_reused(photos: Path, copy_of_run: Path) -> None:
     budgets = ("--time-budget", "8s", "--max-memory", "4G")
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK), *budgets)
-    assert ran(told) == ["train", "evaluate", "export"]
+    assert ran(told) == ["train", "evaluate", "export", "flythrough"]
     events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text().splitlines()]
     notes = [event["data"]["message"] for event in events if event["kind"] == "note"]
     assert any(note.startswith("plan: ") and "8 s budget, within 4.0 GB" in note for note in notes), notes
@@ -197,7 +200,7 @@ def test_kill_9_in_every_stage_loses_nothing(photos: Path, undisturbed: Path, tm
             assert died.returncode == -signal.SIGKILL, f"{stage} was not hit: {died.stderr.decode()[-2000:]}"
             assert not list((out / "stages").glob(f"{stage}-*")), f"{stage} was left in spite of the kill"
     told = splatpipe("run", photos, out, *sets(*QUICK))
-    assert ran(told) == ["export"]
+    assert ran(told) == [STAGES[-1]]
     assert sha256(out / "splat.ply") == sha256(undisturbed / "splat.ply")
 
 

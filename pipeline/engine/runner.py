@@ -44,10 +44,10 @@ class Line:
     photos_dir: Path
 
     def needed(self, until: str | None = None) -> list[Stage]:
-        """The stages to walk: those that lead to the last one (or ``until``) from what the source does not give."""
+        """The stages to walk from what the source does not give: those that lead to ``until``, else to deliverables."""
         names = [stage.name for stage in self.stages]
         last = names.index(until) if until else len(names) - 1
-        wanted = {names[last]}
+        wanted = {names[last]} if until else {names[last], *(stage.name for stage in self.stages if stage.deliverables)}
         for stage in reversed(self.stages[: last + 1]):
             if stage.name in wanted:
                 wanted |= {part.split(".")[0] for part in stage.reads if part not in self.source}

@@ -217,11 +217,11 @@ class Store:
             _copy_if_changed(file, self.out / name)
         for earlier in self.artifacts(stage.name):
             for name, file in earlier.deliverables(stage).items():
-                if name not in wanted and _is_copy(file, self.out / name):
+                if name not in wanted and is_copy(file, self.out / name):
                     (self.out / name).unlink()
 
 
-def _is_copy(source: Path, target: Path) -> bool:
+def is_copy(source: Path, target: Path) -> bool:
     """Whether ``_copy_if_changed`` made it, and nobody has changed it since."""
     before = source.stat()
     return target.is_file() and (target.stat().st_size, target.stat().st_mtime_ns) == (
@@ -231,7 +231,7 @@ def _is_copy(source: Path, target: Path) -> bool:
 
 
 def _copy_if_changed(source: Path, target: Path) -> None:
-    if _is_copy(source, target):
+    if is_copy(source, target):
         return
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.new")

@@ -22,8 +22,8 @@ from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.pipeline.scene.spz import SPZ_FROM_Z_UP, spz_bytes
 from splatpipe.pipeline.view.opened import Opened
 from splatpipe.pipeline.web.viewer import viewer_page
-from splatpipe.stages.evaluate import as_trained, render_pixels
 from splatpipe.stages.export import in_world
+from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.smoothing import smoothed
 from splatpipe.stages.viewing import SPLAT, look_of, viewer_scene

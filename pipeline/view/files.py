@@ -23,6 +23,7 @@ TYPES = {
     ".spz": "application/octet-stream",
     ".glb": "model/gltf-binary",
     ".mp4": "video/mp4",
+    ".webm": "video/webm",
     ".png": "image/png",
     ".jpg": "image/jpeg",
 }

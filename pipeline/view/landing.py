@@ -26,9 +26,9 @@ WHAT = {
     "cameras.json": "the cameras, in the same frame",
     "metrics.json": "every figure of quality",
     "sparse.glb": "sparse points and camera frusta",
-    "flythrough.mp4": "a flight through the scene",
+    "flythrough.webm": "a flight through the scene",
 }
-SHOWN_IN_BROWSER = (".html", ".json", ".mp4", ".png", ".jpg")
+SHOWN_IN_BROWSER = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
 
 
 def landing(run: Run, marking: bool) -> dict[str, Any]:
@@ -77,8 +77,8 @@ def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> 
         ways.append((f"/{VIEWER}", "3D viewer", "Fly around, measure, read coordinates"))
     if REPORT in names:
         ways.append((f"/{REPORT}", "Report", "What was captured, what was done, how good it is"))
-    if "flythrough.mp4" in names:
-        ways.append(("/flythrough.mp4", "Film", "A flight through the scene"))
+    if "flythrough.webm" in names:
+        ways.append(("/flythrough.webm", "Film", "A flight through the scene"))
     if not at_work and has_log:
         ways.append(("/live", "Training", "Its curves, and its renders beside the photos"))
     return [{"href": href, "title": title, "text": text, "first": k == 0} for k, (href, title, text) in enumerate(ways)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.options import TrainConfig
+from splatpipe.stages.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.stages.train.budget import (
     FEWEST_GAUSSIANS,
     FIRST_GROWTH,
@@ -27,7 +27,8 @@ MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
 MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
 PILOT_GROWTH_A_SECOND = 150.0  # Gaussians that a second of budget pays for, about: where the forecast has to be right
 LEAST_SHARE = 0.1  # of the budget for the training, even where nothing is left: the tolerance of the whole
-EXPORT_SECONDS = 1.5  # the last stages whatever the size: digests, the report, the end of the process
+FILM_VIEWS = 40  # held-out views that take as long to measure as a film of ten seconds takes to make
+EXPORT_SECONDS = 5.5  # the last stages whatever the size: digests, the report with its pictures, the end of the process
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,10 @@ def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
     options = scene.config.model_copy(update={"max_gaussians": plan.options.max_gaussians})
     least = LEAST_SHARE * options.time_budget_s
 
+    views = scene.held_out + (FILM_VIEWS if options.time_budget_s >= FILM_FROM_BUDGET_S else 0)
+
     def seconds(megapixels: float) -> float:
-        after = EXPORT_SECONDS + scene.held_out * measured.evaluate_s * megapixels
+        after = EXPORT_SECONDS + views * measured.evaluate_s * megapixels
         return max(least, left - after)
 
     return Task(

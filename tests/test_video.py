@@ -1,0 +1,125 @@
+"""Films: played by a browser's own decoder, whole or not there, the same bytes each time."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.scene.video import VideoWriter
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from decoded import decoded, psnr
+
+WIDTH, HEIGHT = 322, 182  # even, and nothing that codecs like better
+
+
+def frames(count: int, width: int = WIDTH, height: int = HEIGHT) -> Iterator[np.ndarray]:
+    """A coloured texture that slides by; red, green and blue are told apart."""
+    noise = np.random.default_rng(0).integers(0, 255, (height + count, width + 2 * count, 3), dtype=np.uint8)
+    texture = cv2.GaussianBlur(noise, (0, 0), 4.0).astype(np.float32)
+    texture = (texture - texture.mean()) * 3.0 + np.array([190.0, 120.0, 60.0], np.float32)
+    texture = np.clip(texture, 0, 255).astype(np.uint8)
+    for k in range(count):
+        yield np.ascontiguousarray(texture[k : k + height, 2 * k : 2 * k + width])
+
+
+def write(path: Path, count: int = 20, fps: int = 25, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    with VideoWriter(path, size, fps) as film:
+        for frame in frames(count, *size):
+            film.write(frame)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+def test_a_browser_plays_a_film_of_the_wanted_length_size_and_pictures(
+    suffix: str, tmp_path: Path, browser: Browser
+) -> None:
+    film = write(tmp_path / f"a film{suffix}", 20, 10)
+    told, pictures = decoded(browser, film, [0.05, 0.95, 1.95])
+    assert (told["width"], told["height"]) == (WIDTH, HEIGHT)
+    assert told["duration"] == pytest.approx(2.0, abs=0.01)
+    truth = list(frames(20))
+    for picture, number in zip(pictures, (0, 9, 19), strict=True):
+        assert psnr(picture, truth[number]) > 30.0
+        assert psnr(picture, truth[number - 1]) < psnr(picture, truth[number]) - 3.0
+
+
+@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+def test_the_same_frames_leave_the_same_bytes(suffix: str, tmp_path: Path) -> None:
+    one, other = (write(tmp_path / f"{name}{suffix}", 12) for name in ("one", "other"))
+    assert hashlib.sha256(one.read_bytes()).digest() == hashlib.sha256(other.read_bytes()).digest()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([one.name, other.name])
+
+
+@pytest.mark.parametrize(("fps", "count"), [(1, 1), (7, 15), (24, 49), (30, 31), (120, 121)])
+def test_any_speed_and_number_of_frames_is_whole(fps: int, count: int, tmp_path: Path) -> None:
+    film = write(tmp_path / "film.webm", count, fps, (64, 48))
+    reader = cv2.VideoCapture(str(film), cv2.CAP_FFMPEG)
+    read = 0
+    while reader.read()[0]:
+        read += 1
+    assert read == count
+
+
+def test_a_broken_off_film_leaves_nothing_and_spares_the_earlier_one(tmp_path: Path) -> None:
+    path = tmp_path / "film.webm"
+    path.write_bytes(b"earlier")
+
+    def break_off() -> None:
+        with VideoWriter(path, (WIDTH, HEIGHT), 25) as film:
+            film.write(next(frames(1)))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        break_off()
+    assert [found.name for found in tmp_path.iterdir()] == ["film.webm"] and path.read_bytes() == b"earlier"
+
+
+def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    with pytest.raises(MachineError, match="Cannot write"):
+        VideoWriter(tmp_path / "none" / "film.webm", (WIDTH, HEIGHT), 25)
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path) -> None:
+    """A limit on file sizes stands for the full disk: OpenCV tells of neither."""
+    code = f"""
+import resource, signal, sys
+from pathlib import Path
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import test_video
+from splatpipe.pipeline.engine.errors import MachineError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    test_video.write(Path({str(tmp_path)!r}) / "film.webm", 40)
+except MachineError as error:
+    print(error.message, error.hint)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "could not be written whole" in done.stdout and "disk" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sides_are_even_and_suffixes_known(tmp_path: Path) -> None:
+    for name, size in (("film.webm", (321, 182)), ("film.webm", (322, 181)), ("film.avi", (322, 182))):
+        with pytest.raises(ValueError):
+            VideoWriter(tmp_path / name, size, 25)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_said_on_stderr(tmp_path: Path) -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_video; from pathlib import Path\n"
+        f"test_video.write(Path({str(tmp_path)!r}) / 'film.webm', 3); print('still heard', file=sys.stderr)"
+    )
+    env = {**os.environ, "PYTHONWARNINGS": "ignore"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env)
+    assert done.stderr.split() == ["still", "heard"]
