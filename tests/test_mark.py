@@ -360,6 +360,11 @@ def test_three_points_make_a_frame_where_photos_have_no_positions(gps_run: Path,
     marking = Marking(replace(job, frame=None, positions=Positions({}, {}), text=text))
     assert not marking.overview()["placed"]
     assert all(row["predicted"] is None for row in marking.detail("P07")["photos"])
+    first = next(iter(TRUTH["P01"]["seen_px"].items()))
+    marking.change("P01", first[0], tuple(first[1]))
+    rows = {row["name"]: row for row in marking.detail("P01")["photos"]}
+    for photo, pixel in list(TRUTH["P01"]["seen_px"].items())[1:]:  # the ray of the only mark runs through the point
+        assert beside(rows[photo]["line"], pixel) < 2.0
     for name in ("P01", "P04", "P05", "P16"):
         for photo, (x, y) in list(TRUTH[name]["seen_px"].items())[:4]:
             marking.change(name, photo, (x, y))
@@ -370,12 +375,19 @@ def test_three_points_make_a_frame_where_photos_have_no_positions(gps_run: Path,
         assert rows[photo]["predicted"] == pytest.approx(pixel, abs=8.0)
     photo, (x, y) = list(TRUTH["P01"]["seen_px"].items())[4]
     marking.change("P01", photo, (x + 60.0, y))
-    assert marking.overview()["points"][0]["wrong"] == 1
+    assert [point["name"] for point in marking.overview()["points"] if point["wrong"]] == ["P01"]
     row = next(row for row in marking.detail("P01")["photos"] if row["name"] == photo)
     assert not row["agrees"] and row["residual_px"] == pytest.approx([-60.0, 0.0], abs=2.0)
     for wrong in (("P0", photo, None), ("P01", "none.jpg", None), ("P01", photo, (-1.0, 0.0))):
         with pytest.raises(WrongRequestError):
             marking.change(*wrong)
+
+
+def beside(line: list[list[float]], pixel: list[float]) -> float:
+    """Distance of a pixel from a line of straight pieces."""
+    a, b = np.array(line[:-1]), np.array(line[1:])
+    along = np.clip(((np.array(pixel) - a) * (b - a)).sum(1) / np.maximum(((b - a) ** 2).sum(1), 1e-9), 0.0, 1.0)
+    return float(np.linalg.norm(a + along[:, None] * (b - a) - pixel, axis=1).min())
 
 
 def test_a_turned_photo_is_shown_as_it_is_stored(tmp_path: Path, open_page: Callable) -> None:

@@ -117,7 +117,10 @@ def load(source: Source, opened: Opened) -> Shown:
 def views_of(opened: Opened) -> tuple[View, ...]:
     """The photos that are trained on and measured with; none before they are undistorted."""
     part = opened.parts.get("undistort.dataset")
-    return () if part is None else tuple(load_views(part.path))
+    if part is None:
+        return ()
+    folder = part.path.resolve()  # an OUT from elsewhere may name pictures that lie elsewhere
+    return tuple(view for view in load_views(part.path) if view.image_path.resolve().is_relative_to(folder))
 
 
 def held_out_of(source: Source | None) -> Sequence[str]:

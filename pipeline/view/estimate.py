@@ -38,6 +38,10 @@ LEAST_RADIUS_PX = 6.0
 SURFACE_RADIUS_M = 8.0  # around a point, of whose sparse points the height is taken
 LEAST_NEAR = 3  # sparse points that tell a height
 RAY_TOLERANCE = 1e-3  # of x/z; beyond it a lens model has folded back what it does not show
+BEYOND = np.array(
+    [0.5, 2.0]
+)  # of a photo's sparse points' depths, nearest and farthest: how far a mark's ray is followed
+LINE_STEPS = 48  # along it: a bent lens bends the line
 NEIGHBOURS = 30  # sparse points around a place: a photo that shows none of them most likely has something before it
 MOST_WITNESSES = 50_000  # sparse points among which they are looked for
 HELPFUL_MARKS = 4  # of a point: from there on more tell little
@@ -286,6 +290,18 @@ class Projector:
             beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)
             doubtful[rows, index] = beyond | ~witnessed[rows, index]
         return Projection(pixels, radius, depth, doubtful)
+
+    def line(self, sighting: Sighting) -> Float64[np.ndarray, "steps m 2"]:
+        """Where photos may show what one photo shows at a mark: along its ray, NaN where they do not."""
+        assert sighting.index is not None
+        view = self._job.model.view(sighting.index, self._job.photos[sighting.photo].width)
+        pose = view.cam_from_model
+        depths = self._cloud[self._shows[:, sighting.index]] @ pose[2, :3] + pose[2, 3]
+        reach = np.percentile(depths, [5.0, 95.0]) * BEYOND if len(depths) else np.array([0.1, 10.0])
+        ray = np.append(view.ray(np.array(sighting.pixel)), 1.0)
+        near, far = np.maximum(reach, 1e-9).tolist()
+        places = (np.geomspace(near, far, LINE_STEPS)[:, None] * ray - pose[:, 3]) @ pose[:, :3]
+        return self.project(places, np.zeros(LINE_STEPS)).pixels
 
     def _witnessed(self, places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n m"]:
         """Which photos show a sparse point close to each place: what hides that is no hindrance, then."""

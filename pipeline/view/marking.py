@@ -195,6 +195,7 @@ class Marking:
         number = list(self._points).index(name)
         shown = {s.photo: s for s in estimate.survey.points[number].sightings}
         index = {photo: k for k, photo in enumerate(self.job.model.names)}
+        lines = self._lines(estimate, number)
         rows = []
         for photo in self._photos:
             row = self._seen(photo, index.get(photo), number, projection)
@@ -205,6 +206,7 @@ class Marking:
                 "hidden": (name, photo) in hidden,
                 "agrees": sighting.agrees if sighting is not None else True,
                 "residual_px": off,
+                "line": None if lines is None or photo not in index else _listed(lines[:, index[photo]]),
             }
             rows.append(row)
         rows.sort(key=lambda row: (row["predicted"] is None, row["doubtful"], row["rank"]))
@@ -215,6 +217,11 @@ class Marking:
             order = helpful_order(estimate.places[number], centres, ranks)
             rows[: len(sure)] = [sure[k] for k in order]
         return {"revision": revision, "name": name, "by_marks": bool(estimate.by_marks[number]), "photos": rows}
+
+    def _lines(self, estimate: Estimate, number: int) -> Float64[np.ndarray, "steps m 2"] | None:
+        """Of a point that is marked in one photo: where the others may show it; None of any other."""
+        posed = [seen for seen in estimate.survey.points[number].sightings if seen.index is not None]
+        return self._projector.line(posed[0]) if len(posed) == 1 else None
 
     def _shifted(self, pixel: tuple[float, float]) -> tuple[float, float]:
         shift = self.job.pixel_shift
@@ -297,6 +304,12 @@ def helpful_order(
         score[chosen] = -1.0
         chosen.append(int(np.argmax(score)))
     return [*chosen, *(k for k in range(len(ranks)) if k not in chosen)]
+
+
+def _listed(line: Float64[np.ndarray, "steps 2"]) -> list[list[float]] | None:
+    """The part of a line that a photo shows."""
+    shown = line[np.isfinite(line).all(axis=1)]
+    return np.round(shown, 1).tolist() if len(shown) > 1 else None
 
 
 def _coordinates(point: SurveyedPoint) -> list[float | None]:

@@ -7,6 +7,7 @@ const ARM = 16;
 export function paintOver(context, picture, row, moved) {
   if (picture.pointer) lines(context, picture);
   if (!row) return;
+  if (row.line && !row.mark) path(context, picture, row.line);
   if (row.predicted && !row.mark) circle(context, picture, row.predicted, row.radius_px);
   if (row.predicted && row.mark) dot(context, picture.screenAt(row.predicted));
   if (moved && !row.mark) cross(context, picture.screenAt(moved), INK.moved);
@@ -59,6 +60,14 @@ function circle(context, picture, place, radius) {
   context.save();
   context.setLineDash([6, 5]);
   stroke(context, INK.expected, () => context.arc(x, y, Math.max(ARM + 4, radius * picture.zoom), 0, 2 * Math.PI));
+  context.restore();
+}
+
+// Where the ray of the point's only mark runs through this photo: the point lies on it.
+function path(context, picture, line) {
+  context.save();
+  context.globalAlpha = 0.8;
+  stroke(context, INK.moved, () => line.forEach((place) => context.lineTo(...picture.screenAt(place))));
   context.restore();
 }
 
