@@ -329,6 +329,7 @@ window.splatpipe = {
     state: () => ({ point: pointName(), photo: state.told.photos[state.photo].name, told: state.told, detail: state.detail, waiting: outbox.count }),
     goTo: (point, photo) => choosePoint(...numbers({ point, photo })),
     screenAt: (at) => {
+      picture.resize(); // the layout may have changed since the last frame
       const box = $("canvas").getBoundingClientRect();
       const [x, y] = picture.screenAt(at);
       return [x + box.left, y + box.top];
