@@ -116,6 +116,7 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "viewer.html",
         "config.toml",
         "events.jsonl",
+        "report.html",
         "stages",
     ):
         assert (undisturbed / name).exists(), name

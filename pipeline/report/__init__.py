@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 
 REPORT_FILE = "report.html"
 PATIENCE_S = 600.0  # far more than hundreds of photos take
-LEAST_S = 1.0  # of a run that is to end: enough for the report without pictures
+LEAST_S = 2.0  # of a run that is to end: enough for the report without pictures, also on a busy machine
 
 
 def write_report(out: Path, *, drawn: bool = True) -> Path:
