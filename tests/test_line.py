@@ -113,6 +113,7 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "cameras.json",
         "metrics.json",
         "sparse.glb",
+        "viewer.html",
         "config.toml",
         "events.jsonl",
         "report.html",
