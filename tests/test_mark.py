@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,15 @@ from playwright.sync_api import Page
 
 from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.demo.truth import true_poses
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.control_edit import ControlText
 from splatpipe.pipeline.scene.control_file import read_control_file
+from splatpipe.pipeline.scene.names import NameFinder
+from splatpipe.pipeline.view.job import open_job
+from splatpipe.pipeline.view.marking import Marking, WrongRequestError
+from splatpipe.pipeline.view.opened import open_run
 from splatpipe.pipeline.view.photo import without_metadata
+from splatpipe.stages.georef.level import Positions
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from served import Served, linked_copy, serving
@@ -46,7 +54,7 @@ def by_gps_alone(demo_run: Path, home: Path) -> Path:
     config = re.sub(r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text())
     (out / "config.toml").unlink()
     (out / "config.toml").write_text(config)
-    splatpipe("stage", "georef", out, "--set", "georef.control=none")
+    splatpipe("stage", "georef", out, "--set", "georef.control=none", "--set", "export.viewer_megabytes=0.0")
     return out
 
 
@@ -319,29 +327,55 @@ def test_a_phone_shows_and_marks_by_touch(marking: tuple[Served, Path], open_pag
 
 
 def test_what_cannot_be_marked_is_told(gps_run: Path, tmp_path: Path) -> None:
-    def told(*arguments: object) -> str:
-        command = [sys.executable, "-m", "splatpipe.pipeline.cli", "view", str(gps_run), "--mark", "--no-browser"]
-        done = subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, check=False, timeout=60)
-        assert done.returncode in (1, 2)
-        return done.stderr
+    def told(points: Path | None = None) -> str:
+        with pytest.raises(SplatpipeError) as caught:
+            Marking(open_job(open_run(gps_run), points))
+        return f"{caught.value.message} {caught.value.hint}"
 
     (gps_run.parent / "photos of a house" / "gcp_list.txt").unlink(missing_ok=True)
     assert "--points FILE" in told()
     points = tmp_path / "points.csv"
-    assert "cannot be read" in told("--points", points)
+    assert "cannot be read" in told(points)
     points.write_text("name,x,y,z\nP1,1,2,3\n")
-    assert "names no CRS" in told("--points", points)
+    assert "names no CRS" in told(points)
     points.write_text("EPSG:32633\n")
-    assert "points.csv" in told("--points", points)
+    assert "points.csv" in told(points)
     points.write_bytes(b"\x00\xff" * 100)
-    assert "no UTF-8 text" in told("--points", points)
+    assert "no UTF-8 text" in told(points)
     control = gps_run.parent / "photos of a house" / "gcp_list.txt"
     control.write_text("EPSG:25833\n388710 5299705 512 1 2 DJI_0001.JPG P99\n")
     points.write_text(POINTS)
-    assert "One control file has one CRS" in told("--points", points)
+    assert "One control file has one CRS" in told(points)
     control.write_text("EPSG:32633\n388711 5299705 512 1 2 DJI_0001.JPG P01\n")
-    assert "other coordinates" in told("--points", points)
+    assert "other coordinates" in told(points)
     control.unlink()
+    points.write_text(POINTS.replace("EPSG:32633", "EPSG:25832"))  # the neighbour's zone
+    assert "km from where the photos were taken" in told(points)
+
+
+def test_three_points_make_a_frame_where_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
+    """Before that nothing is expected anywhere; then every other point is, to a few pixels. A wrong mark is told."""
+    job = open_job(open_run(gps_run), gps_run.parent / "points.csv")
+    text = ControlText.begin(tmp_path / "gcp_list.txt", "EPSG:32633", False, NameFinder(job.photos))
+    marking = Marking(replace(job, frame=None, positions=Positions({}, {}), text=text))
+    assert not marking.overview()["placed"]
+    assert all(row["predicted"] is None for row in marking.detail("P07")["photos"])
+    for name in ("P01", "P04", "P05", "P16"):
+        for photo, (x, y) in list(TRUTH[name]["seen_px"].items())[:4]:
+            marking.change(name, photo, (x, y))
+    told = marking.overview()
+    assert told["placed"] and told["heights_tied"] and max(told["expected_m"]) < 0.1 and not told["warnings"]
+    rows = {row["name"]: row for row in marking.detail("P07")["photos"]}
+    for photo, pixel in TRUTH["P07"]["seen_px"].items():
+        assert rows[photo]["predicted"] == pytest.approx(pixel, abs=8.0)
+    photo, (x, y) = list(TRUTH["P01"]["seen_px"].items())[4]
+    marking.change("P01", photo, (x + 60.0, y))
+    assert marking.overview()["points"][0]["wrong"] == 1
+    row = next(row for row in marking.detail("P01")["photos"] if row["name"] == photo)
+    assert not row["agrees"] and row["residual_px"] == pytest.approx([-60.0, 0.0], abs=2.0)
+    for wrong in (("P0", photo, None), ("P01", "none.jpg", None), ("P01", photo, (-1.0, 0.0))):
+        with pytest.raises(WrongRequestError):
+            marking.change(*wrong)
 
 
 def test_a_turned_photo_is_shown_as_it_is_stored(tmp_path: Path, open_page: Callable) -> None:

@@ -167,7 +167,8 @@ async function onward() {
   const other = order.find((k) => k !== state.point && needsMore(points[k]));
   if (other != null) return choosePoint(other);
   if (next) return choosePhoto(next.photo);
-  return hint("Every point is marked wherever it is likely to be seen.");
+  const blind = state.detail.photos.every((each) => !each.predicted);
+  return hint(blind ? "Nothing tells yet where other photos show it: choose one with N and P." : "Every point is marked wherever it is likely to be seen.");
 }
 
 function remove() {
