@@ -114,6 +114,7 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "cameras.json",
         "metrics.json",
         "sparse.glb",
+        "flythrough.webm",
         "config.toml",
         "events.jsonl",
         "stages",
