@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
-import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -37,21 +33,29 @@ from splatpipe.pipeline.cli_options import (
     UntilOption,
     WhatOption,
 )
+from splatpipe.pipeline.cli_runs import (
+    Overrides,
+    RunSession,
+    available_cores,
+    check_stage,
+    existing,
+    overrides,
+    request_of,
+    stages_to_rerun,
+    with_budgets,
+)
 from splatpipe.pipeline.ending import Ending, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
     EXIT_USAGE,
-    MachineError,
     Stopped,
     UsageError,
     exit_code,
 )
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.engine.runner import Runner
-    from splatpipe.pipeline.engine.session import Request
-    from splatpipe.stages.options import LineConfig
+    pass
 
 app = typer.Typer(
     name="splatpipe",
@@ -61,67 +65,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-
-@dataclass(frozen=True)
-class _Overrides:
-    """What the command line says about the configuration."""
-
-    tables: Sequence[dict[str, Any]]
-
-    def resolve(self, *below: dict[str, Any]) -> LineConfig:
-        from splatpipe.pipeline.engine.config import resolve
-        from splatpipe.stages.options import LineConfig
-
-        return resolve(LineConfig, [*below, *self.tables])
-
-
-def _overrides(config: Path | None, assignments: Sequence[str] | None, seed: int | None) -> _Overrides:
-    from splatpipe.pipeline.engine.config import load_file, parse_set, with_seed
-    from splatpipe.stages.options import LineConfig
-
-    tables = [load_file(config)] if config else []
-    for table in tables:  # OUT/config.toml has these two besides the options
-        table.pop("photos", None), table.pop("splatpipe", None)
-    if seed is not None:
-        tables.append(with_seed(LineConfig, seed))
-    return _Overrides([*tables, *(parse_set(text, LineConfig) for text in assignments or ())])
-
-
-def _with_budgets(assignments: Sequence[str] | None, time_budget: str | None, max_memory: str | None) -> list[str]:
-    """``--time-budget`` and ``--max-memory`` as the assignments that they are short for."""
-    from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
-
-    budgets = []
-    if time_budget is not None:
-        budgets.append(f"train.time_budget_s={parse_duration(time_budget, '--time-budget')!r}")
-    if max_memory is not None:
-        budgets.append(f"train.max_memory_bytes={parse_bytes(max_memory, '--max-memory')}")
-    return [*budgets, *(assignments or ())]
-
-
-def _request(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
-    from splatpipe.pipeline.engine.session import Request
-    from splatpipe.pipeline.engine.source import with_absolute_files
-    from splatpipe.pipeline.engine.stage import Machine
-    from splatpipe.stages.line import LINE
-
-    began_s = round(time.monotonic(), 3)
-    if device not in ("auto", "cpu", "cuda"):
-        raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
-    if device == "cuda":
-        raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
-    if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
-        import splatpipe.pipeline.raster  # noqa: F401
-    machine = Machine(device, threads or available_cores(), began_s)
-    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _show_version(wanted: bool) -> None:
@@ -162,10 +105,10 @@ def run(
     from splatpipe.pipeline.engine.config import load_preset
 
     with Ending(out, as_json) as done:
-        assignments = _with_budgets(assignments, time_budget, max_memory)
-        resolved = _overrides(config, assignments, seed).resolve(load_preset(preset))
-        again = _stages_to_rerun(rerun or [], rerun_from, until)
-        with _Session(_request(photos, out, resolved, device, threads)) as runner:
+        assignments = with_budgets(assignments, time_budget, max_memory)
+        resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
+        again = stages_to_rerun(rerun or [], rerun_from, until)
+        with RunSession(request_of(photos, out, resolved, device, threads)) as runner:
             done.outcome = runner.outcome
             runner.walk(until=until, rerun=again)
 
@@ -205,11 +148,11 @@ def stage(
     from splatpipe.stages.options import LineConfig
 
     with Ending(out, as_json) as done:
-        _check_stage(name)
+        check_stage(name)
         photos, table = load_run(out)
-        resolved = _overrides(None, assignments, None).resolve(known(LineConfig, table))
-        request = _request(photos, out, resolved, device, threads)
-        with _Session(request) as runner:
+        resolved = overrides(None, assignments, None).resolve(known(LineConfig, table))
+        request = request_of(photos, out, resolved, device, threads)
+        with RunSession(request) as runner:
             done.outcome = runner.outcome
             runner.run_alone(name)
 
@@ -234,8 +177,8 @@ def georef(
     with Ending(out, as_json) as done:
         photos, table = load_run(out)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
-        resolved = _overrides(None, assignments, None).resolve(known(LineConfig, table), *control)
-        with _Session(_request(photos, out, resolved, device, threads)) as runner:
+        resolved = overrides(None, assignments, None).resolve(known(LineConfig, table), *control)
+        with RunSession(request_of(photos, out, resolved, device, threads)) as runner:
             done.outcome = runner.outcome
             runner.walk()
 
@@ -289,7 +232,7 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
     from splatpipe.pipeline.engine.session import survey_line
 
     with Ending(out, as_json) as done:
-        standings = list(survey(*survey_line(_existing(out))))
+        standings = list(survey(*survey_line(existing(out))))
         stages = [
             {
                 "name": standing.stage.name,
@@ -329,7 +272,7 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     from splatpipe.pipeline.engine.store import locked
 
     with Ending(out, as_json) as done:
-        line, store = survey_line(_existing(out))
+        line, store = survey_line(existing(out))
         with locked(store):
             keep = [(standing.stage.name, standing.key) for standing in survey(line, store)]
             removed, freed = store.remove_stale(keep)
@@ -343,7 +286,7 @@ def options(preset: PresetOption = "standard") -> None:
     from splatpipe.pipeline.console import show_table
     from splatpipe.pipeline.engine.config import load_preset, lookup, option_help
 
-    resolved = _Overrides([]).resolve(load_preset(preset))
+    resolved = Overrides([]).resolve(load_preset(preset))
     rows = [(name, str(lookup(resolved, name)), text) for name, text in option_help(type(resolved))]
     show_table(rows, ("option", "value", "what it does"))
 
@@ -359,51 +302,6 @@ def doctor(as_json: JsonOption = False) -> None:
         print_json(findings)
     else:
         show_table([(name, str(value)) for name, value in findings.items()], ("what", "found"))
-
-
-def _existing(out: Path) -> Request:
-    from splatpipe.pipeline.engine.config import known
-    from splatpipe.pipeline.engine.session import load_run
-    from splatpipe.stages.options import LineConfig
-
-    photos, table = load_run(out)
-    return _request(photos, out, _Overrides([]).resolve(known(LineConfig, table)))
-
-
-def _check_stage(name: str) -> None:
-    from splatpipe.stages.line import LINE
-
-    names = [entry.name for entry in LINE]
-    if name not in names:
-        raise UsageError(f'There is no stage "{name}".', hint=f"The line is: {', '.join(names)}.")
-
-
-def _stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | None) -> frozenset[str]:
-    from splatpipe.stages.line import LINE
-
-    for name in [*rerun, *filter(None, (rerun_from, until))]:
-        _check_stage(name)
-    names = [entry.name for entry in LINE]
-    return frozenset([*rerun, *(names[names.index(rerun_from) :] if rerun_from else [])])
-
-
-class _Session:
-    """An open session whose events go to the terminal, which is left tidy whatever happens."""
-
-    def __init__(self, request: Request) -> None:
-        self._request = request
-
-    def __enter__(self) -> Runner:
-        from splatpipe.pipeline.console import RunConsole
-        from splatpipe.pipeline.engine.session import open_session
-
-        self._console = RunConsole()
-        self._session = open_session(self._request, self._console)
-        return self._session.__enter__()
-
-    def __exit__(self, *error: Any) -> bool | None:
-        self._console.close()
-        return self._session.__exit__(*error)
 
 
 def _stop(number: int, _frame: FrameType | None) -> NoReturn:

@@ -20,7 +20,7 @@ from splatpipe.pipeline.scene.frames import Frame, save_frame
 from splatpipe.pipeline.scene.gaussians import Gaussians, quat_from_rotation
 from splatpipe.pipeline.scene.geodesy import Origin
 from splatpipe.pipeline.scene.similarity import Similarity
-from splatpipe.stages import evaluate
+from splatpipe.stages import evaluate, rendering
 from splatpipe.stages.accuracy import depth_at, measure_accuracy
 from splatpipe.stages.options import EvaluateConfig
 

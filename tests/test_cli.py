@@ -27,7 +27,7 @@ def photos(tmp_path: Path) -> Path:
 def test_help_names_every_command_and_imports_nothing_heavy() -> None:
     done = splatpipe("--help")
     assert done.returncode == 0
-    for command in ("run", "stage", "demo", "georef", "status", "clean", "doctor", "options"):
+    for command in ("run", "stage", "demo", "georef", "render", "status", "clean", "doctor", "options"):
         assert command in done.stdout
     code = (
         "import sys; from splatpipe.pipeline import cli; from splatpipe.stages import line\n"

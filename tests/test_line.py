@@ -115,6 +115,7 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "metrics.json",
         "sparse.glb",
         "viewer.html",
+        "flythrough.webm",
         "config.toml",
         "events.jsonl",
         "report.html",

@@ -131,6 +131,7 @@ export function fillStrip(strip, photos, choose) {
       image.src = photo.thumb;
       image.alt = photo.name;
       image.loading = "lazy";
+      image.style.aspectRatio = `${photo.width} / ${photo.height}`; // its place is known before it is loaded
       button.append(image);
     } else {
       button.textContent = photo.name;
@@ -139,13 +140,15 @@ export function fillStrip(strip, photos, choose) {
     strip.append(button);
     return [photo, button];
   });
+  let begun = false;
   return (chosen) => {
     for (const [photo, button] of buttons) {
       const is = photo === chosen;
       button.setAttribute("aria-current", String(is));
       if (is && strip.offsetParent) {
-        strip.scrollTo({ left: button.offsetLeft - (strip.clientWidth - button.offsetWidth) / 2, behavior: "smooth" });
+        strip.scrollTo({ left: button.offsetLeft - (strip.clientWidth - button.offsetWidth) / 2, behavior: begun ? "smooth" : "instant" });
       }
     }
+    begun = true;
   };
 }

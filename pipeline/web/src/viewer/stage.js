@@ -125,7 +125,7 @@ export class Stage {
     const began = performance.now();
     if (this.splatsShown && this.mesh) {
       if (resting || slow) await this.sortNow();
-      else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate());
+      else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate(), this.failed);
     }
     this.setQuality(!resting && slow);
     this.renderer.render(this.scene, this.camera);
