@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, Stage
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runner import Outcome
 
-STOP_S = 4.5  # after Ctrl-C everything is over, the report too: within five seconds is promised
+STOP_S = 4.0  # after Ctrl-C the report is over, too: an end within five seconds is promised, on a busy machine as well
 
 
 class Ending:
@@ -38,7 +38,7 @@ class Ending:
         seconds = time.monotonic() - self._started_s
         if isinstance(error, GeneratorExit | SystemExit):
             return
-        if self.outcome is not None:
+        if self.outcome is not None and not _insists(error):
             self._report(error)
         if error is None and self.outcome is not None:
             self._show(self.outcome, seconds)
@@ -90,6 +90,14 @@ class Ending:
             "failed": outcome.failed if outcome else "",
             "outputs": [str(path) for path in self._files(outcome)] if outcome else [],
         }
+
+
+def _insists(error: BaseException | None) -> bool:
+    """Whether the user pressed Ctrl-C once more while the first one was being obeyed: then nothing is waited for."""
+    before = None if error is None else error.__context__
+    while before is not None and not isinstance(before, Stopped):
+        before = before.__context__
+    return isinstance(error, Stopped) and before is not None
 
 
 def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:

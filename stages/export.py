@@ -40,7 +40,7 @@ VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", 
 
 
 def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`, `viewer/`; `sky/` where asked for.
+    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`, `viewer/`, and a sky if wanted.
 
     The frame is georef's: local east, north, up in metres where there are positions, of arbitrary scale elsewhere. The
     sky is a file of its own: within `splat.ply` it would be most of its bounding box, by which programs place and tile.

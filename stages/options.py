@@ -265,10 +265,10 @@ class EvaluateConfig(StageConfig):
 class ExportConfig(StageConfig):
     sky: bool = False
     """Hand over the sky of `train.sky`, too: `sky.ply`, a dome of Gaussians around the splat, in its frame."""
-    title: str = Field("3D model", max_length=200)
+    title: Annotated[str, Field(max_length=200)] = "3D model"
     """What `viewer.html` is called, e.g. the building and the date."""
-    viewer_megabytes: float = Field(60.0, ge=0.0)
-    """A `viewer.html` that would be larger reads `splat.spz` beside it, for which it takes `splatpipe view`; 0: no viewer."""
+    viewer_megabytes: NonNegativeFloat = 60.0
+    """A `viewer.html` that would be larger reads `splat.spz` beside it, which takes `splatpipe view`; 0 for none."""
 
 
 class FlythroughConfig(StageConfig):

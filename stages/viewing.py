@@ -1,10 +1,10 @@
-"""What `viewer.html` shows of a run: its cameras, photos, points, sky and CRS in the world frame, and the page itself."""
+"""What `viewer.html` shows of a run: cameras, photos, points, sky and CRS in the world frame; and the page itself."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,7 +31,7 @@ THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows;
 MOST_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
 SKY_ROWS = 64  # twice the panorama's: what interpolating twice blurs is not seen
-CLEARLY_TILTED = 0.3  # of the upward direction, in the picture: else one looks straight down, and no edge is the top
+CLEARLY_TILTED = 0.6  # of the upward direction, in the picture: seen from rather above, no edge is clearly the top
 
 
 @dataclass(frozen=True)
@@ -115,13 +115,23 @@ def write_viewer(folder: Path, scene: ViewerScene, gaussians: Gaussians, largest
         gaussians: In the world frame, finite.
         largest_bytes: Of a page that carries its splat.
     """
-    upright = gaussians.transformed(1.0, torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64), torch.zeros(3))
-    splat = spz_bytes(upright, scene.antialias)
+    splat = viewer_splat(gaussians, scene.antialias)
     page = viewer_page(scene, splat)
     if len(page.encode()) > largest_bytes:
         (folder / SPLAT).write_bytes(splat)
         page = viewer_page(scene, SPLAT)
     (folder / PAGE).write_text(page, encoding="utf-8")
+
+
+def viewer_splat(gaussians: Gaussians, antialias: bool) -> bytes:
+    """The SPZ file that the page draws.
+
+    Args:
+        gaussians: In the world frame (z up), finite.
+        antialias: Whether their opacities allow for the blur on screen.
+    """
+    turn = torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64)
+    return spz_bytes(gaussians.transformed(1.0, turn, torch.zeros(3, dtype=torch.float64)), antialias)
 
 
 def upright(camera: Camera) -> tuple[Camera, int]:
@@ -175,7 +185,7 @@ def _thumb(picture: Pixels, height: int) -> bytes:
     done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise StageError("A photo's small picture could not be coded as JPEG.")
-    return data.tobytes()
+    return bytes(data)
 
 
 def _sky(sky: Panorama, frame: Frame) -> ViewerSky:
@@ -187,6 +197,8 @@ def _sky(sky: Panorama, frame: Frame) -> ViewerSky:
     return ViewerSky(np.rint(colours * 255.0).astype(np.uint8))
 
 
-def _directions(elevation: Sequence[float], azimuth: Sequence[float]) -> Float64[np.ndarray, "rows columns 3"]:
+def _directions(
+    elevation: Float64[np.ndarray, " rows"], azimuth: Float64[np.ndarray, " columns"]
+) -> Float64[np.ndarray, "rows columns 3"]:
     rows, columns = np.meshgrid(elevation, azimuth, indexing="ij")
     return np.stack([np.cos(rows) * np.cos(columns), np.cos(rows) * np.sin(columns), np.sin(rows)], axis=2)

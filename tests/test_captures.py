@@ -32,7 +32,7 @@ def test_a_real_capture_becomes_a_splat(
     print(json.dumps({name: value for name, value in metrics.items() if isinstance(value, int | float | str)}))
     assert metrics["photos"] == photos
     assert metrics["registered"] >= registered
-    for name in ("splat.ply", "cameras.json", "sparse.glb", "config.toml", "events.jsonl"):
+    for name in ("splat.ply", "cameras.json", "sparse.glb", "config.toml", "events.jsonl", "report.html"):
         assert (out / name).stat().st_size > 0
 
 

@@ -308,6 +308,27 @@ def test_events_are_logged_as_json_lines(numbers: Path, out: Path) -> None:
     assert kinds.count("stage_started") == kinds.count("stage_finished") == 4
 
 
+def test_how_a_run_and_its_stages_ended_is_in_the_events(numbers: Path, out: Path) -> None:
+    """A good end, a bad one, a death: with exit code, memory, time and the artifact's key."""
+
+    def last(kind: str) -> dict[str, object]:
+        events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+        return next(event["data"] for event in reversed(events) if event["kind"] == kind)  # type: ignore[no-any-return]
+
+    first, _ = walk(request_of(numbers, out))
+    assert last("run_finished")["exit_code"] == 0 and last("run_started")["versions"]
+    finished = last("stage_finished")
+    assert finished["key"] == first.artifacts["tell"].key
+    assert finished["peak_memory_bytes"] == first.artifacts["tell"].manifest["peak_memory_bytes"]
+    for fail, memory_is_known in (("raise", True), ("kill", False)):
+        with pytest.raises(StageError) as caught:
+            walk(request_of(numbers, out, count={"fail": fail}))
+        ended, failed = last("run_finished"), last("stage_failed")
+        assert (ended["exit_code"], ended["message"]) == (3, caught.value.message)
+        assert failed["message"] == caught.value.message and failed["seconds"] >= 0.0  # type: ignore[operator]
+        assert (failed["peak_memory_bytes"] is not None) is memory_is_known
+
+
 def test_hostile_names_do_not_disturb(numbers: Path, out: Path) -> None:
     for name in ("näme mit leer", "写真", "new\nline", "quote'\"`$(x)"):
         (numbers / f"{name}.txt").write_text("1")

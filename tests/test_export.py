@@ -253,3 +253,16 @@ def test_same_bits_for_the_same_inputs(inputs: Inputs, exported: Path, tmp_path:
     export.run(ExportConfig(), inputs, tmp_path, tiny_scene.Recorder())
     for name in ("splat.ply", "georef.json", "cameras.json", "metrics.json", "sparse.glb"):
         assert (tmp_path / name).read_bytes() == (exported / name).read_bytes(), name
+
+
+def test_the_viewer_is_a_page_of_its_own_and_can_be_left_out(inputs: Inputs, exported: Path, tmp_path: Path) -> None:
+    page = (exported / "viewer/viewer.html").read_text(encoding="utf-8")
+    assert "<title>3D model</title>" in page
+    assert [path.name for path in (exported / "viewer").iterdir()] == ["viewer.html"]
+    config = ExportConfig(title="Barn & byre", viewer_megabytes=0.001)
+    export.run(config, inputs, tmp_path, tiny_scene.Recorder())
+    assert sorted(path.name for path in (tmp_path / "viewer").iterdir()) == ["splat.spz", "viewer.html"]
+    assert "<title>Barn &amp; byre</title>" in (tmp_path / "viewer/viewer.html").read_text(encoding="utf-8")
+    (tmp_path / "none").mkdir()
+    export.run(ExportConfig(viewer_megabytes=0.0), inputs, tmp_path / "none", tiny_scene.Recorder())
+    assert not list((tmp_path / "none/viewer").iterdir())

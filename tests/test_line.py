@@ -114,9 +114,11 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "cameras.json",
         "metrics.json",
         "sparse.glb",
+        "viewer.html",
         "flythrough.webm",
         "config.toml",
         "events.jsonl",
+        "report.html",
         "stages",
     ):
         assert (undisturbed / name).exists(), name

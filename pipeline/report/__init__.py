@@ -9,13 +9,16 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import IO
 
 from splatpipe.pipeline.engine.errors import MachineError
 
 REPORT_FILE = "report.html"
 PATIENCE_S = 600.0  # far more than hundreds of photos take
-LEAST_S = 1.0  # of a run that is to end: enough for the report without pictures
+LEAST_S = 2.0  # where the time is over at once: enough for the report without pictures, also on a busy machine
+POLL_S = 0.02
 
 
 def write_report(out: Path, *, drawn: bool = True) -> Path:
@@ -56,26 +59,38 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     Raises:
         MachineError: if it could not be written.
     """
-    patience_s = PATIENCE_S if until_s is None else max(LEAST_S, until_s - time.monotonic())
     command = [sys.executable, "-m", "splatpipe.pipeline.report", str(out), *([] if until_s is None else ["--hurry"])]
     path = out / REPORT_FILE
     before = _stamp(path)
+    began_s = time.monotonic()
+    end_s = began_s + PATIENCE_S if until_s is None else until_s
+
+    def over() -> bool:
+        now_s = time.monotonic()
+        return now_s > end_s and (_stamp(path) != before or now_s > began_s + LEAST_S)
+
     try:
         with log.open("a", encoding="utf-8") as said:
-            done = subprocess.run(
-                command, stdin=subprocess.DEVNULL, stdout=said, stderr=said, timeout=patience_s, check=False
-            )
-            failed = done.returncode != 0
-    except subprocess.TimeoutExpired:
-        failed = until_s is None
+            code = _run(command, said, over)
     except OSError as error:
         raise MachineError(f"The report could not be written: {error.strerror}.") from error
     finally:
         for unfinished in out.glob(f"{REPORT_FILE}.*.new"):
             unfinished.unlink(missing_ok=True)
-    if failed or _stamp(path) == before:
+    if _stamp(path) == before or (code != 0 and until_s is None):
         raise MachineError("The report could not be written.", hint=f"{log} ends with the reason.")
     return path
+
+
+def _run(command: Sequence[str], said: IO[str], over: Callable[[], bool]) -> int:
+    """Run a process to its end, or until its time is over; its exit code. Whatever interrupts the wait ends it, too."""
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+    try:
+        while process.poll() is None and not over():
+            time.sleep(POLL_S)
+    finally:
+        process.kill()
+    return process.wait()
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

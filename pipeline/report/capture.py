@@ -17,8 +17,14 @@ MOST_LISTED = 200  # rows of a table of photos
 LEAST_POINTS = 100  # observed by a photo that is placed well
 
 
-def capture_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter:
-    """What was captured: photos, cameras, positions, map, overlap, and what was left out and why."""
+def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: bool) -> Chapter:
+    """What was captured: photos, cameras, positions, map, overlap, and what was left out and why.
+
+    Args:
+        holdings: What there is.
+        geometry: Of the model, if there is one.
+        drawn: Whether to draw maps.
+    """
     summary = holdings.summary("ingest")
     photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
     left_out = holdings.read("ingest.left_out").get("left_out", [])
@@ -40,6 +46,12 @@ def capture_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter:
     }
     if geometry is not None:
         chapter |= _mapped(holdings, geometry)
+    elif drawn and len(positions) > 1:
+        from splatpipe.pipeline.report.charts import stated_map
+
+        places = [(float(position["latitude"]), float(position["longitude"])) for position in positions]
+        text = "Where the photos say that they were taken, joined in name order. Whereto they look is not known yet."
+        chapter["maps"] = [{"svg": stated_map(places), "text": text}]
     return chapter
 
 
@@ -59,12 +71,12 @@ def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapt
     ]
     if not sparse:  # the stage failed or was never reached
         facts = [fact for fact in facts if "–" not in fact[1] and fact[1]]
-    unregistered = [str(name) for name in models.get("unregistered", [])] if isinstance(models, Mapping) else []
+    unregistered = [str(name) for name in models.get("unregistered", [])]
     chapter: Chapter = {
         "facts": facts,
         "unregistered": unregistered[:MOST_LISTED],
         "unregistered_more": max(0, len(unregistered) - MOST_LISTED),
-        "other_models": models.get("other_models", []) if isinstance(models, Mapping) else [],
+        "other_models": models.get("other_models", []),
         "cameras": [_calibrated(camera) for camera in sparse.get("cameras", [])],
     }
     if geometry is not None:
@@ -79,7 +91,7 @@ def unit_of(holdings: Holdings) -> str:
 
 def held_out(holdings: Holdings) -> list[str]:
     """Names of the photos that training never saw, as far as it is known."""
-    plan = holdings.read("train.plan")
+    plan = holdings.read("train.plan") or holdings.read_unfinished("train", "plan.json")
     return [str(name) for name in plan.get("test_views", [])]
 
 
@@ -122,7 +134,7 @@ def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
     from splatpipe.pipeline.report import charts
 
     found = holdings.read("matches.pairs")
-    pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])] if isinstance(found, Mapping) else []
+    pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])]
     drawn = [
         (charts.observations_bars(geometry), f"Photos with fewer than {LEAST_POINTS} points (red) are placed poorly."),
         (
@@ -131,16 +143,17 @@ def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
         ),
         (charts.error_histogram(geometry), "How far the points miss their pixels."),
     ]
-    if pairs:
-        drawn.append((charts.match_map(geometry, pairs, unit_of(holdings)), "Which photos were matched with which."))
     for number_of, field in enumerate(geometry.fields[:4], start=1):
         text = "Mean residuals over the picture, much enlarged: a pattern would tell that the lens model does not fit."
         drawn.append((charts.residual_field(field, number_of), text))
+    if pairs:
+        drawn.append((charts.match_map(geometry, pairs, unit_of(holdings)), "Which photos were matched with which."))
     return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
 
 
 def _camera(camera: Mapping[str, Any]) -> dict[str, str]:
-    name = " ".join(str(camera[part]) for part in ("make", "model_name") if camera.get(part)) or "unknown camera"
+    make, model = str(camera.get("make") or ""), str(camera.get("model_name") or "")
+    name = (model if model.casefold().startswith(make.casefold()) else f"{make} {model}").strip() or "unknown camera"
     known = str(camera.get("focal_source", "")).replace("-", " ")
     focal = f"{number(camera.get('focal_px'), 1)} px" + (f" ({known})" if known else "")
     size = f"{count(camera.get('width'))} × {count(camera.get('height'))}"

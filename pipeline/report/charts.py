@@ -19,6 +19,7 @@ from splatpipe.pipeline.report.drawing import (
     GREY,
     HEIGHT,
     INK,
+    LINE,
     ORANGE,
     RED,
     WIDTH,
@@ -34,6 +35,8 @@ PAIRS_DRAWN = 3_000  # lines, the strongest
 OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # from so many photos on a colour of its own
 OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa564", "#1a6b3c")
 ARROW_SHARE = 0.12  # of the map's width, that the longest residual is drawn as
+SQUASHED = 4.0  # times the iterations reached: a planned end further off leaves no room for the curve
+METRES_A_DEGREE = 111_195.0  # of a sphere: enough to draw by
 MOST_NAMES = 30  # points with their names on a map
 Residual = tuple[str, Sequence[float], Sequence[float]]  # name; place and residual: east, north, up, metres
 
@@ -60,9 +63,25 @@ def survey_map(geometry: Geometry, unit: str, held_out: Sequence[str]) -> Markup
     return to_svg(figure, "Map of the photos' positions, viewing directions and footprints")
 
 
+def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
+    """Where the photos say that they were taken: all there is before the cameras are found.
+
+    Args:
+        places: Latitude and longitude, degrees.
+    """
+    degrees = np.array(places, np.float64)
+    north = METRES_A_DEGREE * (degrees[:, 0] - degrees[:, 0].mean())
+    east = METRES_A_DEGREE * math.cos(math.radians(degrees[0, 0])) * (degrees[:, 1] - degrees[:, 1].mean())
+    box = _about(np.stack([east, north], axis=1))
+    figure, axes = new_figure(*map_size(box))
+    axes.plot(east, north, "o-", ms=4, mfc=BLUE, mec="white", mew=0.5, color=LINE, lw=0.8)
+    as_map(axes, box, "m")
+    return to_svg(figure, "Map of where the photos say that they were taken")
+
+
 def overlap_map(overlap: Overlap, unit: str) -> Markup:
     """How many footprints cover each place."""
-    figure, axes = new_figure(*map_size(overlap.box))
+    figure, axes = new_figure(*map_size(overlap.box), right=1.15)
     norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
     shown = np.ma.masked_equal(overlap.counts, 0)
     axes.imshow(
@@ -124,7 +143,7 @@ def track_histogram(geometry: Geometry) -> Markup:
 
 def error_histogram(geometry: Geometry) -> Markup:
     """Mean reprojection errors of the sparse points."""
-    figure, axes = new_figure(WIDTH, 2.6)
+    figure, axes = new_figure()
     errors = geometry.errors_px[np.isfinite(geometry.errors_px)]
     top = float(np.percentile(errors, 99.5)) if len(errors) else 1.0
     axes.hist(np.clip(errors, 0.0, top), bins=48, range=(0.0, max(top, 1e-6)), color=BLUE)
@@ -139,7 +158,7 @@ def error_histogram(geometry: Geometry) -> Markup:
 def residual_field(field: Field, camera: int) -> Markup:
     """Mean residuals over the picture: a pattern tells that the lens model does not fit."""
     width, height = field.size
-    figure, axes = new_figure(WIDTH, float(np.clip(WIDTH * height / width, 2.4, 5.2)) + 0.4)
+    figure, axes = new_figure(*map_size((0.0, float(width), 0.0, float(height))))
     largest = float(np.linalg.norm(field.residuals, axis=1).max())
     scale = max(largest, 1e-6) * 14.0 / width
     axes.quiver(
@@ -194,7 +213,7 @@ def training_curve(name: str, curve: Mapping[float, float], planned: float | Non
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
-    if planned and steps and planned > steps[-1]:
+    if planned and SQUASHED * steps[-1] >= planned > steps[-1]:
         axes.axvline(planned, color=ORANGE, lw=1.0, ls="--", label=f"planned end: {planned:,.0f}")
         axes.legend(fontsize=8)
     axes.set_xlim(left=0)
@@ -209,10 +228,10 @@ def view_bars(views: Sequence[tuple[str, float]], unit: str) -> Markup:
     values = [value for _, value in views]
     axes.bar(np.arange(len(values)) + 1, values, width=0.8, color=BLUE)
     axes.axhline(float(np.mean(values)), color=ORANGE, lw=1.2, label=f"mean {np.mean(values):.2f} {unit}")
-    axes.set_ylim(bottom=max(0.0, min(values) - 5.0))
+    axes.set_ylim(max(0.0, min(values) - 5.0), max(values) + 4.0)
     axes.set_xlabel("held-out photo, the worst first")
     axes.set_ylabel(f"PSNR ({unit})")
-    axes.legend(fontsize=8, loc="lower right")
+    axes.legend(fontsize=8, loc="upper left")
     return to_svg(figure, "PSNR of the held-out photos")
 
 

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 INK, FAINT, LINE = "#1b1f24", "#5b6570", "#d8dde3"
 BLUE, ORANGE, GREEN, RED, GREY = "#0b66c3", "#d9730d", "#1a7f37", "#cf222e", "#8b949e"
 WIDTH, HEIGHT = 5.4, 3.5  # inches: half of a page, or the whole of a phone, with letters that can be read on both
+MARGINS = (0.78, 0.12, 0.5, 0.3)  # inches: left, right, bottom, top
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # letters stay letters: small, searchable, in the page's own font
     "font.family": "sans-serif",
@@ -49,10 +50,12 @@ def styled() -> Iterator[None]:
         yield
 
 
-def new_figure(width: float = WIDTH, height: float = HEIGHT) -> tuple[Figure, Axes]:
-    """An empty chart and its axes; inches."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+def new_figure(width: float = WIDTH, height: float = HEIGHT, right: float = MARGINS[1]) -> tuple[Figure, Axes]:
+    """An empty chart and its axes; inches, `right` of the margin there."""
+    figure = Figure(figsize=(width, height))  # fixed margins: a layout engine would draw everything twice
     FigureCanvasSVG(figure)
+    left, _, bottom, top = MARGINS
+    figure.subplots_adjust(left / width, bottom / height, 1.0 - right / width, 1.0 - top / height)
     return figure, figure.add_subplot()
 
 
@@ -93,6 +96,7 @@ def as_map(axes: Axes, box: tuple[float, float, float, float], unit: str) -> Non
 
 
 def map_size(box: tuple[float, float, float, float]) -> tuple[float, float]:
-    """Inches of a map of that box: no wider than the page, no higher than wide."""
+    """Inches of a map of that box: as wide as any chart, and hardly higher."""
     ratio = (box[3] - box[2]) / max(box[1] - box[0], 1e-9)
-    return WIDTH, float(np.clip(WIDTH * ratio * 0.9, 2.6, 5.2)) + 0.5
+    left, right, bottom, top = MARGINS
+    return WIDTH, float(np.clip((WIDTH - left - right) * ratio, 2.0, 4.8)) + bottom + top

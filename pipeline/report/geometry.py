@@ -18,12 +18,13 @@ from splatpipe.pipeline.scene.similarity import Similarity
 BORDER_STEPS = 6  # rays along each side of a picture, for its footprint
 GROUND_PERCENTILE = 5.0  # of the sparse points' heights: roofs and walls are above
 REACH_PERCENTILE = 95.0  # of the distances of a photo's own points: what lies behind is not told by it
+REACH_POINTS = 20_000  # are enough for that; all of them, for each of hundreds of photos, would cost seconds
 LEAST_DROP = 0.02  # of a ray's length: flatter rays meet the ground beyond reach
 BOX_PERCENTILES = (4.0, 96.0)  # of the sparse points: some lie far behind what was photographed
 BOX_MARGIN = 0.15  # of its longer side
 GRID_CELLS = 240  # along the longer side of the overlap map
 FIELD_CELLS = 16  # along the longer side of a picture, for the mean residuals
-FIELD_PHOTOS = 60  # enough observations for them; more would cost seconds
+FIELD_PHOTOS = 24  # enough observations for them; more would cost seconds
 LEAST_IN_CELL = 5  # observations, for a mean that says something
 
 
@@ -155,9 +156,10 @@ def _taken(
     world_from_cam = similarity.rotation @ poses[:, :, :3].transpose(0, 2, 1)
     centres = similarity.apply(-np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3]))
     middle = np.median(points, axis=0)
+    some = points[:: max(1, len(points) // REACH_POINTS)]
     footprints = []
     for image, centre, rotation in zip(images, centres, world_from_cam, strict=True):
-        reach = _reach(points, centre, rotation, float(np.linalg.norm(middle - centre)))
+        reach = _reach(some, centre, rotation, float(np.linalg.norm(middle - centre)))
         footprints.append(_footprint(_border_rays(image.camera) @ rotation.T, centre, ground, reach))
     counts = np.array([image.num_points3D for image in images], np.int64)
     return Taken([image.name for image in images], centres, world_from_cam[:, :, 2], counts, footprints)

@@ -84,6 +84,18 @@ class Holdings:
         path = self.part(name)
         return {} if path is None else read_json(path / file)
 
+    def read_unfinished(self, stage: str, file: str) -> Any:
+        """A JSON file that a stage had written when it was stopped; an empty table where there is none.
+
+        Raises:
+            ValueError: if it is no JSON, or far too large.
+        """
+        story = self.story.stages.get(stage)
+        if story is None or not story.key:
+            return {}
+        path = Store(self.out).working_folder(next(each for each in LINE if each.name == stage), story.key) / file
+        return read_json(path) if path.is_file() else {}
+
     def summary(self, stage: str) -> Mapping[str, Any]:
         """What a stage returned; empty where it did not finish."""
         artifact = self.artifacts.get(stage)

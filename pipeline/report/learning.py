@@ -30,16 +30,17 @@ def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
     story = holdings.story.stages.get("train")
     if "train" not in holdings.artifacts and (story is None or story.state == "not reached"):
         return None
-    summary, plan, history = holdings.summary("train"), holdings.read("train.plan"), holdings.read("train.history")
+    summary, history = holdings.summary("train"), holdings.read("train.history")
+    plan = holdings.read("train.plan") or holdings.read_unfinished("train", "plan.json")
     told = {} if story is None else dict(story.told.progress)
     planned = summary.get("planned_iterations") or plan.get("last_iteration") or told.get("total")
-    reached = summary.get("iterations") or told.get("done")
+    reached = summary.get("iterations") or (None if story is None else story.reached)
     curves = _curves(holdings, history)
     gaussians = summary.get("gaussians") or _last(curves.get("gaussians", {}))
     options = plan.get("options") or {}
     facts = [
         ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
-        ("Gaussians", f"{count(gaussians)} at the end, {count(plan.get('initial_gaussians'))} at the beginning"),
+        ("Gaussians", f"{count(gaussians)}, {count(plan.get('initial_gaussians'))} at the beginning"),
         (
             "Size of the photos",
             f"{number(summary.get('train_megapixels') or plan.get('train_megapixels'), 2)} megapixels",
@@ -122,10 +123,10 @@ def _row(view: Mapping[str, Any], measures: Sequence[tuple[str, str, int]]) -> d
 def _floaters(floaters: Mapping[str, Any]) -> list[tuple[str, str]]:
     depth = floaters.get("depth_disagreement") or {}
     return [
-        ("Opacity in free space", share(floaters.get("free_space_opacity"), 3)),
-        ("of what the views show", share(floaters.get("free_space_rendered"), 3)),
-        ("Neighbouring views' depths differ by", f"{share(depth.get('median'), 2)} (median)"),
-        ("by more than 5 %", f"in {share(depth.get('share_above_5_percent'), 1)} of the pixels"),
+        ("Opacity in the air", f"{share(floaters.get('free_space_opacity'), 3)} of all"),
+        ("Share of the views", f"{share(floaters.get('free_space_rendered'), 3)} of what they show hangs in the air"),
+        ("Depths of neighbouring views", f"differ by {share(depth.get('median'), 2)} (median)"),
+        ("Depths more than 5 % off", f"in {share(depth.get('share_above_5_percent'), 1)} of the pixels"),
     ]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import quote
 
 from splatpipe.pipeline.report.holdings import Holdings
-from splatpipe.pipeline.report.wording import count, duration, moment, size
+from splatpipe.pipeline.report.wording import count, duration, moment, plural, size
 from splatpipe.stages.line import LINE
 
 Chapter = dict[str, Any]
@@ -22,6 +22,7 @@ WHAT = {
     "sparse.glb": "sparse points and cameras, for any 3D viewer",
     "sky.ply": "the sky as a dome of Gaussians",
 }
+FIRST = ("viewer.html", "flythrough.webm", "splat.ply")  # what people want to open, so linked at the top, too
 FOLDERS = {
     "undistort.dataset": "undistorted photos and cameras, as other trainers take them",
     "evaluate.views": "held-out photos, renders and errors in full size",
@@ -50,6 +51,7 @@ def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
         "peak": size(max((row["memory"] or 0 for row in rows), default=0) or None),
         "machine": _machine(machine),
         "versions": sorted((str(name), str(value)) for name, value in versions.items()),
+        "otherwise": _made_otherwise(holdings, versions),
         "seeds": [
             (f"{name}.seed", str(section["seed"]))
             for name, section in options.items()
@@ -81,7 +83,15 @@ def files_chapter(holdings: Holdings) -> Chapter:
         for name, what in RECORDS.items()
         if (holdings.out / name).is_file()
     ]
-    return {"files": files, "folders": folders, "records": records, "stale": any(not file["current"] for file in files)}
+    found = {str(file["name"]): file for file in files if file["current"]}
+    first = [found[name] for name in FIRST if name in found]
+    return {
+        "first": first,
+        "files": files,
+        "folders": folders,
+        "records": records,
+        "stale": any(not file["current"] for file in files),
+    }
 
 
 def said_chapter(holdings: Holdings) -> Chapter:
@@ -115,12 +125,23 @@ def _stage_row(holdings: Holdings, name: str) -> dict[str, Any]:
     }
 
 
+def _made_otherwise(holdings: Holdings, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Stages that an earlier run made with other versions, and which."""
+    told = []
+    for name, artifact in holdings.artifacts.items():
+        other = artifact.manifest.get("versions", {})
+        differ = [f"{what} {value}" for what, value in other.items() if versions.get(what) != value]
+        if differ:
+            told.append((name, ", ".join(differ)))
+    return told
+
+
 def _machine(machine: Mapping[str, Any]) -> str:
     told = [str(machine[name]) for name in ("system", "processor") if machine.get(name)]
     if machine.get("cores"):
         told.append(f"{count(machine['cores'])} cores")
     if machine.get("threads"):
-        told.append(f"{count(machine['threads'])} threads used")
+        told.append(f"{plural(int(machine['threads']), 'thread')} used")
     if machine.get("device") not in (None, "auto"):
         told.append(f"device {machine['device']}")
     return ", ".join(told)

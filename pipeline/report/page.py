@@ -50,7 +50,7 @@ def report_page(holdings: Holdings, *, drawn: bool) -> str:
 def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> str:
     script, style = asset("report.js").replace("</", "<\\/"), asset("report.css").replace("</", "<\\/")
     chapters = {
-        "capture": _guarded(lambda: capture_chapter(holdings, geometry) if holdings.summary("ingest") else None),
+        "capture": _guarded(lambda: capture_chapter(holdings, geometry, drawn=drawn) if _checked(holdings) else None),
         "registration": _guarded(lambda: registration_chapter(holdings, geometry) if _matched(holdings) else None),
         "placing": _guarded(lambda: placing_chapter(holdings, geometry)),
         "training": _guarded(lambda: training_chapter(holdings, drawn=drawn)),
@@ -68,7 +68,7 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
     )
     return environment.get_template("report.html.j2").render(
         name=holdings.out.resolve().name or str(holdings.out),
-        photos_dir="" if holdings.photos_dir is None else str(holdings.photos_dir),
+        photos_dir="" if holdings.photos_dir is None else "/".join(holdings.photos_dir.parts[-2:]),
         began=moment(holdings.story.began_s) if holdings.story.began_s else "",
         version=importlib.metadata.version("splatpipe"),
         verdict=judge(holdings),
@@ -80,6 +80,10 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
         style=Markup(style),
         **chapters,
     )
+
+
+def _checked(holdings: Holdings) -> bool:
+    return "ingest" in holdings.artifacts
 
 
 def _matched(holdings: Holdings) -> bool:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.report.holdings import Holdings, read_json
 from splatpipe.pipeline.report.wording import count, interval, length, metres, number
-from splatpipe.pipeline.scene.crs import describe_vertical
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.report.geometry import Geometry
@@ -30,10 +30,10 @@ def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | 
         return None
     frame, control, report = (holdings.read(f"georef.{name}") for name in ("frame", "control", "accuracy"))
     points = list(control.get("points", []))
-    splat = holdings.read("evaluate.metrics").get("accuracy", {}).get("splat") or {"tables": {}, "points": []}
+    splat = _splat(holdings)
     chapter: Chapter = {
         "note": str(frame.get("note", "")),
-        "facts": _frame_facts(holdings, frame, control, report),
+        "facts": _frame_facts(holdings, (frame, control, report), named=geometry is not None),
         "tables": _tables(report.get("tables") or {}, splat.get("tables") or {}),
         "flights": _flights(report.get("tables") or {}),
         "left_out": [str(name) for name in frame.get("left_out", [])],
@@ -48,9 +48,19 @@ def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | 
     return chapter
 
 
+def _splat(holdings: Holdings) -> Mapping[str, Any]:
+    """What evaluate found of the splat's own accuracy; nothing where that is damaged, which its own chapter tells."""
+    with suppress(OSError, ValueError, AttributeError):
+        found = holdings.read("evaluate.metrics").get("accuracy", {}).get("splat")
+        if found:
+            return dict(found)
+    return {"tables": {}, "points": []}
+
+
 def _frame_facts(
-    holdings: Holdings, frame: Mapping[str, Any], control: Mapping[str, Any], report: Mapping[str, Any]
+    holdings: Holdings, parts: tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], *, named: bool
 ) -> list[tuple[str, str]]:
+    frame, control, report = parts
     if frame.get("kind") != "enu":
         return [("Frame", "z up; scale, place and heading are arbitrary: no metres")]
     origin = frame["origin"]
@@ -60,7 +70,7 @@ def _frame_facts(
         ("Frame", "local east, north, up in metres"),
         ("Origin", f"{place} (latitude, longitude, height)"),
         ("CRS of the coordinates", _crs(holdings, frame)),
-        ("Vertical datum", describe_vertical(str(frame.get("vertical_datum", "unknown")))),
+        ("Vertical datum", _vertical(str(frame.get("vertical_datum", "unknown")), named=named)),
         ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel"),
     ]
     if control.get("file"):
@@ -72,6 +82,15 @@ def _frame_facts(
         told = f"bent the model by {moved}" if bent else f"fits it as it is (bending would move the photos by {moved})"
         facts.append(("Control and the model", told if summary.get("moved_px") is not None else "not adjusted"))
     return facts
+
+
+def _vertical(datum: str, *, named: bool) -> str:
+    """The datum by its name, or as the frame has it where there is no time to load pyproj."""
+    if not named:
+        return datum
+    from splatpipe.pipeline.scene.crs import describe_vertical
+
+    return describe_vertical(datum)
 
 
 def _crs(holdings: Holdings, frame: Mapping[str, Any]) -> str:

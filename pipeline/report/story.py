@@ -59,6 +59,13 @@ class StageStory:
     hint: str = ""
     told: Told = field(default_factory=Told)
 
+    @property
+    def reached(self) -> float | None:
+        """How far it came, in its own unit: the last progress, or the last point of a curve if that is further."""
+        steps = [step for curve in self.told.metrics.values() for step in curve]
+        done = self.told.progress.get("done")
+        return max([*steps, *([] if done is None else [float(done)])], default=None)
+
 
 @dataclass
 class Story:

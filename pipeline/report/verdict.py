@@ -60,7 +60,7 @@ def judge(holdings: Holdings) -> Verdict:
         return Verdict(ended.level, ended.title, ended.text, findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
     if any(finding.level == "bad" for finding in doubtful):
-        return Verdict("bad", "Finished, but not fit for use as it is", text, findings)
+        return Verdict("bad", "Finished, but with a serious shortcoming", text, findings)
     if doubtful:
         return Verdict("doubt", f"Finished; {plural(len(doubtful), 'point')} to look at", text, findings)
     return Verdict("good", "Finished, and nothing looks doubtful", text, findings)
@@ -99,11 +99,10 @@ def _ended(holdings: Holdings) -> tuple[Finding | None, str]:
 def _far(holdings: Holdings) -> str:
     """How far the stage came in which it ended."""
     stage = holdings.story.culprit
-    progress: Mapping[str, Any] = {} if stage is None else stage.told.progress
-    if not progress:
+    if stage is None or not stage.told.progress:
         return ""
-    unit = str(progress.get("unit", ""))
-    return f"It had come to {count(progress.get('done'))} of {count(progress.get('total'))} {unit}."
+    total, unit = stage.told.progress.get("total"), str(stage.told.progress.get("unit", ""))
+    return f"It had come to {count(stage.reached)} of {count(total)} {unit}."
 
 
 def _photos(holdings: Holdings) -> Finding | None:
@@ -204,12 +203,22 @@ def _views(holdings: Holdings) -> Finding | None:
     mean, views = metrics["mean"], metrics["per_view"]
     if not views:
         return Finding("doubt", "Held-out photos", "No photo was held out, so nothing tells how good the pictures are.")
-    value = mean["psnr_cc"] if mean.get("psnr_cc") is not None else mean["psnr"]
+    worst_of = min(views, key=_likeness)
+    value, worst = _likeness(mean), _likeness(worst_of)
     level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
     told = {"good": "a good likeness", "doubt": "a fair likeness", "bad": "a poor likeness"}[level]
     text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB "
-    text += f"({value:.1f} without what exposure did), SSIM {number(mean['ssim'], 2)}"
-    return Finding(level, "Held-out photos", f"{text}: {told}.")
+    text += f"({value:.1f} without what exposure did), SSIM {number(mean['ssim'], 2)}: {told}"
+    if level == "good" and worst < PSNR_DOUBT_DB:
+        return Finding(
+            "doubt", "Held-out photos", f"{text} on average, but not of {worst_of['name']} ({worst:.1f} dB)."
+        )
+    return Finding(level, "Held-out photos", f"{text}.")
+
+
+def _likeness(measures: Mapping[str, Any]) -> float:
+    """PSNR, what exposure did apart where that is known."""
+    return float(measures["psnr_cc"] if measures.get("psnr_cc") is not None else measures["psnr"])
 
 
 def _floaters(holdings: Holdings) -> Finding | None:

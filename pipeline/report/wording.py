@@ -66,7 +66,7 @@ def size(value: object) -> str:
 def moment(seconds: object) -> str:
     """A point in time, UTC."""
     try:
-        return f"{datetime.fromtimestamp(float(seconds), UTC):%Y-%m-%d %H:%M UTC}"
+        return f"{datetime.fromtimestamp(float(str(seconds)), UTC):%Y-%m-%d %H:%M UTC}"
     except (TypeError, ValueError, OverflowError, OSError):
         return NONE
 

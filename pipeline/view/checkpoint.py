@@ -19,10 +19,14 @@ from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.images import reduced_view
 from splatpipe.pipeline.scene.panorama import Panorama, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.scene.spz import SPZ_FROM_Z_UP, spz_bytes
 from splatpipe.pipeline.view.opened import Opened
+from splatpipe.pipeline.web.viewer import viewer_page
+from splatpipe.stages.export import in_world
 from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.smoothing import smoothed
+from splatpipe.stages.viewing import SPLAT, look_of, viewer_scene
 
 CHECKPOINT = "checkpoint.npz"
 JPEG_QUALITY = 92
@@ -62,8 +66,9 @@ class Shown:
 def newest(opened: Opened) -> Source | None:
     """The furthest that a training has come; None before it can begin."""
     if "train.model" in opened.parts:
-        path, plan, sky = (opened.parts[f"train.{name}"].path for name in ("model", "plan", "sky"))
-        return Source(path, "model", opened.parts["train.model"].digest[:16], plan, sky)
+        part = opened.parts["train.model"]
+        plan, sky = opened.parts["train.plan"].path, opened.parts["train.sky"].path
+        return Source(part.path, "model", part.digest[:16], plan, sky)
     folder = opened.working.get("train")
     if folder is not None:
         try:
@@ -74,8 +79,8 @@ def newest(opened: Opened) -> Source | None:
             pass
     if "initialize.splat" in opened.parts:
         part = opened.parts["initialize.splat"]
-        plan = folder / "plan.json" if folder is not None else None
-        return Source(part.path, "initial", part.digest[:16], plan if plan and plan.is_file() else None)
+        begun = folder is not None and (folder / "plan.json").is_file()
+        return Source(part.path, "initial", part.digest[:16], folder / "plan.json" if folder and begun else None)
     return None
 
 
@@ -135,6 +140,30 @@ def pictures(shown: Shown, view: View, threads: int) -> tuple[bytes, bytes]:
     with same_bits(threads):
         render = render_pixels((shown.gaussians, shown.sky), camera, shown.options)
     return _jpeg(render), _jpeg(photo)
+
+
+def viewer(shown: Shown, source: Source, opened: Opened, name: str) -> tuple[str, bytes]:
+    """The 3D viewer's page of a model, and the splat that it loads from beside it, called ``SPLAT``.
+
+    Args:
+        shown: The model.
+        source: Where it is from.
+        opened: The run.
+        name: Of the run.
+
+    Raises:
+        SplatpipeError: if the run is not so far that a model lies anywhere, or cannot be read.
+    """
+    if source.plan is None or not {"georef.frame", "undistort.dataset"} <= set(opened.parts):
+        raise SplatpipeError("There is nothing to show in 3D yet.")
+    frame = load_frame(opened.parts["georef.frame"].path)
+    gaussians = in_world(shown.gaussians, frame)
+    look = look_of(source.plan, shown.sky)
+    dataset, held_out = opened.parts["undistort.dataset"].path, set(held_out_of(source))
+    title = f"{name}, iteration {shown.iteration:,}"
+    scene = viewer_scene(dataset, frame, look, held_out, len(gaussians), title)
+    upright = gaussians.transformed(1.0, torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64), torch.zeros(3))
+    return viewer_page(scene, SPLAT), spz_bytes(upright, scene.antialias)
 
 
 def _from_checkpoint(path: Path, opened: Opened) -> tuple[Gaussians, Panorama | None]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -22,9 +21,9 @@ from splatpipe.pipeline.view.job import Job
 from splatpipe.stages.georef.accuracy import Placed, accuracy_json
 from splatpipe.stages.georef.blunders import name_blunders, require_near
 from splatpipe.stages.georef.gps import NoPlaceError
+from splatpipe.stages.georef.model import SparseModel
 from splatpipe.stages.georef.place import (
     Site,
-    Stations,
     make_site,
     observed_in,
     require_fit,
@@ -37,10 +36,10 @@ Marks = Mapping[str, Mapping[str, tuple[float, float]]]
 UNKNOWN_HEIGHT_M = 5.0  # of a point that has no height, or while the heights' datum is not known
 LEAST_RADIUS_PX = 6.0
 SURFACE_RADIUS_M = 8.0  # around a point, of whose sparse points the height is taken
-LEAST_NEAR = 3  # sparse points
+LEAST_NEAR = 3  # sparse points that tell a height
 RAY_TOLERANCE = 1e-3  # of x/z; beyond it a lens model has folded back what it does not show
-HIDING = 0.85  # of a point's depth: what the photo sees there is nearer, so hides it
-HIDING_SHARE = 0.03  # of a photo's width: how far around a point
+NEIGHBOURS = 30  # sparse points around a place: a photo that shows none of them most likely has something before it
+MOST_WITNESSES = 50_000  # sparse points among which they are looked for
 HELPFUL_MARKS = 4  # of a point: from there on more tell little
 
 
@@ -105,6 +104,9 @@ class Estimator:
 
     Args:
         job: What is marked.
+
+    Raises:
+        SplatpipeError: if the points lie elsewhere than the photos.
     """
 
     def __init__(self, job: Job) -> None:
@@ -112,6 +114,8 @@ class Estimator:
         self._index = {name: k for k, name in enumerate(job.model.names)}
         self._located: dict[str, tuple[object, SurveyPoint]] = {}
         self._stations = stations_of(job.model, job.positions, job.frame)
+        unmarked = [SurveyPoint(point, "control", "", ()) for point in job.points]
+        self._geodetic = require_near(self._survey(unmarked), job.config, self._stations)
         self._gsd = job.model.gsd(1.0)  # of the model's units: it takes a while, and no mark changes it
 
     def estimate(self, marks: Marks) -> Estimate:
@@ -166,7 +170,7 @@ class Estimator:
 
     def _fit(self, survey: Survey, told: Told) -> _Fitted:
         job, stations = self._job, self._stations
-        site = make_site(survey, require_near(survey, job.config, stations), stations, job.frame, job.config)
+        site = make_site(survey, self._geodetic, stations, job.frame, job.config)
         start = start_similarity(site, survey, job.model, job.positions, job.frame)
         if not survey.of_role("control"):
             start = (self._lifted(start[0], site), start[1])
@@ -234,7 +238,7 @@ class Projection:
         pixels: Of each point in each photo of the model; NaN where that does not show it.
         radius_px: Around it, where it is to be looked for.
         depth: In the model's units.
-        doubtful: Whether it lies beyond the border, if only just, or something nearer seems to hide it.
+        doubtful: Whether it lies beyond the border, if only just, or something seems to hide it.
     """
 
     pixels: Float64[np.ndarray, "n m 2"]
@@ -252,14 +256,14 @@ class Projector:
 
     def __init__(self, job: Job) -> None:
         self._job = job
-        self._seen = [self._observed(index) for index in range(len(job.model.names))]
+        self._cloud, self._shows = _cloud_of(job.model)
 
     def project(self, places: Float64[np.ndarray, "n 3"], radius_m: Float64[np.ndarray, " n"]) -> Projection:
         """Where photos show places of the model, known to some radius (its units)."""
         count, photos = len(places), len(self._job.model.names)
         pixels = np.full((count, photos, 2), np.nan)
         radius, depth = np.full((count, photos), np.nan), np.full((count, photos), np.nan)
-        doubtful = np.zeros((count, photos), dtype=bool)
+        doubtful, witnessed = np.zeros((count, photos), dtype=bool), self._witnessed(places)
         for index, name in enumerate(self._job.model.names):
             photo = self._job.photos.get(name)
             if photo is None:
@@ -276,37 +280,35 @@ class Projector:
             focal = view.camera.mean_focal_length() / view.scale
             spread = np.maximum(LEAST_RADIUS_PX, focal * radius_m[ahead] / seen[ahead, 2])
             margin = np.minimum(spread, 0.25 * photo.width)[:, None]
-            inside = true & ((shown >= -margin) & (shown <= [photo.width, photo.height] + margin)).all(axis=1)
+            inside = true & ((shown >= -margin) & (shown <= np.array([photo.width, photo.height]) + margin)).all(axis=1)
             rows = ahead[inside]
             pixels[rows, index], radius[rows, index], depth[rows, index] = shown[inside], spread[inside], seen[rows, 2]
             beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)
-            doubtful[rows, index] = beyond | self._hidden(index, shown[inside], seen[rows, 2], photo.width)
+            doubtful[rows, index] = beyond | ~witnessed[rows, index]
         return Projection(pixels, radius, depth, doubtful)
 
-    def _observed(self, index: int) -> Float64[np.ndarray, "k 3"]:
-        """Pixels and depths of the sparse points that a photo of the model shows."""
-        model = self._job.model
-        photo = self._job.photos.get(model.names[index])
-        if photo is None:
-            return np.zeros((0, 3))
-        view = model.view(index, photo.width)
-        image: Any = model.reconstruction.images[model.image_ids[index]]
-        shown = [point for point in image.points2D if point.has_point3D()]
-        pixels = np.array([point.xy for point in shown], np.float64).reshape(-1, 2) / view.scale
-        places = np.array([model.reconstruction.points3D[p.point3D_id].xyz for p in shown], np.float64).reshape(-1, 3)
-        depth = places @ view.cam_from_model[2, :3] + view.cam_from_model[2, 3]
-        return np.column_stack([pixels, depth])
+    def _witnessed(self, places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n m"]:
+        """Which photos show a sparse point close to each place: what hides that is no hindrance, then."""
+        count = min(NEIGHBOURS, len(self._cloud))
+        if count == 0:
+            return np.ones((len(places), self._shows.shape[1]), dtype=bool)
+        witnessed = np.zeros((len(places), self._shows.shape[1]), dtype=bool)
+        for k in np.flatnonzero(np.isfinite(places).all(axis=1)):
+            away = ((self._cloud - places[k]) ** 2).sum(axis=1)
+            witnessed[k] = self._shows[np.argpartition(away, count - 1)[:count]].any(axis=0)
+        return witnessed
 
-    def _hidden(
-        self, index: int, pixels: Float64[np.ndarray, "k 2"], depth: Float64[np.ndarray, " k"], width: int
-    ) -> Bool[np.ndarray, " k"]:
-        """Whether what a photo shows around places is nearer than they are."""
-        seen, hidden = self._seen[index], np.zeros(len(pixels), dtype=bool)
-        for k, pixel in enumerate(pixels):
-            near = np.abs(seen[:, :2] - pixel).max(axis=1, initial=0.0) < HIDING_SHARE * width
-            if near.sum() >= LEAST_NEAR:
-                hidden[k] = float(np.percentile(seen[near, 2], 75)) < HIDING * depth[k]
-        return hidden
+
+def _cloud_of(model: SparseModel) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.ndarray, "k m"]]:
+    """Sparse points, evenly thinned where there are many, and which photos show each."""
+    every = sorted(model.reconstruction.points3D.items())
+    chosen = [point for _, point in every[:: max(1, len(every) // MOST_WITNESSES)]]
+    number = {image: k for k, image in enumerate(model.image_ids)}
+    shows = np.zeros((len(chosen), len(model.image_ids)), dtype=bool)
+    for row, point in enumerate(chosen):
+        seen = (number.get(element.image_id) for element in point.track.elements)
+        shows[row, [k for k in seen if k is not None]] = True
+    return np.array([point.xyz for point in chosen], dtype=np.float64).reshape(-1, 3), shows
 
 
 def residual_of(sighting: Sighting, point: SurveyPoint, job: Job) -> list[float] | None:

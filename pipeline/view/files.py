@@ -73,6 +73,15 @@ def open_inside(folder: Path, relative: str) -> OpenFile:
     return OpenFile(descriptor, facts.st_size, f'"{facts.st_ino:x}-{facts.st_size:x}-{facts.st_mtime_ns:x}"')
 
 
+def is_inside(folder: Path, relative: str) -> bool:
+    """Whether ``open_inside`` opens it."""
+    try:
+        os.close(open_inside(folder, relative).descriptor)
+    except NotThereError:
+        return False
+    return True
+
+
 def wanted_range(header: str | None, size: int) -> tuple[int, int] | None:
     """First byte and the one after the last that a Range header asks for; None for the whole file.
 

@@ -77,7 +77,7 @@ class Guard:
 
         try:
             self._check(scope)
-            body = await _body(receive, Headers(scope=scope)) if scope["method"] == "POST" else b""
+            body = await _body(receive) if scope["method"] == "POST" else b""
         except RefusedError as error:
             answer = PlainTextResponse(f"{error}\n", error.status, {"connection": "close"})
             await answer(scope, receive, guarded)
@@ -130,12 +130,12 @@ def _only(headers: Iterable[tuple[bytes, bytes]], name: bytes, title: str) -> st
     return found[0].decode("latin-1")
 
 
-async def _body(receive: Receive, headers: Headers) -> bytes:
-    body = b""
+async def _body(receive: Receive) -> bytes:
+    body = bytearray()
     while True:
         message: Any = await receive()
         body += message.get("body", b"")
         if len(body) > LARGEST_BODY:
             raise RefusedError(413, "It is too large.")
         if message["type"] != "http.request" or not message.get("more_body"):
-            return body
+            return bytes(body)

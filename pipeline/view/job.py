@@ -8,14 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float64
-
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.source import AUTO, NONE, open_source
 from splatpipe.pipeline.scene.control_edit import ControlText
 from splatpipe.pipeline.scene.control_file import SAME_PLACE_M, SurveyedPoint, read_control_file, read_points_file
-from splatpipe.pipeline.scene.crs import Crs, parse_crs, to_geodetic
+from splatpipe.pipeline.scene.crs import Crs, parse_crs
 from splatpipe.pipeline.scene.frames import Frame
 from splatpipe.pipeline.scene.names import NameFinder
 from splatpipe.pipeline.scene.photos import Photo, load_photo_list
@@ -24,7 +21,7 @@ from splatpipe.stages.georef.gps import NoPlaceError, georeference, read_positio
 from splatpipe.stages.georef.level import Positions
 from splatpipe.stages.georef.model import SparseModel, read_model
 from splatpipe.stages.line import GEOREF, LINE
-from splatpipe.stages.options import GeorefConfig
+from splatpipe.stages.options import GeorefConfig, LineConfig
 
 LIST_NAME, CSV_NAME = "gcp_list.txt", "control.csv"
 CONTROL = "source.control"
@@ -37,7 +34,6 @@ class Job:
     Attributes:
         points: Of the survey, with the coordinates as stated.
         crs: Of them.
-        geodetic: Latitude, longitude, height (NaN where it is not known) of each.
         photos: Of the capture, by name.
         photos_dir: Where they lie.
         photos_part: What ingest left of them.
@@ -51,7 +47,6 @@ class Job:
 
     points: tuple[SurveyedPoint, ...]
     crs: Crs
-    geodetic: Float64[np.ndarray, "n 3"]
     photos: Mapping[str, Photo]
     photos_dir: Path
     photos_part: Path
@@ -79,7 +74,7 @@ def open_job(run: Run, points_file: Path | None) -> Job:
         SplatpipeError: if the run is not so far, or there are no points, or they do not fit together.
     """
     photos_dir, config = run.config()
-    source = open_source(photos_dir, run.out, LINE, config)
+    source = open_source(photos_dir, run.out, LINE, _without_missing_control(config))
     opened = run.look()
     missing = [name for name in ("ingest.photos", "ingest.positions", "sparse.model") if name not in opened.parts]
     if missing:
@@ -90,14 +85,20 @@ def open_job(run: Run, points_file: Path | None) -> Job:
     photos = load_photo_list(opened.parts["ingest.photos"].path).by_name()
     text, points = _text_and_points(run, source.named.get(CONTROL), points_file, (source.folder, config.georef), photos)
     crs = parse_crs(text.table.crs)
-    stated = np.array([[p.x, p.y, np.nan if p.z is None else p.z] for p in points], dtype=np.float64)
-    geodetic = to_geodetic(stated, crs, config.georef.approximate_crs).geodetic
     model = read_model(opened.parts["sparse.model"].path, photos)
     positions = read_positions(opened.parts["ingest.positions"].path)
     command = _command(run, text.path, config.georef.control, source.named.get(CONTROL))
     places = (source.folder, opened.parts["ingest.photos"].path)
     frame = _frame(model, positions, config.georef)
-    return Job(points, crs, geodetic, photos, *places, model, positions, frame, config.georef, text, command)
+    return Job(points, crs, photos, *places, model, positions, frame, config.georef, text, command)
+
+
+def _without_missing_control(config: LineConfig) -> LineConfig:
+    """The options of a run whose control file was taken away: it is begun anew where it was."""
+    setting = config.georef.control
+    if setting in (AUTO, NONE) or Path(setting).is_file():
+        return config
+    return config.model_copy(update={"georef": config.georef.model_copy(update={"control": NONE})})
 
 
 def _frame(model: SparseModel, positions: Positions, config: GeorefConfig) -> Frame | None:

@@ -8,6 +8,7 @@ from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.session import EVENTS_FILE
@@ -15,6 +16,9 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.view.log import RunLog
 from splatpipe.pipeline.view.opened import Opened, Run
+
+if TYPE_CHECKING:  # torch takes seconds to load, and marking does without
+    from splatpipe.pipeline.view.checkpoint import Shown, Source
 
 LOOK_EVERY_S = 2.0
 MOST_PICTURES = 64  # that are kept: pairs of JPEGs of some 100 kB
@@ -36,7 +40,8 @@ class Live:
         self._opened = Opened({}, {}, {})
         self._looked_s = -LOOK_EVERY_S
         self._renderer = ThreadPoolExecutor(1, "render")  # one at a time
-        self._model: tuple[str, object] | None = None
+        self._model: tuple[str, Shown] | None = None
+        self._viewer: tuple[str, bytes, bytes] | None = None
         self._views: tuple[Path | None, tuple[View, ...]] = (None, ())
         self._pictures: OrderedDict[tuple[str, int], tuple[bytes, bytes]] = OrderedDict()
 
@@ -54,9 +59,10 @@ class Live:
             log = self._log
             source = checkpoint.newest(opened)
             held_out = set(checkpoint.held_out_of(source))
-            model = None
+            model: JSON = None
             if source is not None and views:
                 model = {"kind": source.kind, "stamp": source.stamp, "iteration": checkpoint.iteration_of(source)}
+                model["in_3d"] = source.plan is not None
             return {
                 "name": self._run.name,
                 "at_work": self._run.is_at_work(),
@@ -79,38 +85,60 @@ class Live:
                 ],
             }
 
-    def picture(self, stamp: str, number: int, what: str) -> bytes | None:
-        """A JPEG of a view: its ``render`` or its ``photo``; None where that model, or view, is no longer there.
+    def picture(self, number: int, what: str) -> bytes | None:
+        """A JPEG of a view: its ``render`` by the latest model or its ``photo``; None where there is no such.
 
         Raises:
             SplatpipeError: if it cannot be made.
         """
-        made = self._pictures.get((stamp, number))
-        if made is None:
-            made = self._renderer.submit(self._make, stamp, number).result()
+        made = self._renderer.submit(self._make, number).result()
         return None if made is None else made[0 if what == "render" else 1]
 
-    def _make(self, stamp: str, number: int) -> tuple[bytes, bytes] | None:
+    def viewer(self, what: str) -> bytes | None:
+        """The 3D viewer of the latest model: its ``page``, or the ``splat`` that it loads; None where there is none.
+
+        Raises:
+            SplatpipeError: if it cannot be made.
+        """
+        made = self._renderer.submit(self._make_viewer).result()
+        return None if made is None else made[0 if what == "page" else 1]
+
+    def _make_viewer(self) -> tuple[bytes, bytes] | None:
         from splatpipe.pipeline.view import checkpoint
 
-        if (stamp, number) in self._pictures:
-            return self._pictures[stamp, number]
+        with self._lock:
+            opened, _ = self._look()
+        source = checkpoint.newest(opened)
+        if source is None:
+            return None
+        if self._viewer is None or self._viewer[0] != source.stamp:
+            page, splat = checkpoint.viewer(self._load(source, opened), source, opened, self._run.name)
+            self._viewer = source.stamp, page.encode(), splat
+        return self._viewer[1:]
+
+    def _load(self, source: Source, opened: Opened) -> Shown:
+        from splatpipe.pipeline.view import checkpoint
+
+        if self._model is None or self._model[0] != source.stamp:
+            self._model = None  # two of them may not fit
+            self._model = source.stamp, checkpoint.load(source, opened)
+        return self._model[1]
+
+    def _make(self, number: int) -> tuple[bytes, bytes] | None:
+        from splatpipe.pipeline.view import checkpoint
+
         with self._lock:
             opened, views = self._look()
         source = checkpoint.newest(opened)
         if source is None or not 0 <= number < len(views):
             return None
-        if self._model is None or self._model[0] != source.stamp:
-            self._model = None  # two of them may not fit
-            self._model = source.stamp, checkpoint.load(source, opened)
-        if source.stamp != stamp:
-            return None
-        shown = self._model[1]
-        assert isinstance(shown, checkpoint.Shown)
+        if (source.stamp, number) in self._pictures:
+            return self._pictures[source.stamp, number]
+        shown = self._load(source, opened)
         if shown.megapixels is None:
             shown = replace(shown, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
         made = checkpoint.pictures(shown, views[number], RENDER_THREADS)
-        self._pictures[stamp, number] = made
+        self._pictures[source.stamp, number] = made
         while len(self._pictures) > MOST_PICTURES:
             self._pictures.popitem(last=False)
         return made

@@ -150,9 +150,9 @@ class RunLog:
     def _event(self, kind: str, stage: str, data: Mapping[str, JSON], time_s: float) -> None:
         self.last_s = time_s
         if kind == "run_started":
+            stages = {str(name): StageState(str(name)) for name in data["stages"]}
             self._begin()
-            self.started_s = self.last_s = time_s
-            self.stages = {str(name): StageState(str(name)) for name in data["stages"]}
+            self.started_s, self.last_s, self.stages = time_s, time_s, stages
         elif kind == "run_finished":
             self.finished = True
         elif kind == "metric":

@@ -8,6 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+from jaxtyping import Float64
+
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.scene.control_edit import ControlText
 from splatpipe.pipeline.scene.control_file import SurveyedPoint
@@ -23,6 +26,8 @@ from splatpipe.pipeline.view.estimate import (
 from splatpipe.pipeline.view.job import Job
 
 MOST_UNDONE = 10_000
+WIDE_RAD = math.radians(60.0)  # between rays: more tells no more
+HELPFUL_PHOTOS = 20  # of a point, in the order in which they tell most; the rest by their distance
 DIGITS = 2  # of pixels, as they are written
 State = tuple[float, float] | Literal["hidden"] | None  # of a point in a photo: its mark, or that it is not visible
 
@@ -194,16 +199,21 @@ class Marking:
         for photo in self._photos:
             row = self._seen(photo, index.get(photo), number, projection)
             sighting = shown.get(photo)
+            off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
             row |= {
                 "mark": list(self._shifted(marks[photo])) if photo in marks else None,
                 "hidden": (name, photo) in hidden,
                 "agrees": sighting.agrees if sighting is not None else True,
-                "residual_px": None
-                if sighting is None
-                else residual_of(sighting, estimate.survey.points[number], self.job),
+                "residual_px": off,
             }
             rows.append(row)
         rows.sort(key=lambda row: (row["predicted"] is None, row["doubtful"], row["rank"]))
+        sure = [row for row in rows if row["predicted"] is not None and not row["doubtful"]]
+        if sure:
+            centres = self.job.model.centres[[index[row["name"]] for row in sure]]
+            ranks = np.array([row["rank"] for row in sure])
+            order = helpful_order(estimate.places[number], centres, ranks)
+            rows[: len(sure)] = [sure[k] for k in order]
         return {"revision": revision, "name": name, "by_marks": bool(estimate.by_marks[number]), "photos": rows}
 
     def _shifted(self, pixel: tuple[float, float]) -> tuple[float, float]:
@@ -266,6 +276,27 @@ class Marking:
             "enough": len(seen) - wrong >= HELPFUL_MARKS,
             "residual_m": residual if any(value is not None for value in residual) else None,
         }
+
+
+def helpful_order(
+    place: Float64[np.ndarray, " 3"], centres: Float64[np.ndarray, "n 3"], ranks: Float64[np.ndarray, " n"]
+) -> list[int]:
+    """An order in which photos tell where a point is: near ones that see it from elsewhere than those before.
+
+    Args:
+        place: The point.
+        centres: Of the cameras.
+        ranks: Their distances, ascending; greater for those that see the point less well.
+    """
+    directions = centres - place
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-300)
+    chosen, apart = [0], np.full(len(ranks), WIDE_RAD)
+    while len(chosen) < min(len(ranks), HELPFUL_PHOTOS):
+        apart = np.minimum(apart, np.arccos(np.clip(directions @ directions[chosen[-1]], -1.0, 1.0)))
+        score = apart / ranks
+        score[chosen] = -1.0
+        chosen.append(int(np.argmax(score)))
+    return [*chosen, *(k for k in range(len(ranks)) if k not in chosen)]
 
 
 def _coordinates(point: SurveyedPoint) -> list[float | None]:

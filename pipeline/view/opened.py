@@ -16,6 +16,7 @@ from splatpipe.pipeline.engine.session import Request, load_run, survey_line
 from splatpipe.pipeline.engine.source import with_absolute_files
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.engine.store import Artifact, Part, Store, open_store
+from splatpipe.pipeline.view.files import is_inside
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
@@ -99,7 +100,7 @@ class Run:
         for stage in LINE:
             for artifact in self.store.artifacts(stage.name)[:1] if stage.deliverables else []:
                 names += [path.as_posix() for path in artifact.deliverables(stage)]
-        return tuple(name for name in names if (self.out / name).is_file() and not (self.out / name).is_symlink())
+        return tuple(name for name in names if is_inside(self.out, name))
 
     def is_at_work(self) -> bool:
         """Whether a splatpipe works in it now: it holds the lock."""

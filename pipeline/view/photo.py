@@ -1,7 +1,7 @@
 """Photos as a browser shows them: in the stored grid, in which marks count, whatever way EXIF would turn them.
 
-A JPEG goes out as it is but for its metadata: a browser that sees no EXIF turns nothing, and not a pixel is lost. What a
-browser does not draw (TIFF, 16 bits) is converted without loss.
+A JPEG goes out as it is but for its metadata: a browser that sees no EXIF turns nothing, and not a pixel is lost. What
+a browser does not draw (TIFF, 16 bits) is converted without loss.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import signal
 import socket
 import threading
 import webbrowser
@@ -37,9 +38,7 @@ ASSETS = {
     "mark.js": "text/javascript",
 }
 OF_RUN = {"content-security-policy": CSP_OF_RUN, "cache-control": "no-cache"}
-ALONE = {
-    "cross-origin-opener-policy": "same-origin"
-}  # no page of the run, which has our origin, holds a handle of ours
+ALONE = {"cross-origin-opener-policy": "same-origin"}  # from the run's pages, which have our origin
 
 
 @dataclass(frozen=True)
@@ -75,23 +74,60 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
     listening = _listen(options.port)
     live, token = Live(run), secrets.token_urlsafe(32)
     pages = Pages(run, live, token)
-    routes = pages.routes()
-    if options.mark:
-        from splatpipe.pipeline.view.job import open_job
-        from splatpipe.pipeline.view.mark_routes import MarkPages
-        from splatpipe.pipeline.view.marking import Marking
+    try:
+        routes = [*(_marking(pages, options, say) if options.mark else ()), *pages.routes()]
+        start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
+        start += "mark" if options.mark else "live" if run.is_at_work() else ""
+        _take_signals_back()
 
-        marking = Marking(open_job(run, options.points))
-        pages.marking = True
-        routes = [*MarkPages(marking, pages).routes(), *routes]
-        say(f"Marks go into {marking.job.text.path}")
-    address = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
-    start = address + ("mark" if options.mark else "live" if run.is_at_work() else "")
-    say(f"Open {start} (Ctrl-C ends it)")
-    if options.open_browser:
-        threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
-    config = uvicorn.Config(
-        make_app(routes, token),
+        def ready() -> None:
+            say(f"Open {start} (Ctrl-C ends it)")
+            if options.open_browser:
+                threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
+
+        _Server(_settings(make_app(routes, token)), ready).run(sockets=[listening])
+    except Stopped as stopped:
+        if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
+            raise
+    finally:
+        live.close()
+        listening.close()
+
+
+class _Server(uvicorn.Server):
+    """Says when it listens, and to signals as well."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._ready = ready
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to listen."""
+        await super().startup(sockets)
+        self._ready()
+
+
+def _take_signals_back() -> None:
+    """Put Python's handlers in place again: pyceres, once imported, takes SIGTERM for a crash and tells its stack."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.getsignal(number))
+
+
+def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> list[Route]:
+    """What marking adds."""
+    from splatpipe.pipeline.view.job import open_job
+    from splatpipe.pipeline.view.mark_routes import MarkPages
+    from splatpipe.pipeline.view.marking import Marking
+
+    marking = Marking(open_job(pages.run, options.points))
+    pages.marking = True
+    say(f"Marks go into {marking.job.text.path}")
+    return MarkPages(marking, pages).routes()
+
+
+def _settings(app: ASGIApp) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
         http="h11",
         ws="none",
         lifespan="off",
@@ -101,14 +137,6 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
         timeout_graceful_shutdown=1,
         limit_concurrency=64,
     )
-    try:
-        uvicorn.Server(config).run(sockets=[listening])
-    except Stopped as stopped:
-        if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
-            raise
-    finally:
-        live.close()
-        listening.close()
 
 
 def _listen(port: int) -> socket.socket:
@@ -165,7 +193,11 @@ class Pages:
             Route("/", self._landing),
             Route("/live", self._live),
             Route("/api/live", self._state),
-            Route("/live/{stamp}/{number:int}/{what}.jpg", self._picture),
+            Route(
+                "/live/{stamp}/{number:int}/{what}.jpg", self._picture
+            ),  # the stamp is the page's: a new one, new pictures
+            Route("/live/{stamp}/viewer.html", self._viewer),
+            Route("/live/{stamp}/splat.spz", self._splat),
             Route("/assets/{name}", self._asset),
             Route("/{path:path}", self._file),
         ]
@@ -189,10 +221,22 @@ class Pages:
         given = request.path_params
         if given["what"] not in ("render", "photo"):
             raise HTTPException(404)
-        made = self.live.picture(given["stamp"], given["number"], given["what"])
+        made = self.live.picture(given["number"], given["what"])
         if made is None:
             raise HTTPException(404)
-        return Response(made, media_type="image/jpeg", headers={"cache-control": "private, max-age=3600"})
+        return Response(made, media_type="image/jpeg", headers={"cache-control": "no-store"})
+
+    def _viewer(self, _request: Request) -> Response:
+        page = self.live.viewer("page")
+        if page is None:
+            raise HTTPException(404)
+        return Response(page, media_type="text/html", headers=OF_RUN)
+
+    def _splat(self, _request: Request) -> Response:
+        splat = self.live.viewer("splat")
+        if splat is None:
+            raise HTTPException(404)
+        return Response(splat, media_type="application/octet-stream", headers=OF_RUN)
 
     def _asset(self, request: Request) -> Response:
         name = request.path_params["name"]

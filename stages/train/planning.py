@@ -28,7 +28,7 @@ MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared m
 PILOT_GROWTH_A_SECOND = 150.0  # Gaussians that a second of budget pays for, about: where the forecast has to be right
 LEAST_SHARE = 0.1  # of the budget for the training, even where nothing is left: the tolerance of the whole
 FILM_VIEWS = 40  # held-out views that take as long to measure as a film of ten seconds takes to make
-EXPORT_SECONDS = 1.5  # the last stages whatever the size: digests, the report, the end of the process
+EXPORT_SECONDS = 5.5  # the last stages whatever the size: digests, the report with its pictures, the end of the process
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,8 @@ function showViews() {
   for (const id of ["view", "previous", "next"]) $(id).disabled = number < 0;
   $("nothing").hidden = Boolean(model);
   $("iteration").textContent = model ? [MODELS[model.kind], model.kind === "initial" ? "" : model.iteration?.toLocaleString("en")].join(" ") : "";
+  $("viewer").hidden = !model?.in_3d;
+  $("viewer").href = `/live/${model?.stamp}/viewer.html`;
   if (model && number >= 0) picture(model.stamp, number);
 }
 

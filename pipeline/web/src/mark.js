@@ -25,10 +25,10 @@ const KEYS = [
   ["R  Ctrl+Y", "redo"],
 ];
 
-const state = { told: null, detail: null, point: 0, photo: -1, moved: null, order: new Map(), wanted: 6 };
+const state = { told: null, detail: null, point: 0, photo: -1, moved: null, order: new Map(), wanted: 6, acting: Promise.resolve() };
 const photos = new Photos();
 const picture = new Picture($("canvas"), $("overall"), {
-  click: (place) => mark(place, false),
+  click: (place) => row() && mark(place, false),
   paint: (context, view) => paintOver(context, view, row(), state.moved),
 });
 let outbox;
@@ -167,7 +167,8 @@ async function onward() {
   const other = order.find((k) => k !== state.point && needsMore(points[k]));
   if (other != null) return choosePoint(other);
   if (next) return choosePhoto(next.photo);
-  return hint("Every point is marked wherever it is likely to be seen.");
+  const blind = state.detail.photos.every((each) => !each.predicted);
+  return hint(blind ? "Nothing tells yet where other photos show it: choose one with N and P." : "Every point is marked wherever it is likely to be seen.");
 }
 
 function remove() {
@@ -207,7 +208,7 @@ async function turnBack(what) {
 function step(by) {
   const rows = state.detail.photos;
   const at = rows.findIndex((each) => each.photo === state.photo);
-  choosePhoto(rows[(at + by + rows.length) % rows.length].photo);
+  return choosePhoto(rows[(at + by + rows.length) % rows.length].photo);
 }
 
 const stepPoint = (by) => choosePoint((state.point + by + state.told.points.length) % state.told.points.length);
@@ -292,7 +293,12 @@ function onKey(event) {
   const act = control ? turned[key] && (() => turnBack(turned[key])) : moves[key] ? () => nudge(...moves[key]) : plain[key];
   if (!act) return;
   event.preventDefault();
-  act();
+  run(act);
+}
+
+// One after the other, however fast the keys come.
+function run(act) {
+  state.acting = state.acting.then(act).catch((error) => hint(error.message, true));
 }
 
 function help() {
@@ -303,9 +309,12 @@ function help() {
 }
 
 document.addEventListener("keydown", onKey);
-$("pad").addEventListener("click", (event) => actions[event.target.closest("button")?.dataset.do]?.());
-$("undo").addEventListener("click", () => turnBack("undo"));
-$("redo").addEventListener("click", () => turnBack("redo"));
+$("pad").addEventListener("click", (event) => {
+  const act = actions[event.target.closest("button")?.dataset.do];
+  if (act && state.detail) run(act);
+});
+$("undo").addEventListener("click", () => run(() => turnBack("undo")));
+$("redo").addEventListener("click", () => run(() => turnBack("redo")));
 $("help").addEventListener("click", help);
 $("drawer").addEventListener("click", () => {
   const open = document.body.classList.toggle("drawn");
@@ -325,6 +334,7 @@ window.splatpipe = {
       return [x + box.left, y + box.top];
     },
     settled: async () => {
+      await state.acting;
       await outbox.send();
       return new Promise((done) => requestAnimationFrame(() => done(outbox.count)));
     },

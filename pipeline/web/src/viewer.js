@@ -53,9 +53,10 @@ class Viewer {
       moved();
     };
     this.frusta = new Frusta(this.photos, frustumDepth(this.photos), () => this.stage.invalidate());
-    this.measuring = new Measuring($("labels"), facts, () => this.stage.invalidate());
-    this.stage.scene.add(this.frusta.group, this.measuring.group);
+    this.measuring = new Measuring($("labels"), $("lines"), facts, () => this.stage.invalidate());
+    this.stage.scene.add(this.frusta.group);
     this.stage.beforeDraw = () => this.beforeDraw();
+    this.stage.failed = (error) => tell(`Drawing failed: ${error.message}`, "Reload this page, or try another browser.");
     this.stage.canvas.addEventListener("webglcontextlost", () => tell("The graphics card stopped drawing.", "Reload this page."));
     new ResizeObserver(() => this.stage.resize()).observe(this.stage.canvas);
     await this.addSmallParts();
@@ -172,7 +173,9 @@ class Viewer {
     const now = performance.now();
     if (now - (this.hovered ?? 0) < HOVER_MS || this.view.journey) return;
     this.hovered = now;
-    this.tellPoint(this.pick(x, y));
+    const point = this.pick(x, y);
+    this.tellPoint(point);
+    if (this.tool) this.measuring.hover(point);
   }
 
   leave() {
@@ -218,6 +221,7 @@ class Viewer {
   }
 
   showCameras(shown) {
+    if (shown) this.frusta.paint();
     this.frusta.group.visible = shown;
     $("cameras").setAttribute("aria-pressed", String(shown));
     this.stage.invalidate();
@@ -277,6 +281,7 @@ class Viewer {
 }
 
 function progress(share) {
+  $("bar").classList.add("known");
   $("bar").style.width = `${Math.round(100 * share)}%`;
 }
 

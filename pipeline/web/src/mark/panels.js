@@ -15,10 +15,9 @@ export function metres(value) {
   if (value == null || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);
   if (size >= 10) return `${value.toFixed(0)} m`;
-  return size >= 0.995 ? `${value.toFixed(1)} m` : `${(value * 100).toFixed(size >= 0.0995 ? 0 : 1)} cm`;
+  if (size >= 0.995) return `${value.toFixed(1)} m`;
+  return size >= 0.00995 ? `${(value * 100).toFixed(size >= 0.0995 ? 0 : 1)} cm` : `${(value * 1000).toFixed(0)} mm`;
 }
-
-const inGsd = (value, gsd) => (gsd && Number.isFinite(value) && value < 100 * gsd ? ` (${(value / gsd).toFixed(1)} GSD)` : "");
 
 export function showEstimate(root, told) {
   root.replaceChildren(element("h2", {}, "What the marks tell"));
@@ -27,14 +26,14 @@ export function showEstimate(root, told) {
   } else {
     const [horizontal, vertical] = told.expected_m ?? [NaN, NaN];
     const row = (title, h, v, count) =>
-      element("tr", {}, element("th", {}, title), element("td", {}, count ?? ""), element("td", {}, metres(h) + inGsd(h, told.gsd_m)), element("td", {}, metres(v) + inGsd(v, told.gsd_m)));
+      element("tr", {}, element("th", {}, title), element("td", {}, count ?? ""), element("td", {}, metres(h)), element("td", {}, metres(v)));
     const head = ["", "points", "horizontal", "height"].map((text) => element("th", {}, text));
     const table = element("table", {}, element("tr", {}, ...head));
     const { control, check } = told.tables;
     if (control) table.append(row("control, rms", control.rmse_horizontal_m, control.rmse_up_m, control.count));
     if (check) table.append(row("check, rms", check.rmse_horizontal_m, check.rmse_up_m, check.count));
     table.append(row("expected (σ)", horizontal, told.heights_tied ? vertical : NaN));
-    root.append(table);
+    root.append(table, element("p", { class: "faint" }, `A pixel is ${metres(told.gsd_m)} on the ground.`));
     if (!told.heights_tied) root.append(element("p", {}, "Heights are not tied to the survey yet: mark one point in two photos."));
   }
   for (const warning of told.warnings) root.append(element("p", { class: "warning" }, warning));
@@ -77,8 +76,8 @@ export const isLeft = (row) => row.predicted != null && !row.mark && !row.hidden
 
 export function showPhotos(root, rows, chosen, choose) {
   const groups = [
-    ["to do", (row) => isLeft(row)],
     ["marked", (row) => row.mark],
+    ["to do", (row) => isLeft(row)],
     ["perhaps", (row) => row.predicted && !row.mark && !row.hidden && row.doubtful],
     ["not visible", (row) => row.hidden],
     ["elsewhere", (row) => !row.predicted && !row.mark && !row.hidden],

@@ -3,6 +3,7 @@
 const MOST_PIXELS = 150e6; // of photos kept decoded, 4 bytes each
 const LARGEST_ZOOM = 40;
 const SHARP_FROM = 1.5; // device pixels a pixel, from which on they are drawn as squares
+const SMALL_WIDTH = 1600; // of the copy that is drawn while the view is far away: a large photo is slow to reduce
 const DRAG_PX = 4; // less is a click
 const TAP_MS = 600;
 
@@ -22,7 +23,7 @@ export class Photos {
       total += pixels;
       if (total > MOST_PIXELS && other !== number) {
         this.kept.delete(other);
-        bitmap.then((image) => image.close(), () => 0);
+        bitmap.then(({ whole, small }) => [whole, small].forEach((image) => image.close()), () => 0);
       }
     }
     return entry.bitmap;
@@ -32,7 +33,9 @@ export class Photos {
 async function load(number) {
   const answer = await fetch(`/photo/${number}`);
   if (!answer.ok) throw new Error((await answer.text()).trim());
-  return createImageBitmap(await answer.blob());
+  const whole = await createImageBitmap(await answer.blob());
+  const resizeWidth = Math.min(SMALL_WIDTH, whole.width);
+  return { whole, small: await createImageBitmap(whole, { resizeWidth, resizeQuality: "high" }) };
 }
 
 export class Picture {
@@ -122,7 +125,8 @@ export class Picture {
       const [left, top] = this.screenAt([0, 0]);
       context.imageSmoothingEnabled = this.zoom * ratio < SHARP_FROM;
       context.imageSmoothingQuality = "high";
-      context.drawImage(this.bitmap, left, top, this.size.width * this.zoom, this.size.height * this.zoom);
+      const isFar = this.zoom * ratio * this.size.width <= this.bitmap.small.width;
+      context.drawImage(isFar ? this.bitmap.small : this.bitmap.whole, left, top, this.size.width * this.zoom, this.size.height * this.zoom);
     }
     this.on.paint(context, this);
     this.paintOverall();
@@ -136,7 +140,7 @@ export class Picture {
     if (this.overall.hidden) return;
     const scale = Math.min(width / this.size.width, height / this.size.height);
     context.imageSmoothingQuality = "high";
-    context.drawImage(this.bitmap, 0, 0, this.size.width * scale, this.size.height * scale);
+    context.drawImage(this.bitmap.small, 0, 0, this.size.width * scale, this.size.height * scale);
     const [x0, y0] = this.photoAt([0, 0]);
     const [x1, y1] = this.photoAt([this.width, this.height]);
     context.strokeStyle = "#ffb000";

@@ -24,11 +24,13 @@ export class Frusta {
     this.group = new Group();
     this.group.renderOrder = 1;
     this.depth = depth;
-    this.items = photos.map((photo) => this.make(photo, depth, changed));
+    this.items = photos.map((photo) => this.make(photo, depth));
     this.marked = null;
+    this.changed = changed;
+    this.painted = false;
   }
 
-  make(photo, depth, changed) {
+  make(photo, depth) {
     const centre = new Vector3(...photo.centre);
     const four = corners(photo, depth);
     const all = [centre, ...four];
@@ -44,23 +46,27 @@ export class Frusta {
     const picture = new Mesh(quad, face);
     lines.renderOrder = picture.renderOrder = 1;
     this.group.add(lines, picture);
-    if (photo.thumb) this.paint(photo, face, changed);
     return { photo, centre, four, lines, picture };
   }
 
-  async paint(photo, face, changed) {
-    const image = new Image();
-    image.src = photo.thumb;
-    await image.decode().catch(() => null);
-    if (!image.width) return;
-    const texture = new Texture(image);
-    texture.needsUpdate = true;
-    texture.colorSpace = "srgb";
-    face.map = texture;
-    face.color.set(0xffffff);
-    face.opacity = 0.8;
-    face.needsUpdate = true;
-    changed();
+  /** Lay the photos into the frusta: once they are to be seen. */
+  async paint() {
+    if (this.painted) return;
+    this.painted = true;
+    for (const { photo, picture } of this.items.filter((item) => item.photo.thumb)) {
+      const image = new Image();
+      image.src = photo.thumb;
+      await image.decode().catch(() => null);
+      if (!image.width) continue;
+      const texture = new Texture(image);
+      texture.needsUpdate = true;
+      texture.colorSpace = "srgb";
+      picture.material.map = texture;
+      picture.material.color.set(0xffffff);
+      picture.material.opacity = 0.8;
+      picture.material.needsUpdate = true;
+    }
+    this.changed();
   }
 
   /** Hide the frusta that one looks out of. */
@@ -125,6 +131,7 @@ export function fillStrip(strip, photos, choose) {
       image.src = photo.thumb;
       image.alt = photo.name;
       image.loading = "lazy";
+      image.style.aspectRatio = `${photo.width} / ${photo.height}`; // its place is known before it is loaded
       button.append(image);
     } else {
       button.textContent = photo.name;
@@ -133,13 +140,15 @@ export function fillStrip(strip, photos, choose) {
     strip.append(button);
     return [photo, button];
   });
+  let begun = false;
   return (chosen) => {
     for (const [photo, button] of buttons) {
       const is = photo === chosen;
       button.setAttribute("aria-current", String(is));
       if (is && strip.offsetParent) {
-        strip.scrollTo({ left: button.offsetLeft - (strip.clientWidth - button.offsetWidth) / 2, behavior: "smooth" });
+        strip.scrollTo({ left: button.offsetLeft - (strip.clientWidth - button.offsetWidth) / 2, behavior: begun ? "smooth" : "instant" });
       }
     }
+    begun = true;
   };
 }

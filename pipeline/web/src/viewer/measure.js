@@ -1,26 +1,29 @@
-// Distances and heights between two clicked points: lines in the scene, labels over it.
+// Distances and heights between two clicked points: lines and labels over the picture.
 
-import { BufferGeometry, Group, LineBasicMaterial, LineDashedMaterial, LineSegments, Vector3 } from "three";
+import { Vector3 } from "three";
 
-const LABEL_ABOVE_PX = 22; // so that a label does not hide a short line
+const LABEL_ABOVE_PX = 20; // so that a label does not hide a short line
+const HALO = { width: 4.5, colour: "rgba(10, 14, 18, 0.7)" };
+const LINE = { width: 2, colour: "#ffffff" };
+const DASHES = [7, 5];
 
 export class Measuring {
-  /** @param {HTMLElement} layer Holds the labels. @param {{metres: boolean}} facts */
-  constructor(layer, facts, changed) {
-    this.layer = layer;
-    this.facts = facts;
-    this.changed = changed;
-    this.group = new Group();
+  /** @param {HTMLElement} layer Holds the labels. @param {SVGElement} drawing Holds the lines. @param {{metres: boolean}} facts */
+  constructor(layer, drawing, facts, changed) {
+    Object.assign(this, { layer, drawing, facts, changed });
     this.kind = null; // "distance", "height" or null
     this.first = null;
     this.results = [];
+    this.segments = []; // on the screen: [x, y, x, y, dashed]
     this.dot = this.label("dot");
+    this.rubber = null; // from the first point to the cursor
   }
 
   /** Begin with a tool, or end with null. */
   use(kind) {
     this.kind = kind;
     this.first = null;
+    this.hover(null);
     this.changed();
   }
 
@@ -34,6 +37,7 @@ export class Measuring {
 
   /** A clicked point: the first, or the second, which makes a measurement. */
   click(point) {
+    this.hover(null);
     if (!this.first) {
       this.first = point;
       this.changed();
@@ -44,35 +48,31 @@ export class Measuring {
     return result;
   }
 
+  /** The point under the cursor, or null: what a click would measure is shown. */
+  hover(point) {
+    if (this.rubber) this.remove(this.rubber);
+    this.rubber = this.first && point ? this.make(this.kind, this.first, point) : null;
+    this.show();
+  }
+
   /** @returns {{kind, distance, horizontal, height, from, to}} In world units. */
   add(kind, from, to) {
+    const made = this.make(kind, from, to);
+    this.results.push(made);
+    this.changed();
+    return made.result;
+  }
+
+  make(kind, from, to) {
     const height = to.z - from.z;
     const horizontal = Math.hypot(to.x - from.x, to.y - from.y);
     const result = { kind, from, to, distance: from.distanceTo(to), horizontal, height };
     const corner = new Vector3(to.x, to.y, from.z);
-    const solid = kind === "height" ? [corner, to] : [from, to];
-    const dashed = kind === "height" ? [from, corner] : [];
-    const lines = [this.line(solid, false), ...(dashed.length ? [this.line(dashed, true)] : [])];
+    const lines = kind === "height" ? [[corner, to, false], [from, corner, true]] : [[from, to, false]];
     const label = this.label("measured");
     label.textContent = kind === "height" ? `Δh ${this.told(height, true)}` : this.told(result.distance);
-    label.title = `Length ${this.told(result.distance)}, horizontal ${this.told(horizontal)}, height ${this.told(height, true)}`;
-    const ends = [this.label("dot"), this.label("dot")];
-    this.results.push({ result, lines, label, ends, middle: new Vector3().addVectors(solid[0], solid[1]).multiplyScalar(0.5) });
-    this.changed();
-    return result;
-  }
-
-  line(points, dashed) {
-    const Material = dashed ? LineDashedMaterial : LineBasicMaterial;
-    const line = new LineSegments(
-      new BufferGeometry().setFromPoints(points),
-      new Material({ color: 0xffffff, depthTest: false, transparent: true, ...(dashed ? { dashSize: points[0].distanceTo(points[1]) / 21, gapSize: points[0].distanceTo(points[1]) / 42 } : {}) }),
-    );
-    if (dashed) line.computeLineDistances();
-    line.renderOrder = 2;
-    line.frustumCulled = false;
-    this.group.add(line);
-    return line;
+    const middle = new Vector3().addVectors(lines[0][0], lines[0][1]).multiplyScalar(0.5);
+    return { result, lines, label, ends: [this.label("dot"), this.label("dot")], middle };
   }
 
   told(length, signed = false) {
@@ -84,26 +84,23 @@ export class Measuring {
   undo() {
     if (this.first) this.first = null;
     else if (this.results.length) this.remove(this.results.pop());
+    this.hover(null);
     this.changed();
   }
 
-  clear() {
-    this.first = null;
-    while (this.results.length) this.remove(this.results.pop());
-    this.changed();
-  }
-
-  remove({ lines, label, ends }) {
-    for (const line of lines) {
-      this.group.remove(line);
-      line.geometry.dispose();
-      line.material.dispose();
-    }
+  remove({ label, ends }) {
     for (const element of [label, ...ends]) element.remove();
   }
 
-  /** Move the labels to where their points are in the window. */
+  /** Move everything to where its points are in the window. */
   update(view) {
+    this.view = view;
+    this.show();
+  }
+
+  show() {
+    const { view } = this;
+    if (!view) return;
     const put = (element, point, above = 0) => {
       const { x, y, depth } = view.project(point);
       element.hidden = depth <= 0;
@@ -111,26 +108,62 @@ export class Measuring {
     };
     this.dot.hidden = !this.first;
     if (this.first) put(this.dot, this.first);
-    for (const { result, label, ends, middle } of this.results) {
+    this.segments = [];
+    for (const { result, lines, label, ends, middle } of this.rubber ? [...this.results, this.rubber] : this.results) {
       put(label, middle, LABEL_ABOVE_PX);
       put(ends[0], result.from);
       put(ends[1], result.to);
+      for (const [a, b, dashed] of lines) {
+        const segment = onScreen(view, a, b);
+        if (segment) this.segments.push([...segment, dashed]);
+      }
     }
+    this.drawing.replaceChildren(...this.segments.flatMap((segment) => [svgLine(segment, HALO), svgLine(segment, LINE)]));
   }
 
-  /** Draw the labels into a picture. */
+  /** Draw it all into a picture. */
   draw(canvas, scale) {
     const context = canvas.getContext("2d");
-    context.font = `600 ${13 * scale}px system-ui, sans-serif`;
+    context.scale(scale, scale);
+    for (const style of [HALO, LINE]) {
+      context.strokeStyle = style.colour;
+      context.lineWidth = style.width;
+      for (const [ax, ay, bx, by, dashed] of this.segments) {
+        context.setLineDash(dashed ? DASHES : []);
+        context.beginPath();
+        context.moveTo(ax, ay);
+        context.lineTo(bx, by);
+        context.stroke();
+      }
+    }
+    context.font = "600 13px system-ui, sans-serif";
     context.textAlign = "center";
     context.textBaseline = "middle";
     for (const element of this.layer.querySelectorAll(".measured:not([hidden])")) {
       const box = element.getBoundingClientRect();
-      const [x, y] = [(box.left + box.width / 2) * scale, (box.top + box.height / 2) * scale];
       context.fillStyle = "rgba(15, 20, 26, 0.85)";
-      context.fillRect(box.left * scale, box.top * scale, box.width * scale, box.height * scale);
+      context.fillRect(box.left, box.top, box.width, box.height);
       context.fillStyle = "#fff";
-      context.fillText(element.textContent, x, y);
+      context.fillText(element.textContent, box.left + box.width / 2, box.top + box.height / 2);
     }
   }
+}
+
+/** A world segment on the screen, cut at the near plane; null where all of it is behind. */
+function onScreen(view, a, b) {
+  const { near } = view.planes;
+  const [pa, pb] = [view.project(a), view.project(b)];
+  if (pa.depth < near && pb.depth < near) return null;
+  const cut = (from, to, share) => view.project(new Vector3().lerpVectors(from, to, share));
+  const start = pa.depth < near ? cut(a, b, (near - pa.depth) / (pb.depth - pa.depth)) : pa;
+  const end = pb.depth < near ? cut(a, b, (near - pa.depth) / (pb.depth - pa.depth)) : pb;
+  return [start.x, start.y, end.x, end.y];
+}
+
+function svgLine([ax, ay, bx, by, dashed], { width, colour }) {
+  const line = document.createElementNS("http://www.w3.org/2000/svg", "line");
+  const values = { x1: ax, y1: ay, x2: bx, y2: by, stroke: colour, "stroke-width": width, "stroke-linecap": "round" };
+  if (dashed) values["stroke-dasharray"] = DASHES.join(" ");
+  for (const [name, value] of Object.entries(values)) line.setAttribute(name, value);
+  return line;
 }

@@ -2,7 +2,7 @@
 
 import { BufferAttribute, BufferGeometry, Points, ShaderMaterial, Vector3 } from "three";
 
-const SIZE_PX = 2.5;
+const SIZE_PX = 3.5;
 const REACH_PX = 10; // from a click
 
 export function makePoints(xyz, rgb) {

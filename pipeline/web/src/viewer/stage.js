@@ -11,9 +11,9 @@ const SIGMAS = Math.sqrt(2 * Math.log(255)); // an opaque Gaussian is fainter th
 const REST_MS = 160; // without a movement: then the picture is drawn in full
 const POLL_MS = 4;
 const SLOW_MS = 120; // a frame that takes longer is drawn as a draft while the view moves
-const DRAFT_MS = 150; // what a draft may take
-const MOST_STRIDE = 12;
-const DRAFT_RESOLUTION = 0.5;
+const DRAFT_MS = 150; // what a draft is to take, about
+const DRAFT_SPLATS = 150_000; // a software renderer takes 1 µs for each, however small
+const LEAST_RESOLUTION = 0.3; // of a draft
 const MOST_PIXEL_RATIO = 2;
 
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -49,6 +49,7 @@ export class Stage {
     this.setStride = drawInBatches(this.spark);
     this.scene.add(this.spark);
     this.beforeDraw = () => {};
+    this.failed = () => {};
     this.mesh = null;
     this.wanted = 0;
     this.movedAt = -Infinity;
@@ -108,7 +109,7 @@ export class Stage {
     this.scheduled = true;
     const begin = () => {
       this.scheduled = false;
-      this.draw();
+      this.draw().catch((error) => this.failed(error));
     };
     if (document.hidden) setTimeout(begin, POLL_MS);
     else requestAnimationFrame(begin);
@@ -124,7 +125,7 @@ export class Stage {
     const began = performance.now();
     if (this.splatsShown && this.mesh) {
       if (resting || slow) await this.sortNow();
-      else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate());
+      else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate(), this.failed);
     }
     this.setQuality(!resting && slow);
     this.renderer.render(this.scene, this.camera);
@@ -144,9 +145,9 @@ export class Stage {
   }
 
   setQuality(draft) {
-    const stride = draft ? Math.min(MOST_STRIDE, Math.max(1, Math.round(this.fullMs / DRAFT_MS))) : 1;
-    this.setStride(stride);
-    const ratio = Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO) * (draft ? DRAFT_RESOLUTION : 1);
+    this.setStride(draft ? Math.max(1, Math.ceil(this.spark.activeSplats / DRAFT_SPLATS)) : 1);
+    const share = draft ? Math.max(LEAST_RESOLUTION, Math.sqrt(DRAFT_MS / this.fullMs)) : 1;
+    const ratio = Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO) * Math.min(1, share);
     const { width, height } = this;
     const drawn = this.drawn;
     if (drawn && drawn.ratio === ratio && drawn.width === width && drawn.height === height) return;

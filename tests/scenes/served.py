@@ -1,0 +1,113 @@
+"""A real ``splatpipe view`` process, and requests to it byte by byte as no client would send them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+WRITTEN_INTO = ("events.jsonl", "splatpipe.log", ".lock")
+ADDRESS = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back.
+
+    Attributes:
+        status: 0 where the server closed without a word.
+        headers: By their names in small letters.
+        body: As it was sent.
+    """
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+
+@dataclass(frozen=True)
+class Served:
+    """A server.
+
+    Attributes:
+        port: Its port.
+        start: The page that it opens.
+        process: It.
+    """
+
+    port: int
+    start: str
+    process: subprocess.Popen[str]
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def ask(
+        self, target: str | bytes, *lines: str, method: str = "GET", host: str | None = "", body: bytes = b""
+    ) -> Answer:
+        """Send one request and read all of the answer.
+
+        Args:
+            target: As it goes into the first line.
+            lines: Further headers.
+            method: The method.
+            host: Of the Host header; empty for the right one, None for none.
+            body: What follows.
+        """
+        raw = target if isinstance(target, bytes) else target.encode("latin-1")
+        headers = [f"Host: {host or f'127.0.0.1:{self.port}'}"] if host is not None else []
+        head = b"%s %s HTTP/1.1\r\n" % (method.encode(), raw)
+        head += "".join(f"{line}\r\n" for line in [*headers, *lines, "Connection: close"]).encode("latin-1") + b"\r\n"
+        return self.send(head + body)
+
+    def send(self, raw: bytes) -> Answer:
+        """Send bytes and read all that comes back."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=30) as connection:
+            with contextlib.suppress(OSError):  # refused before all of it was sent
+                connection.sendall(raw)
+            received = b""
+            with contextlib.suppress(ConnectionResetError):
+                while chunk := connection.recv(1 << 16):
+                    received += chunk
+        head, _, body = received.partition(b"\r\n\r\n")
+        first, *rest = head.decode("latin-1").split("\r\n")
+        fields = (line.partition(": ") for line in rest)
+        return Answer(int(first.split()[1]) if first else 0, {name.lower(): value for name, _, value in fields}, body)
+
+
+@contextlib.contextmanager
+def serving(out: Path, *options: object) -> Iterator[Served]:
+    """``splatpipe view OUT`` while the context lasts."""
+    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "view", str(out), "--no-browser", *map(str, options)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        told = ""
+        for line in process.stderr:
+            told += line
+            if found := ADDRESS.search(line):
+                yield Served(int(found.group(1)), found.group(2), process)
+                break
+        else:
+            raise AssertionError(told)
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+
+
+def linked_copy(run: Path, target: Path) -> Path:
+    """A copy of a run that may go on: what a run replaces is a hard link, what it writes into is not."""
+
+    def copy(source: str, place: str) -> None:
+        (shutil.copy2 if Path(source).name in WRITTEN_INTO else os.link)(source, place)
+
+    return Path(shutil.copytree(run, target, copy_function=copy))

@@ -1,0 +1,125 @@
+"""The live page in a real browser while a real training runs."""
+
+import io
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Page
+
+from splatpipe.demo import capture_path
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from served import Served, linked_copy, serving
+
+PATIENCE_S = 240.0  # far more than it takes; of a busy machine
+
+
+@pytest.fixture
+def training(demo_run: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
+    """The demo, trained again and for longer; all before it is reused."""
+    out = linked_copy(demo_run, tmp_path / "out")
+    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "run", str(capture_path()), str(out), "--threads", "1"]
+    command += ["--config", str(demo_run / "config.toml"), "--set", "train.iterations=20000"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    yield out, process
+    process.send_signal(signal.SIGTERM)
+    process.wait(timeout=60)
+
+
+def wait(page: Page, until: Callable[[Any], bool]) -> Any:
+    """The page's state, as soon as it is as wanted."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        told = page.evaluate("splatpipe.live.state()")
+        if told is not None and until(told):
+            return told
+        page.wait_for_timeout(250)
+    raise AssertionError(told and {**told, "curves": {}, "views": []})
+
+
+def wait_for_work(out: Path) -> None:
+    from splatpipe.pipeline.view.opened import open_run
+
+    deadline = time.monotonic() + PATIENCE_S
+    while not open_run(out).is_at_work() and time.monotonic() < deadline:
+        time.sleep(0.1)
+
+
+def shown(page: Page, name: str) -> np.ndarray:
+    """The picture that the page shows, as it came."""
+    page.locator(f"#{name}:not([hidden])").wait_for()
+    address = page.evaluate(f"document.getElementById('{name}').src")
+    answer = page.request.get(address)
+    with Image.open(io.BytesIO(answer.body())) as picture:
+        return np.asarray(picture.convert("RGB"), np.float64)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return 10.0 * math.log10(255.0**2 / float(((a - b) ** 2).mean()))
+
+
+def test_the_page_follows_a_training_from_its_start_to_its_stop(
+    training: tuple[Path, subprocess.Popen[bytes]], open_page: Callable
+) -> None:
+    out, process = training
+    wait_for_work(out)
+    with serving(out) as server:
+        assert server.start == "live"
+        watched = open_page(f"{server.address}/{server.start}")
+        page = watched.page
+        told = wait(page, lambda told: told["model"] and len(told["curves"].get("loss", [])) > 0)
+        assert told["at_work"] and told["model"]["kind"] == "initial"
+        assert [stage["state"] for stage in told["stages"] if stage["name"] in ("ingest", "undistort")] == [
+            "reused"
+        ] * 2
+        first, photo = shown(page, "render"), shown(page, "photo")
+        assert first.shape == photo.shape
+        follow_the_curves(page, len(told["curves"]["loss"]))
+        before = page.evaluate("document.getElementById('render').src")
+        told = wait(page, lambda told: told["model"]["kind"] == "checkpoint" and told["model"]["iteration"] > 0)
+        page.locator(f"#render:not([src='{before.removeprefix(server.address)}'])").wait_for()
+        page.wait_for_timeout(1500)
+        assert page.evaluate("document.getElementById('render').src") != before
+        assert page.locator("#iteration").inner_text().startswith("iteration ")
+        assert psnr(shown(page, "render"), photo) > psnr(first, photo) + 3.0
+        page.keyboard.press("ArrowRight")
+        page.wait_for_timeout(1500)
+        assert shown(page, "photo").shape == photo.shape and not np.array_equal(shown(page, "photo"), photo)
+        process.send_signal(signal.SIGTERM)
+        process.wait(timeout=60)
+        wait(page, lambda told: not told["at_work"])
+        page.locator("#state.failed").wait_for()
+        assert "train" in page.locator("#state").inner_text()
+        assert watched.errors == []
+        assert all(url.startswith(server.address) for url in watched.requests)
+
+
+def follow_the_curves(page: Page, points: int) -> None:
+    """The curves grow, on the page as in its data, and the time that is left is told."""
+    for _ in range(2):
+        told = wait(page, lambda told, points=points: len(told["curves"]["loss"]) > points)
+        points = len(told["curves"]["loss"])
+        assert told["curves"]["gaussians"][-1][1] > 100
+    assert page.locator("#loss canvas").count() == 1 and page.locator("#gaussians canvas").count() == 1
+    page.get_by_text("left in train").wait_for()
+    done = float(page.locator("#progress").get_attribute("aria-valuenow") or -1)
+    assert 0.0 <= done < 100.0 and "iterations" in page.locator("#progress span").inner_text()
+
+
+def test_before_anything_is_there_the_page_says_so(tmp_path: Path, open_page: Callable) -> None:
+    (tmp_path / "out" / "stages").mkdir(parents=True)
+    with serving(tmp_path / "out") as server:
+        served: Served = server
+        watched = open_page(f"{served.address}/live", 390, 844, True)
+        watched.page.get_by_text("the training has not begun").wait_for()
+        assert watched.page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert watched.errors == []

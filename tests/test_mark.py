@@ -1,0 +1,397 @@
+"""Control points marked in a real browser, against the demo's truth; and everything that a mark must survive."""
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Page
+
+from splatpipe.demo import CAPTURE, capture_path
+from splatpipe.demo.truth import true_poses
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.scene.control_edit import ControlText
+from splatpipe.pipeline.scene.control_file import read_control_file
+from splatpipe.pipeline.scene.names import NameFinder
+from splatpipe.pipeline.view.job import open_job
+from splatpipe.pipeline.view.marking import Marking, WrongRequestError
+from splatpipe.pipeline.view.opened import open_run
+from splatpipe.pipeline.view.photo import without_metadata
+from splatpipe.stages.georef.level import Positions
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from served import Served, linked_copy, serving
+
+TRUTH = {point["name"]: point for point in json.loads((CAPTURE / "truth.json").read_text())["points"]}
+TWELVE = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08", "P15", "P16", "P17", "P18")
+MARKS = 4  # of a point
+GSD_M = 0.0278  # of the capture as a whole; that of the photos which are marked is smaller
+POINTS = "EPSG:32633\nname,x,y,z\n" + "".join(
+    "{},{:.4f},{:.4f},{:.4f}\n".format(name, *point["utm_m"]) for name, point in TRUTH.items()
+)
+
+
+def splatpipe(*arguments: object) -> None:
+    command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def by_gps_alone(demo_run: Path, home: Path) -> Path:
+    """The demo without its control, georeferenced by GPS; the photos lie in a folder of its own that has none."""
+    shutil.copytree(capture_path(), home / "photos of a house")
+    (home / "points.csv").write_text(POINTS)
+    out = linked_copy(demo_run, home / "out")
+    config = re.sub(r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text())
+    (out / "config.toml").unlink()
+    (out / "config.toml").write_text(config)
+    splatpipe("stage", "georef", out, "--set", "georef.control=none", "--set", "export.viewer_megabytes=0.0")
+    return out
+
+
+@pytest.fixture(scope="module")
+def gps_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return by_gps_alone(demo_run, tmp_path_factory.mktemp("survey"))
+
+
+@pytest.fixture
+def marking(gps_run: Path) -> Iterator[tuple[Served, Path]]:
+    """The server with the control file that it writes, which begins as none."""
+    file = gps_run.parent / "photos of a house" / "gcp_list.txt"
+    file.unlink(missing_ok=True)
+    config = (gps_run / "config.toml").read_bytes()
+    with serving(gps_run, "--mark", "--points", gps_run.parent / "points.csv") as server:
+        assert server.start == "mark"
+        yield server, file
+    (gps_run / "config.toml").write_bytes(config)
+
+
+def state(page: Page) -> Any:
+    """What the page shows, once nothing is on its way any more."""
+    assert page.evaluate("splatpipe.mark.settled()") == 0
+    return page.evaluate("splatpipe.mark.state()")
+
+
+def opened(open_page: Callable, server: Served, *size: object) -> Any:
+    watched = open_page(f"{server.address}/mark", *size)
+    watched.page.evaluate("splatpipe.mark.ready")
+    return watched
+
+
+def click(page: Page, pixel: list[float]) -> None:
+    """Click where the photo has a pixel; where that is out of sight, after a look at the whole photo."""
+    if not in_sight(page, page.evaluate("(at) => splatpipe.mark.screenAt(at)", pixel)):
+        page.keyboard.press("f")
+        page.wait_for_timeout(50)
+    page.mouse.click(*page.evaluate("(at) => splatpipe.mark.screenAt(at)", pixel))
+
+
+def in_sight(page: Page, at: list[float]) -> bool:
+    box = page.locator("#canvas").bounding_box()
+    assert box is not None
+    return box["x"] < at[0] < box["x"] + box["width"] and box["y"] < at[1] < box["y"] + box["height"]
+
+
+def marks_in(file: Path) -> dict[tuple[str, str], tuple[float, float]]:
+    return {
+        (point.name, mark.photo): (mark.x, mark.y) for point in read_control_file(file).points for mark in point.marks
+    }
+
+
+def test_twelve_points_marked_in_the_browser_georeference_the_demo(
+    marking: tuple[Served, Path], gps_run: Path, open_page: Callable
+) -> None:
+    """As a surveyor does it: click and Enter, X where the point cannot be seen; then the command that the page names.
+
+    The bars are those of the georeferencing: check points within a ground pixel, and one and a half in height.
+    """
+    server, file = marking
+    watched = opened(open_page, server, 1000, 640)
+    page = watched.page
+    page.locator("#file select").select_option("4")
+    errors, unseen = [], 0
+    for _ in range(400):
+        now = state(page)
+        done = {point["name"] for point in now["told"]["points"] if point["marks"] >= MARKS}
+        if done >= set(TWELVE):
+            break
+        if now["told"]["expected_m"] and (not errors or errors[-1] != now["told"]["expected_m"]):
+            errors.append(now["told"]["expected_m"])
+        point, photo = now["point"], now["photo"]
+        if point not in TWELVE or point in done:
+            page.keyboard.press("j")
+        elif photo in TRUTH[point]["seen_px"]:
+            click(page, TRUTH[point]["seen_px"][photo])
+            page.keyboard.press("Enter")
+        else:
+            page.keyboard.press("x")
+            unseen += 1
+    assert unseen <= len(TWELVE)  # the page seldom asks for a point where something hides it
+    assert done >= set(TWELVE)
+    assert errors[0][0] > 1.0 and errors[-1][0] < 0.03 and errors[-1][1] < 0.03
+    told = now["told"]
+    assert told["file"] == str(file) and told["tables"]["check"]["rmse_horizontal_m"] < 0.03
+    assert watched.errors == [] and all(url.startswith(server.address) for url in watched.requests)
+    for (name, photo), pixel in marks_in(file).items():
+        np.testing.assert_allclose(pixel, TRUTH[name]["seen_px"][photo], atol=0.3)
+    command = shlex.split(told["command"])
+    assert command[0] == "splatpipe"
+    splatpipe(*command[1:])
+    metrics = json.loads((gps_run / "metrics.json").read_text())["accuracy"]
+    control, check = (metrics["tables"][role] for role in ("control", "check"))
+    assert (control["count"], check["count"]) == (8, 4)
+    assert check["rmse_horizontal_m"] <= metrics["gsd_m"] and check["rmse_up_m"] <= 1.5 * metrics["gsd_m"]
+    assert metrics["gsd_m"] <= GSD_M
+    assert cameras_off_m(gps_run) < 3.0 * GSD_M
+
+
+def cameras_off_m(out: Path) -> float:
+    """Root mean square distance of the cameras from the true ones, in the true frame: no mark, no fit of ours."""
+    import pyproj
+
+    georef = json.loads((out / "georef.json").read_text())
+    frame = json.loads((CAPTURE / "truth.json").read_text())["frame"]["origin"]
+    to_truth = pyproj.Transformer.from_pipeline(
+        "+proj=topocentric +ellps=WGS84 +lat_0={latitude} +lon_0={longitude} +h_0={height_m}".format(**frame)
+    )
+    off = []
+    for camera in json.loads((out / "cameras.json").read_text()):
+        place = np.array(georef["exact_path"]["matrix"]) @ np.append(camera["position"], 1.0)
+        pose = true_poses()[camera["img_name"]]
+        off.append(np.array(to_truth.transform(*place[:3])) + pose[:3, :3].T @ pose[:3, 3])
+    return float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean()))
+
+
+def test_keys_move_remove_hide_and_take_back(marking: tuple[Served, Path], open_page: Callable) -> None:
+    server, file = marking
+    page = opened(open_page, server).page
+    page.evaluate("splatpipe.mark.goTo('P16', 'DJI_0034.JPG')")
+    pixel = TRUTH["P16"]["seen_px"]["DJI_0034.JPG"]
+    key = ("P16", "DJI_0034.JPG")
+
+    def marked() -> tuple[float, float] | None:
+        state(page)
+        return marks_in(file).get(key)
+
+    page.keyboard.press("Enter")  # the expected place alone is no measurement
+    state(page)
+    assert not file.exists() and "no measurement" in page.locator("#hint").inner_text()
+    click(page, pixel)
+    x, y = marked() or (0.0, 0.0)
+    assert (x, y) == pytest.approx(pixel, abs=0.3)
+    for name in ("ArrowRight", "ArrowRight", "ArrowDown", "Shift+ArrowLeft", "Shift+ArrowUp"):
+        page.keyboard.press(name)
+    assert marked() == pytest.approx((x + 1.9, y + 0.9), abs=0.011)
+    page.keyboard.press("u")  # the moves and the click are one
+    state(page)
+    assert "P16" not in [point.name for point in read_points(file)]
+    page.keyboard.press("r")
+    assert marked() == pytest.approx((x + 1.9, y + 0.9), abs=0.011)
+    page.keyboard.press("Delete")
+    state(page)
+    page.keyboard.press("Control+z")
+    assert marked() == pytest.approx((x + 1.9, y + 0.9), abs=0.011)
+    page.keyboard.press("x")
+    assert state(page)["photo"] != "DJI_0034.JPG" and "# not visible:\tP16\tDJI_0034.JPG" in file.read_text()
+    page.keyboard.press("Control+z")
+    now = state(page)
+    assert (now["point"], now["photo"]) == key and marked() == pytest.approx((x + 1.9, y + 0.9), abs=0.011)
+    page.keyboard.press("n")
+    page.keyboard.press("p")
+    assert state(page)["photo"] == "DJI_0034.JPG"
+    page.keyboard.press("PageDown")
+    assert state(page)["point"] == "P17"
+
+
+def read_points(file: Path) -> list[Any]:
+    lines = [line for line in file.read_text().splitlines()[1:] if not line.startswith("#")]
+    return list(read_control_file(file).points) if lines else []
+
+
+def test_a_mark_survives_the_server_s_death(gps_run: Path, open_page: Callable) -> None:
+    file = gps_run.parent / "photos of a house" / "gcp_list.txt"
+    file.unlink(missing_ok=True)
+    options = ("--mark", "--points", gps_run.parent / "points.csv")
+    with serving(gps_run, *options) as server:
+        page = opened(open_page, server).page
+        page.evaluate("splatpipe.mark.goTo('P17', 'DJI_0034.JPG')")
+        server.process.kill()
+        server.process.wait()
+        click(page, TRUTH["P17"]["seen_px"]["DJI_0034.JPG"])
+        page.get_by_text("1 change not saved").wait_for()
+    assert not file.exists()
+    with serving(gps_run, *options, "--port", server.port) as server:
+        page.get_by_text("Load it again").wait_for()  # the new server has a secret of its own
+        page.on("dialog", lambda dialog: dialog.accept())
+        page.reload()
+        page.evaluate("splatpipe.mark.ready")
+        assert ("P17", "DJI_0034.JPG") in marks_in(file)
+        assert state(page)["waiting"] == 0
+
+
+def test_lines_of_others_stay_and_their_changes_count(gps_run: Path, open_page: Callable) -> None:
+    file = gps_run.parent / "photos of a house" / "gcp_list.txt"
+    x, y, z = TRUTH["P01"]["utm_m"]
+    written = f"# by hand\r\nEPSG:32633\r\n{x:.4f} {y:.4f} {z:.4f} 1 2 ELSEWHERE.JPG P01 extra 7\r\n\r\n# end\r\n"
+    file.write_bytes(written.encode())
+    with serving(gps_run, "--mark", "--points", gps_run.parent / "points.csv") as server:
+        page = opened(open_page, server).page
+        page.evaluate("splatpipe.mark.goTo('P02', 'DJI_0009.JPG')")
+        click(page, TRUTH["P02"]["seen_px"]["DJI_0009.JPG"])
+        state(page)
+        with file.open("ab") as stream:
+            stream.write(b"# added meanwhile\r\n")
+        page.evaluate("splatpipe.mark.goTo('P01', 'DJI_0005.JPG')")
+        click(page, TRUTH["P01"]["seen_px"]["DJI_0005.JPG"])
+        state(page)
+    text = file.read_bytes().decode()
+    kept = [line for line in text.split("\r\n") if "DJI_" not in line]
+    assert kept == [*written.split("\r\n")[:-1], "# added meanwhile", ""]
+    assert {("P01", "DJI_0005.JPG"), ("P02", "DJI_0009.JPG"), ("P01", "ELSEWHERE.JPG")} == set(marks_in(file))
+    file.unlink()
+
+
+def posted(server: Served, body: bytes, *lines: str, path: str = "/api/mark/change", token: str = "") -> int:
+    page = server.ask("/mark").body.decode()
+    found = re.search(r'name="splatpipe-token" content="([\w-]+)"', page)
+    assert found is not None
+    headers = ["Content-Type: application/json", f"X-Splatpipe-Token: {token or found.group(1)}", *lines]
+    if not any(line.lower().startswith(("content-length", "transfer-encoding")) for line in lines):
+        headers.append(f"Content-Length: {len(body)}")
+    return server.ask(path, *headers, method="POST", body=body).status
+
+
+def test_only_the_page_s_own_words_are_written(marking: tuple[Served, Path], open_page: Callable) -> None:
+    server, file = marking
+    good = b'{"point": 0, "photo": 4, "action": "mark", "x": 10.5, "y": 20}'
+    assert posted(server, good, token="x" * 43) == 403
+    assert posted(server, good, "Origin: http://elsewhere.example") == 403
+    assert posted(server, good, "Origin: null") == 403
+    assert posted(server, good, f"Origin: http://localhost:{server.port}") == 403
+    assert posted(server, good, "Sec-Fetch-Site: cross-site") == 403
+    assert posted(server, good, "Content-Length: 99999999999") == 413
+    assert posted(server, b"0\r\n\r\n", "Transfer-Encoding: chunked") in (400, 411)
+    assert posted(server, good, "Content-Length: 5", "Content-Length: 6") == 400
+    assert server.ask("/mark", "Sec-Fetch-Dest: iframe").status == 403
+    assert server.ask("/mark", "Sec-Fetch-Dest: empty").status == 403
+    bad: list[object] = [
+        *([], 3, None, "x", {}, {"point": 0}),
+        *({"point": number, "photo": 4, "action": "unmark"} for number in (-1, 18, 10**30, 0.0, True, "0", None, [0])),
+        *({"point": 0, "photo": number, "action": "hide"} for number in (-1, 40, "../x", 1e400)),
+        *({"point": 0, "photo": 4, "action": act, "x": 1, "y": 1} for act in ("", None, "MARK", "__class__", ["mark"])),
+        *(
+            {"point": 0, "photo": 4, "action": "mark", "x": x, "y": 20}
+            for x in (-0.1, 1200.1, 1e309, 10**400, "5", None)
+        ),
+        {"point": 0, "photo": 4, "action": "mark", "x": float("nan"), "y": 1},
+        {"point": 0, "photo": 4, "action": "mark", "x": True, "y": 1},
+    ]
+    assert [body for body in bad if posted(server, json.dumps(body).encode()) != 400] == []
+    for raw in (b"", b"{", b"\xff\xfe", b"[" * 8000, b'{"point":' * 1000):
+        assert posted(server, raw) == 400
+    page = open_page((CAPTURE / "truth.json").as_uri()).page  # of another origin, with the cookies it may have
+    sent = "(url) => fetch(url, { method: 'POST', mode: 'no-cors', body: '{}' }).then(() => 'sent', () => 'refused')"
+    page.evaluate(sent, f"{server.address}/api/mark/change")
+    assert not file.exists()
+    assert posted(server, good) == 200 and marks_in(file) == {("P01", "DJI_0005.JPG"): (10.5, 20.0)}
+
+
+def test_a_phone_shows_and_marks_by_touch(marking: tuple[Served, Path], open_page: Callable) -> None:
+    server, file = marking
+    watched = opened(open_page, server, 390, 844, True)
+    page = watched.page
+    page.evaluate("splatpipe.mark.goTo('P16', 'DJI_0034.JPG')")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    for name in ("Accept", "Remove", "Not visible", "Undo", "Points"):
+        box = page.get_by_role("button", name=name, exact=True).bounding_box()
+        assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["y"] + box["height"] <= 844
+    page.touchscreen.tap(*page.evaluate("(at) => splatpipe.mark.screenAt(at)", TRUTH["P16"]["seen_px"]["DJI_0034.JPG"]))
+    state(page)
+    assert marks_in(file)["P16", "DJI_0034.JPG"] == pytest.approx(TRUTH["P16"]["seen_px"]["DJI_0034.JPG"], abs=2.0)
+    page.get_by_role("button", name="→").tap()
+    page.get_by_role("button", name="Accept").tap()
+    assert state(page)["photo"] != "DJI_0034.JPG"
+    page.get_by_role("button", name="Points", exact=True).tap()
+    page.locator("#list li", has_text="P07").tap()
+    assert state(page)["point"] == "P07"
+    assert watched.errors == []
+
+
+def test_what_cannot_be_marked_is_told(gps_run: Path, tmp_path: Path) -> None:
+    def told(points: Path | None = None) -> str:
+        with pytest.raises(SplatpipeError) as caught:
+            Marking(open_job(open_run(gps_run), points))
+        return f"{caught.value.message} {caught.value.hint}"
+
+    (gps_run.parent / "photos of a house" / "gcp_list.txt").unlink(missing_ok=True)
+    assert "--points FILE" in told()
+    points = tmp_path / "points.csv"
+    assert "cannot be read" in told(points)
+    points.write_text("name,x,y,z\nP1,1,2,3\n")
+    assert "names no CRS" in told(points)
+    points.write_text("EPSG:32633\n")
+    assert "points.csv" in told(points)
+    points.write_bytes(b"\x00\xff" * 100)
+    assert "no UTF-8 text" in told(points)
+    control = gps_run.parent / "photos of a house" / "gcp_list.txt"
+    control.write_text("EPSG:25833\n388710 5299705 512 1 2 DJI_0001.JPG P99\n")
+    points.write_text(POINTS)
+    assert "One control file has one CRS" in told(points)
+    control.write_text("EPSG:32633\n388711 5299705 512 1 2 DJI_0001.JPG P01\n")
+    assert "other coordinates" in told(points)
+    control.unlink()
+    points.write_text(POINTS.replace("EPSG:32633", "EPSG:25832"))  # the neighbour's zone
+    assert "km from where the photos were taken" in told(points)
+
+
+def test_three_points_make_a_frame_where_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
+    """Before that nothing is expected anywhere; then every other point is, to a few pixels. A wrong mark is told."""
+    job = open_job(open_run(gps_run), gps_run.parent / "points.csv")
+    text = ControlText.begin(tmp_path / "gcp_list.txt", "EPSG:32633", False, NameFinder(job.photos))
+    marking = Marking(replace(job, frame=None, positions=Positions({}, {}), text=text))
+    assert not marking.overview()["placed"]
+    assert all(row["predicted"] is None for row in marking.detail("P07")["photos"])
+    for name in ("P01", "P04", "P05", "P16"):
+        for photo, (x, y) in list(TRUTH[name]["seen_px"].items())[:4]:
+            marking.change(name, photo, (x, y))
+    told = marking.overview()
+    assert told["placed"] and told["heights_tied"] and max(told["expected_m"]) < 0.1 and not told["warnings"]
+    rows = {row["name"]: row for row in marking.detail("P07")["photos"]}
+    for photo, pixel in TRUTH["P07"]["seen_px"].items():
+        assert rows[photo]["predicted"] == pytest.approx(pixel, abs=8.0)
+    photo, (x, y) = list(TRUTH["P01"]["seen_px"].items())[4]
+    marking.change("P01", photo, (x + 60.0, y))
+    assert marking.overview()["points"][0]["wrong"] == 1
+    row = next(row for row in marking.detail("P01")["photos"] if row["name"] == photo)
+    assert not row["agrees"] and row["residual_px"] == pytest.approx([-60.0, 0.0], abs=2.0)
+    for wrong in (("P0", photo, None), ("P01", "none.jpg", None), ("P01", photo, (-1.0, 0.0))):
+        with pytest.raises(WrongRequestError):
+            marking.change(*wrong)
+
+
+def test_a_turned_photo_is_shown_as_it_is_stored(tmp_path: Path, open_page: Callable) -> None:
+    """Marks count in the stored grid: the browser must not turn what EXIF would have turned."""
+    rng = np.random.default_rng(1)
+    picture = Image.fromarray(rng.integers(0, 255, (30, 50, 3), np.uint8))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture.save(tmp_path / "turned.jpg", exif=exif, quality=95, comment=b"hello")
+    stripped = without_metadata((tmp_path / "turned.jpg").read_bytes())
+    (tmp_path / "stripped.jpg").write_bytes(stripped)
+    assert b"Exif" not in stripped and b"hello" not in stripped
+    with Image.open(tmp_path / "turned.jpg") as before, Image.open(tmp_path / "stripped.jpg") as after:
+        assert np.array_equal(np.asarray(before), np.asarray(after))
+    page = open_page((tmp_path / "stripped.jpg").as_uri()).page
+    assert page.evaluate("[document.images[0].naturalWidth, document.images[0].naturalHeight]") == [50, 30]
+    for broken in (b"", b"\xff\xd8", b"\xff\xd8\xff\xe1\x00\x00", b"\xff\xd8\xff", b"PNG", stripped[:20]):
+        with pytest.raises(ValueError, match="JPEG"):
+            without_metadata(broken)

@@ -1,0 +1,381 @@
+"""The report: of finished, stopped and failed runs it tells the truth, in a real browser and without a network."""
+
+import base64
+import fcntl
+import io
+import json
+import math
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from splatpipe.demo import capture_path
+from splatpipe.pipeline.report import make_report, write_report
+from splatpipe.pipeline.report.holdings import open_holdings
+from splatpipe.pipeline.report.page import report_page
+from splatpipe.pipeline.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.report.verdict import judge
+from splatpipe.stages.line import LINE
+
+QUICK = ("features.extractor=opencv-sift", "features.max_image_size=700", "undistort.max_megapixels=0.03")
+HOSTILE = '<script>document.title = "taken"</script><img src="http://example.org/x.png">&"\''
+
+
+def sets(*assignments: str) -> list[str]:
+    return [part for text in assignments for part in ("--set", text)]
+
+
+def splatpipe(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def words(watched: object) -> str:
+    """All that a page says, its closed parts too, blanks made one."""
+    return " ".join(watched.page.evaluate("document.body.textContent").split())  # type: ignore[attr-defined]
+
+
+def headline(watched: object) -> str:
+    return str(watched.page.locator(".verdict h2").inner_text())  # type: ignore[attr-defined]
+
+
+def state_of(watched: object, stage: str) -> str:
+    row = watched.page.locator("#making tr", has=watched.page.get_by_role("rowheader", name=stage, exact=True))  # type: ignore[attr-defined]
+    return str(row.locator("td").first.inner_text())
+
+
+@pytest.fixture(scope="module")
+def finished(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the finished run, whose report this test's own code wrote."""
+    out = shutil.copytree(demo_run, tmp_path_factory.mktemp("finished") / "out")
+    write_report(out)
+    return out
+
+
+@pytest.fixture
+def copy_of_run(demo_run: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(demo_run, tmp_path / "out")
+
+
+def test_a_run_leaves_a_report_that_opens_offline_without_a_request(
+    demo_run: Path, open_page: Callable[..., object]
+) -> None:
+    watched = open_page((demo_run / "report.html").as_uri())
+    assert (watched.requests, watched.errors) == ([], [])
+    assert headline(watched).startswith("Finished")
+    said = words(watched)
+    assert "could not be read" not in said
+    assert "All 40 photos were placed" in said and "6 check points are off by" in said
+    metrics = json.loads((demo_run / "metrics.json").read_text())
+    assert f"{metrics['psnr']:.2f}" in said and f"{metrics['gaussians']:,}" in said
+    table = metrics["accuracy"]["tables"]["check"]
+    assert f"{table['rmse_3d_m']:.3f}" in watched.page.locator("#placing table").first.inner_text()
+    for stage in LINE:
+        assert state_of(watched, stage.name) == "finished"
+
+
+def test_links_lead_to_the_files_beside_it_and_nowhere_else(finished: Path, open_page: Callable[..., object]) -> None:
+    watched = open_page((finished / "report.html").as_uri())
+    links = watched.page.eval_on_selector_all("a[href]", "all => all.map(a => a.getAttribute('href'))")
+    for link in links:
+        assert link.startswith("#") or (finished / link).exists(), link
+    assert {"splat.ply", "georef.json", "metrics.json", "config.toml"} <= set(links)
+    anchors = [link for link in links if link.startswith("#")]
+    assert all(watched.page.locator(anchor).count() == 1 for anchor in anchors)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
+def test_it_fits_a_desktop_and_a_phone(
+    finished: Path, open_page: Callable[..., object], width: int, height: int
+) -> None:
+    watched = open_page((finished / "report.html").as_uri(), width=width, height=height, touch=width < 500)
+    assert watched.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert watched.page.locator(".trouble").all_inner_texts() == []
+    assert watched.page.locator(".chart svg").count() >= 12
+    assert watched.page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
+
+
+def test_its_ids_are_unique(finished: Path) -> None:
+    ids = re.findall(r'\bid="([^"]+)"', (finished / "report.html").read_text())
+    assert len(ids) == len(set(ids))
+
+
+def test_held_out_photos_come_worst_first_and_the_slider_moves_the_cut(
+    finished: Path, open_page: Callable[..., object]
+) -> None:
+    watched = open_page((finished / "report.html").as_uri())
+    views = json.loads((finished / "metrics.json").read_text())["per_view"]
+    order = [view["name"] for view in sorted(views, key=lambda view: view["psnr"])]
+    rows = watched.page.locator("#views tbody th").all_inner_texts()
+    assert rows == order
+    shown = watched.page.locator("#views article h3").all_inner_texts()
+    assert shown == order[: len(shown)] or shown == [*order[: len(shown) - 1], order[-1]]
+    view = watched.page.locator("#views article").first
+    view.scroll_into_view_if_needed()
+    box = view.locator(".photo").bounding_box()
+    cut = "element => getComputedStyle(element).clipPath"
+    assert "50%" in view.locator(".render img").evaluate(cut)
+    watched.page.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 30)
+    left = float(re.search(r"([\d.]+)%", view.locator(".render img").evaluate(cut)).group(1))
+    assert math.isclose(left, 25.0, abs_tol=1.0)
+    view.locator("input").focus()
+    watched.page.keyboard.press("End")
+    assert "100%" in view.locator(".render img").evaluate(cut)
+
+
+def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_places(
+    finished: Path, open_page: Callable[..., object]
+) -> None:
+    """The drawn mark and circle are as far apart as the residual says, in the cut-out's own pixels."""
+    watched = open_page((finished / "report.html").as_uri())
+    holdings = open_holdings(finished)
+    points = holdings.read("georef.control")["points"]
+    assert watched.page.locator(".chip").count() == sum(len(point["observations"]) for point in points)
+    assert watched.page.locator(".chip img").count() == watched.page.locator(".chip").count()
+    point = next(point for point in points if point["name"] == "P05")
+    section = watched.page.locator("section.point", has=watched.page.locator("h4", has_text="P05"))
+    assert section.locator(".chip").count() == len(point["observations"])
+    worst = max(point["observations"], key=lambda seen: math.hypot(*seen["residual_px"]))
+    chip = section.locator(".chip").first
+    assert worst["photo"] in chip.inner_text() and f"{math.hypot(*worst['residual_px']):.2f} px" in chip.inner_text()
+    x, y = map(float, re.match(r"M([\d.]+) ([\d.]+)v24", chip.locator(".mark").get_attribute("d")).groups())
+    circle = chip.locator(".found")
+    apart = (float(circle.get_attribute("cx")) - x, float(circle.get_attribute("cy")) - y - 12.0)
+    for drawn, true in zip(apart, worst["residual_px"], strict=True):
+        assert math.isclose(drawn * CHIP_SIDE / 100.0, true, abs_tol=0.02)
+
+
+def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
+    holdings = open_holdings(finished)
+    points = holdings.read("georef.control")["points"]
+    chips = cut_chips(points, holdings.part("ingest.photos"), holdings.photos_dir)
+    seen = points[0]["observations"][0]
+    chip = chips[0, 0]
+    code = str(chip.picture).split(",")[1]
+    cut = Image.open(io.BytesIO(base64.b64decode(code))).convert("RGB")
+    left, top = (math.floor(value - CHIP_SIDE / 2) for value in seen["pixel"])
+    with Image.open(capture_path() / seen["photo"]) as photo:
+        true = photo.convert("RGB").crop((left, top, left + CHIP_SIDE, top + CHIP_SIDE))
+    differences = [abs(a - b) for a, b in zip(cut.tobytes(), true.tobytes(), strict=True)]
+    assert sum(differences) / len(differences) < 6.0  # JPEG's
+
+
+def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open_page: Callable[..., object]) -> None:
+    """Ctrl-C in a longer training: how far it came, its curve, and that the files beside it are an earlier run's."""
+    before = len((copy_of_run / "events.jsonl").read_text())
+    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "stage", "train", str(copy_of_run)]
+    command += sets("train.iterations=100000")
+    hear = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **hear) as running:
+        while (copy_of_run / "events.jsonl").read_text()[before:].count('"name": "loss"') < 3:
+            assert running.poll() is None, running.stderr and running.stderr.read()
+            time.sleep(0.1)
+        running.send_signal(signal.SIGINT)
+        _, said = running.communicate(timeout=60)
+    assert running.returncode == 130 and "Traceback" not in said
+    assert not list(copy_of_run.glob("report.html.*"))
+    splatpipe("report", copy_of_run)
+    watched = open_page((copy_of_run / "report.html").as_uri())
+    assert (watched.requests, watched.errors) == ([], [])
+    assert headline(watched) == "Stopped in train before it was finished"
+    told = words(watched)
+    iteration = int(re.search(r"It had come to ([\d,]+) of 100,000 iterations", told).group(1).replace(",", ""))
+    events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text()[before:].splitlines()]
+    progress = [event["data"]["done"] for event in events if event["data"].get("what") == "training"]
+    steps = [event["data"]["step"] for event in events if event["kind"] == "metric"]
+    assert iteration == max(*progress, *steps)
+    assert "30 trained on, 10 held out" in words(watched)  # of the plan that it had
+    assert state_of(watched, "train") == "stopped" and state_of(watched, "sparse") == "made before"
+    assert watched.page.locator("#training .chart").count() == 2
+    assert watched.page.locator("#views").count() == 0 and "PSNR" not in watched.page.locator(".cards").inner_text()
+    assert "6 check points are off by" in told  # what was found before is not lost
+    assert watched.page.locator("#files .stale").count() == watched.page.locator("#files tr").filter(
+        has_text=re.compile(r"splat\.|\.glb|cameras\.json|georef\.json|metrics\.json|viewer\.html|flythrough")
+    ).count() > 0  # fmt: skip
+    row = watched.page.locator("#making tr", has_text="stopped").inner_text()
+    assert "MB" in row or "GB" in row  # its memory is known though it never ended
+
+
+def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_of_run: Path) -> None:
+    (copy_of_run / "report.html").unlink()
+    page = report_page(open_holdings(copy_of_run), drawn=False)
+    assert "splatpipe report writes the page again" in page and "<svg role=" not in page and "data:image" not in page
+    make_report(copy_of_run, copy_of_run / "splatpipe.log", until_s=time.monotonic() + 60.0)
+    assert "<svg role=" in (copy_of_run / "report.html").read_text()
+    code = (
+        "import sys; from pathlib import Path; from splatpipe.pipeline.report import write_report\n"
+        f"write_report(Path({str(copy_of_run)!r}), drawn=False)\n"
+        "print([name for name in ('matplotlib', 'torch', 'pycolmap', 'cv2') if name in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_a_run_that_failed_in_sparse_has_a_truthful_report(tmp_path: Path, open_page: Callable[..., object]) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in ("DJI_0001.JPG", "DJI_0011.JPG", "DJI_0021.JPG", "DJI_0031.JPG"):  # a quarter around the house apart
+        shutil.copy(capture_path() / name, photos)
+    out = tmp_path / "out"
+    done = splatpipe("run", photos, out, *sets(*QUICK), "--json")
+    told = json.loads(done.stdout)
+    assert (done.returncode, told["failed"]) == (1, "sparse")
+    watched = open_page((out / "report.html").as_uri())
+    assert (watched.requests, watched.errors) == ([], [])
+    assert headline(watched) == "Failed in sparse"
+    said = words(watched)
+    assert told["error"]["message"] in said and told["error"]["hint"] in said
+    assert "Not reached, so not in this report: Georeferencing and accuracy, Training, Held-out photos." in said
+    assert state_of(watched, "matches") == "finished" and state_of(watched, "sparse") == "failed"
+    assert state_of(watched, "train") == "not reached"
+    assert "No deliverable was made." in said and "Photos placed" not in said
+    assert watched.page.locator("#capture .chart").count() == 1  # where the photos say that they were taken
+
+
+def test_a_run_without_any_position_says_that_nothing_is_in_metres(
+    tmp_path: Path, open_page: Callable[..., object]
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for path in sorted(capture_path().glob("*.JPG"))[-6:]:
+        with Image.open(path) as photo:
+            photo.resize((800, 600)).save(photos / path.name, quality=92)  # Pillow leaves the metadata out
+    (photos / "notes.jpg").write_bytes(b"no picture")
+    out = tmp_path / "out"
+    done = splatpipe("run", photos, out, *sets(*QUICK, "train.iterations=30", "evaluate.every=4"), "--json")
+    assert done.returncode == 0, done.stderr
+    assert str(out / "report.html") in json.loads(done.stdout)["outputs"]
+    watched = open_page((out / "report.html").as_uri())
+    assert (watched.requests, watched.errors) == ([], [])
+    said = words(watched)
+    assert "Nothing in it can be measured in metres" in said and "none of the photos has one" in said
+    assert "Ground sample distance" not in said and "check point" not in said
+    assert "x (model units)" in said and "east (m)" not in said
+    left_out = watched.page.locator("#capture tr", has_text="notes.jpg").inner_text()
+    assert len(left_out.replace("notes.jpg", "").strip()) > 10  # and why
+
+
+def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Callable[..., object]) -> None:
+    """In events, in the control points, and in what was left out."""
+    holdings = open_holdings(copy_of_run)
+    with (copy_of_run / "events.jsonl").open("a") as events:
+        for kind, data in (
+            (
+                "run_started",
+                {"stages": ["ingest", "georef"], "machine": {"system": HOSTILE}, "versions": {HOSTILE: HOSTILE}},
+            ),
+            ("stage_started", {"reason": HOSTILE}),
+            ("warning", {"message": HOSTILE, "hint": HOSTILE}),
+            ("note", {"message": HOSTILE}),
+            ("stage_failed", {"message": HOSTILE, "hint": "", "exit_code": 1}),
+        ):
+            stage = "" if kind == "run_started" else "export"
+            events.write(json.dumps({"kind": kind, "stage": stage, "data": data, "time_s": 1.8e9}) + "\n")
+        events.write("no JSON\n[1, 2]\n" + '{"kind": "metric", "stage": "train", "data": {}, "time_s": "soon"}\n')
+
+    def hostile_control(told: dict[str, object]) -> None:
+        point = told["points"][0]
+        point["name"] = point["why"] = told["file"] = f"$x_{HOSTILE}"
+        point["observations"][0]["photo"] = f"../{HOSTILE}"
+
+    rewrite(holdings.part("georef.control"), hostile_control)
+    left_out = [{"name": HOSTILE, "reason": HOSTILE}]
+    rewrite(holdings.part("ingest.left_out"), lambda told: told.update(left_out=left_out))
+    stolen = {"name": HOSTILE, "file": "../../../etc/passwd"}
+    rewrite(holdings.part("evaluate.metrics"), lambda told: told["per_view"][0].update(stolen))
+    write_report(copy_of_run)
+    watched = open_page((copy_of_run / "report.html").as_uri())
+    assert (watched.requests, watched.errors) == ([], [])
+    assert watched.page.title() == "out: report"
+    assert words(watched).count('document.title = "taken"') >= 9
+    assert watched.page.locator("script").count() == 1
+
+
+@pytest.mark.parametrize(
+    "part", ["georef.control", "evaluate.metrics", "sparse.summary", "train.history", "ingest.positions"]
+)
+def test_a_damaged_part_costs_its_chapter_and_not_the_report(copy_of_run: Path, part: str) -> None:
+    path = open_holdings(copy_of_run).part(part)
+    path.write_text("[" + " " * (path.stat().st_size - 2) + "]")  # as long as it was, and something else
+    page = report_page(open_holdings(copy_of_run), drawn=False)
+    assert page.count("This part could not be read") == 1
+    assert "How it was made" in page
+
+
+def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
+    """Change a part of an artifact, which stays whole."""
+    told = json.loads(path.read_text())
+    size = path.stat().st_size
+    change(told)
+    path.write_text(json.dumps(told))
+    manifest = path.parent / "manifest.json"
+    manifest.write_text(manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "level", "said"),
+    [
+        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=17.0), "bad", "a poor likeness"),
+        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=22.0), "doubt", "a fair likeness"),
+        ("evaluate.metrics", lambda told: told.update(per_view=[]), "doubt", "No photo was held out"),
+        ("evaluate.metrics", lambda told: told["floaters"].update(free_space_rendered=0.2), "doubt", "20.00 %"),
+        ("georef.accuracy", lambda told: told["tables"]["check"].update(rmse_up_m=0.5), "doubt", "50.0 cm in height"),
+        ("georef.accuracy", lambda told: told["tables"].update(check=None), "doubt", "no check point proves it"),
+        (
+            "georef.accuracy",
+            lambda told: told["tables"].update(check=None, control=None),
+            "doubt",
+            "own positions alone",
+        ),
+        ("georef.frame", lambda told: told.update(kind="arbitrary"), "doubt", "neither scale nor place"),
+    ],
+)
+def test_the_verdict_follows_the_figures(
+    copy_of_run: Path, part: str, change: Callable[[dict[str, object]], None], level: str, said: str
+) -> None:
+    before = [finding.text for finding in judge(open_holdings(copy_of_run)).findings]
+    assert not any(said in text for text in before)
+    rewrite(open_holdings(copy_of_run).part(part), change)
+    found = next(finding for finding in judge(open_holdings(copy_of_run)).findings if said in finding.text)
+    assert found.level == level
+
+
+def test_a_broken_off_run_is_told_from_a_running_one(copy_of_run: Path) -> None:
+    lines = (copy_of_run / "events.jsonl").read_text().splitlines()
+    started = next(i for i, line in enumerate(lines) if '"stage_started"' in line and '"train"' in line)
+    (copy_of_run / "events.jsonl").write_text("\n".join(lines[: started + 4]))
+    assert "Broken off in train" in report_page(open_holdings(copy_of_run), drawn=False)
+    with (copy_of_run / "stages" / ".lock").open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert "Still running in train" in report_page(open_holdings(copy_of_run), drawn=False)
+
+
+def test_a_report_that_cannot_be_written_does_not_spoil_a_good_run(copy_of_run: Path) -> None:
+    (copy_of_run / "report.html").unlink()
+    (copy_of_run / "report.html").mkdir()
+    done = splatpipe("stage", "export", copy_of_run, "--json")
+    assert done.returncode == 0 and "The report could not be written" in done.stderr
+    assert json.loads(done.stdout)["error"] is None
+
+
+def test_report_of_a_folder_without_a_run_is_a_wrong_call(tmp_path: Path) -> None:
+    done = splatpipe("report", tmp_path)
+    assert done.returncode == 2 and "holds no run" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_hundreds_of_photos_do_not_explode_it() -> None:
+    views = [{"psnr": float(i)} for i in range(300)]
+    assert len(chosen_views(views)) == 12 and chosen_views(views)[-1] is views[-1]
+    seen = [{"photo": f"{i}.jpg", "pixel": [10.0, 10.0], "residual_px": [i / 100.0, 0.0]} for i in range(400)]
+    points = [{"observations": seen}, {"observations": seen}, {"observations": seen[:3]}]
+    chips = cut_chips(points, None, None)
+    assert len(chips) == MOST_CHIPS
+    assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(chips) and (0, 0) not in chips

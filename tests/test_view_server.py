@@ -1,0 +1,412 @@
+"""What ``splatpipe view`` gives to whom, tried against the real server process: what is not for us is refused."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.view.files import NotThereError, open_inside, wanted_range
+from splatpipe.pipeline.view.log import MOST_POINTS, Curve, RunLog
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from served import Answer, Served, linked_copy, serving
+
+SECRET = b"nobody may read this"
+REFUSED = {400, 403, 404, 405, 411, 413, 414, 415, 416, 421, 431}
+
+
+@pytest.fixture(scope="module")
+def home(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run in it, and secrets around and inside that it does not deliver."""
+    home = tmp_path_factory.mktemp("home")
+    out = linked_copy(demo_run, home / "out")
+    for place in (home / "secret.txt", out / "secret.txt", out / "stages" / "secret.txt"):
+        place.write_bytes(SECRET)
+    (home / "elsewhere").mkdir()
+    (home / "elsewhere" / "secret.txt").write_bytes(SECRET)
+    (out / "cameras.json").unlink()
+    (out / "cameras.json").symlink_to(home / "secret.txt")
+    (out / "sparse.glb").unlink()
+    (out / "sparse.glb").symlink_to("splat.ply")  # even to what is given itself
+    # What a stage delivers as a folder names files below it; here the folder of that name in OUT is a link.
+    sky = next((out / "stages").glob("export-*")) / "sky" / "deep"
+    sky.mkdir(parents=True)
+    (sky / "secret.txt").write_bytes(b"its own")
+    (out / "deep").symlink_to(home / "elsewhere")
+    return home
+
+
+@pytest.fixture(scope="module")
+def served(home: Path) -> Iterator[Served]:
+    with serving(home / "out") as server:
+        yield server
+
+
+def refused(answer: Answer) -> bool:
+    return answer.status in REFUSED and SECRET not in answer.body and b"Traceback" not in answer.body
+
+
+PATHS = [
+    "/secret.txt",
+    "/../secret.txt",
+    "/../../../../../../etc/passwd",
+    "/..",
+    "/.",
+    "/./splat.ply",
+    "/stages/../splat.ply",
+    "/x/../../secret.txt",
+    "/%2e%2e/secret.txt",
+    "/%2E%2E/secret.txt",
+    "/.%2e/secret.txt",
+    "/..%2fsecret.txt",
+    "/%2e%2e%2fsecret.txt",
+    "/%252e%252e/secret.txt",
+    "/%252e%252e%252fsecret.txt",
+    "/%25252e%25252e%25252fsecret.txt",
+    "/%c0%ae%c0%ae/secret.txt",
+    "/%c0%ae%c0%ae%c0%afsecret.txt",
+    "/%u002e%u002e/secret.txt",
+    "/%EF%BC%8E%EF%BC%8E/secret.txt",
+    "/..\\secret.txt",
+    "/..%5csecret.txt",
+    "/%5c..%5csecret.txt",
+    "/..%255csecret.txt",
+    "//etc/passwd",
+    "///etc/passwd",
+    "/%2fetc%2fpasswd",
+    "/%2Fetc/passwd",
+    "/etc/passwd",
+    "/C:/secret.txt",
+    "/file:///etc/passwd",
+    "file:///etc/passwd",
+    "http://127.0.0.1/../secret.txt",
+    "http://elsewhere.example/splat.ply",
+    "splat.ply",
+    "*",
+    "/splat.ply%00",
+    "/splat.ply%00.html",
+    "/secret.txt%00splat.ply",
+    "/splat.ply%20",
+    "/splat.ply/",
+    "/splat.ply/.",
+    "/splat.ply/..",
+    "/splat.ply/../secret.txt",
+    "/splat.ply;/../secret.txt",
+    "/SPLAT.PLY",
+    "/splat.ply~",
+    "/%73plat.ply",
+    "/stages",
+    "/stages/",
+    "/stages/secret.txt",
+    "/stages/format.json",
+    "/stages/.lock",
+    "/.lock",
+    "/config.toml",
+    "/events.jsonl",
+    "/splatpipe.log",
+    "/assets/",
+    "/assets/..",
+    "/assets/../server.py",
+    "/assets/%2e%2e/server.py",
+    "/assets/build.py",
+    "/assets/viewer.js.map",
+    "/live/x/0/secret.jpg",
+    "/live/../../secret.txt",
+    "/live/x/99999999999999999999999/render.jpg",
+    "/live/x/-1/render.jpg",
+    "/photo/0",
+    "/mark",
+    "/api/mark",
+    "/favicon.ico",
+    "/cameras.json",
+    "/sparse.glb",
+    "/deep/secret.txt",
+    "/deep",
+    "/" + "a" * 5000,
+    "/" + "a/" * 5000,
+    "/" + "../" * 300 + "etc/passwd",
+]
+
+
+@pytest.mark.parametrize("path", PATHS, ids=[path[:40] for path in PATHS])
+def test_a_path_that_is_none_of_a_run_s_deliverables_is_refused(served: Served, path: str) -> None:
+    assert refused(served.ask(path))
+    assert refused(served.ask(path, method="HEAD"))
+    assert refused(served.ask(path, "Range: bytes=0-99"))
+
+
+@pytest.mark.parametrize(
+    "raw", [b"/splat.ply\0", b"/\0", b"/splat.ply\xff", b"/..\xc0\xafsecret.txt", b"/a b", b"/a\tb"]
+)
+def test_bytes_that_are_no_path_are_refused(served: Served, raw: bytes) -> None:
+    assert refused(served.ask(raw))
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "elsewhere.example",
+        "127.0.0.1.elsewhere.example",
+        "localhost.elsewhere.example",
+        "elsewhere.example:80@127.0.0.1",
+        "127.0.0.1@elsewhere.example",
+        "127.0.0.1:80:80",
+        "127.0.0.1:999999",
+        "0.0.0.0",
+        "127.0.0.2",
+        "127.1",
+        "2130706433",
+        "0x7f000001",
+        "[::1]",
+        "[::ffff:127.0.0.1]",
+        "localhost.",
+        "localhost, elsewhere.example",
+        "127.0.0.1 elsewhere.example",
+        "x" * 5000,
+        None,
+    ],
+)
+def test_a_host_that_is_not_this_machine_is_refused(served: Served, host: str | None) -> None:
+    """A name of somebody else's that resolves to 127.0.0.1 is DNS rebinding."""
+    for path in ("/", "/splat.ply", "/api/live"):
+        assert refused(served.ask(path, host=host))
+
+
+def test_hosts_of_this_machine_are_answered_through_a_tunnel_s_port_too(served: Served) -> None:
+    for host in (f"127.0.0.1:{served.port}", f"localhost:{served.port}", "localhost:9000", "localhost"):
+        assert served.ask("/", host=host).status == 200
+    assert refused(served.send(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: elsewhere.example\r\n\r\n"))
+    assert refused(served.send(b"GET / HTTP/1.0\r\n\r\n"))
+
+
+def test_a_browser_that_was_led_here_by_another_name_sees_nothing(served: Served, open_page: Callable) -> None:
+    """Chromium resolves every name under localhost to this machine, as a rebound name would be."""
+    watched = open_page(f"http://rebound.localhost:{served.port}/")
+    assert "answers to 127.0.0.1 and localhost" in watched.page.content()
+
+
+def test_a_page_of_another_origin_reads_nothing(served: Served, home: Path, open_page: Callable) -> None:
+    page = home / "elsewhere.html"
+    page.write_text("<!doctype html><title>elsewhere</title>")
+    watched = open_page(page.as_uri())
+    url = f"{served.address}/metrics.json"
+    assert watched.page.evaluate(f"fetch('{url}').then(() => 'read', () => 'refused')") == "refused"
+    script = "(url) => new Promise(done => { const s = document.createElement('script'); s.src = url;"
+    script += " s.onload = () => done('read'); s.onerror = () => done('refused'); document.head.append(s) })"
+    assert watched.page.evaluate(script, f"{served.address}/assets/live.js") == "refused"
+    for foreign in ("Origin: null", "Origin: http://localhost:1", "Sec-Fetch-Site: cross-site"):
+        assert refused(served.ask("/metrics.json", foreign))
+    assert served.ask("/", "Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate").status == 200  # a link leads here
+
+
+@pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "get"])
+def test_methods_that_are_not_reading_are_refused(served: Served, home: Path, method: str) -> None:
+    before = (home / "out" / "splat.ply").read_bytes()
+    assert refused(served.ask("/splat.ply", "Content-Length: 3", method=method, body=b"bad"))
+    assert (home / "out" / "splat.ply").read_bytes() == before
+
+
+def test_writing_takes_the_secret_of_the_page(served: Served) -> None:
+    posted = ("Content-Type: application/json", "Content-Length: 2")
+    assert served.ask("/api/mark/change", *posted, method="POST", body=b"{}").status == 403
+    assert served.ask("/", *posted, "X-Splatpipe-Token: ", method="POST", body=b"{}").status == 403
+
+
+def test_reading_has_no_body(served: Served) -> None:
+    assert refused(served.ask("/", "Content-Length: 9999999999"))
+    assert refused(served.ask("/", "Transfer-Encoding: chunked", body=b"0\r\n\r\n"))
+
+
+def test_headers_without_end_are_refused(served: Served) -> None:
+    assert refused(served.ask("/", "X: " + "a" * 200_000))
+    assert refused(served.ask("/", *[f"X-{k}: {k}" for k in range(20_000)]))
+
+
+def test_files_come_whole_and_in_ranges_as_they_are(served: Served, home: Path) -> None:
+    data = (home / "out" / "splat.ply").read_bytes()
+    whole = served.ask("/splat.ply")
+    assert (whole.status, whole.body, whole.headers["accept-ranges"]) == (200, data, "bytes")
+    size = len(data)
+    for asked, first, last in (
+        ("bytes=0-0", 0, 0),
+        ("bytes=5-104", 5, 104),
+        (f"bytes={size - 7}-", size - 7, size - 1),
+        ("bytes=-9", size - 9, size - 1),
+        (f"bytes=-{size * 10}", 0, size - 1),
+        (f"bytes=10-{10**17}", 10, size - 1),
+    ):
+        part = served.ask("/splat.ply", f"Range: {asked}")
+        assert (part.status, part.body) == (206, data[first : last + 1])
+        assert part.headers["content-range"] == f"bytes {first}-{last}/{size}"
+        head = served.ask("/splat.ply", f"Range: {asked}", method="HEAD")
+        assert (head.status, head.body, head.headers["content-length"]) == (206, b"", part.headers["content-length"])
+    for asked in (f"bytes={size}-", "bytes=-0", f"bytes={10**17}-{10**17 + 5}"):
+        nothing = served.ask("/splat.ply", f"Range: {asked}")
+        assert (nothing.status, nothing.body, nothing.headers["content-range"]) == (416, b"", f"bytes */{size}")
+    # What is no single range of bytes is no reason to send more than the file once (RFC 9110, 14.2).
+    for asked in ("bytes=9-5", "bytes=a-b", "bytes=", "bytes=-", "lines=0-5", "bytes=0-1,3-4", "bytes=" + "0-," * 2000):
+        assert (answer := served.ask("/splat.ply", f"Range: {asked}")).status == 200 and len(answer.body) == size
+
+
+def test_a_file_that_is_known_is_not_sent_again(served: Served, home: Path) -> None:
+    tag = served.ask("/metrics.json").headers["etag"]
+    assert (again := served.ask("/metrics.json", f"If-None-Match: {tag}")).status == 304 and again.body == b""
+    assert served.ask("/metrics.json", "Range: bytes=0-3", f"If-Range: {tag}").status == 206
+    assert served.ask("/metrics.json", "Range: bytes=0-3", 'If-Range: "another"').status == 200
+
+
+def test_every_answer_forbids_what_a_browser_might_make_of_it(served: Served) -> None:
+    for path in ("/", "/live", "/metrics.json", "/splat.ply", "/assets/live.js", "/api/live", "/none", "/../none"):
+        headers = served.ask(path).headers
+        assert headers["x-content-type-options"] == "nosniff" and headers["referrer-policy"] == "no-referrer"
+        assert headers["cross-origin-resource-policy"] == "same-origin"
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'" in policy and "http" not in policy and "*" not in policy
+        assert "server" not in headers and "access-control-allow-origin" not in headers
+
+
+def test_it_listens_on_the_loopback_address_alone(served: Served) -> None:
+    with pytest.raises(OSError), socket.create_connection(("127.0.0.2", served.port), timeout=5):
+        pass
+    listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines() if " 0A " in line]
+    assert [place for place in listening if place.endswith(f":{served.port:04X}")] == [f"0100007F:{served.port:04X}"]
+    six = Path("/proc/net/tcp6").read_text() if Path("/proc/net/tcp6").is_file() else ""
+    assert f":{served.port:04X} " not in "".join(line for line in six.splitlines() if " 0A " in line)
+
+
+@pytest.mark.parametrize(("width", "height", "touch"), [(1440, 900, False), (390, 844, True)])
+def test_the_landing_page_leads_to_what_there_is(
+    served: Served, open_page: Callable, width: int, height: int, touch: bool
+) -> None:
+    watched = open_page(f"{served.address}/", width, height, touch)
+    page = watched.page
+    assert page.locator("h1").inner_text() == "out" and "Finished" in page.locator(".state").inner_text()
+    names = [link.get_attribute("href") for link in page.locator("table a").all()]
+    assert {"/splat.ply", "/metrics.json", "/georef.json"} <= set(names)
+    assert not {"/cameras.json", "/sparse.glb", "/deep/secret.txt"} & set(names)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.get_by_text("Training").click()
+    page.wait_for_url("**/live")
+    assert watched.errors == []
+    assert all(url.startswith(served.address) for url in watched.requests)
+
+
+def test_a_finished_run_shows_its_model_beside_the_photos(served: Served, open_page: Callable) -> None:
+    watched = open_page(f"{served.address}/live")
+    watched.page.locator("#photo:not([hidden])").wait_for()
+    assert "finished, iteration" in watched.page.locator("#iteration").inner_text()
+    assert "(held out)" in watched.page.locator("#view option:checked").inner_text()
+    sizes = watched.page.evaluate("['render', 'photo'].map(id => document.getElementById(id).naturalWidth)")
+    assert sizes[0] == sizes[1] > 100
+    assert watched.errors == []
+
+
+def test_the_viewer_opens_from_here_with_its_splat_inside_or_beside_it(served: Served, open_page: Callable) -> None:
+    """The page of the finished run carries its splat; that of the training loads it from this server."""
+    page = open_page(f"{served.address}/live").page
+    page.locator("#viewer:not([hidden])").wait_for()
+    for address in ("/viewer.html", str(page.locator("#viewer").get_attribute("href"))):
+        watched = open_page(served.address + address, 390, 400)
+        watched.page.evaluate("splatpipe.ready")
+        assert watched.errors == []
+        assert [url.rpartition("/")[2] for url in watched.requests] == (["splat.spz"] if "live" in address else [])
+
+
+def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> None:
+    def view(*arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "splatpipe.pipeline.cli", "view", *map(str, arguments), "--no-browser"]
+        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+
+    done = view(tmp_path)
+    assert done.returncode == 2 and "holds no run" in done.stderr
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        done = view(demo_run, "--port", taken.getsockname()[1])
+    assert done.returncode == 4 and "--port" in done.stderr
+    done = view(demo_run, "--points", "points.csv")
+    assert done.returncode == 2 and "--mark" in done.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_it_ends_when_asked_to(demo_run: Path, number: signal.Signals, code: int) -> None:
+    with serving(demo_run) as server:
+        server.process.send_signal(number)
+        assert server.process.wait(timeout=30) == code
+
+
+def test_a_file_behind_a_link_or_a_pipe_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / "out" / "real").mkdir(parents=True)
+    (tmp_path / "out" / "real" / "file").write_bytes(b"x")
+    (tmp_path / "out" / "linked").symlink_to("real")
+    (tmp_path / "out" / "file").symlink_to("real/file")
+    os.mkfifo(tmp_path / "out" / "pipe")
+    (tmp_path / "link").symlink_to("out")
+    out = tmp_path / "out"
+    for folder in (out, tmp_path / "link"):  # the folder itself is the user's word
+        file = open_inside(folder, "real/file")
+        os.close(file.descriptor)
+        assert file.size == 1
+    for path in (
+        "linked/file",
+        "file",
+        "pipe",
+        "real",
+        "",
+        ".",
+        "..",
+        "../out/real/file",
+        "/etc/passwd",
+        "real/file/x",
+    ):
+        with pytest.raises(NotThereError):
+            open_inside(out, path)
+    with pytest.raises(NotThereError):
+        open_inside(out, "real/file\0")
+
+
+def test_ranges_are_read_as_http_has_them() -> None:
+    assert wanted_range(None, 10) is None and wanted_range("bytes=3-1", 10) is None
+    assert wanted_range("bytes=3-", 10) == (3, 10) and wanted_range("bytes=-3", 10) == (7, 10)
+    assert wanted_range("bytes=0-99", 10) == (0, 10)
+    for asked, size in (("bytes=10-", 10), ("bytes=-0", 10), ("bytes=0-", 0), ("bytes=-5", 0)):
+        with pytest.raises(IndexError):
+            wanted_range(asked, size)
+
+
+def test_a_log_of_rubbish_is_passed_over(tmp_path: Path) -> None:
+    good = {"kind": "run_started", "stage": "", "data": {"stages": ["train"]}, "time_s": 1.0}
+    lines = [json.dumps(good), "", "{", "[]", "null", '{"kind": 1}', "[" * 100_000, "x" * 400_000]
+    lines += [json.dumps({**good, "data": {"stages": 3}}), json.dumps({**good, "kind": "metric", "data": {}})]
+    (tmp_path / "events.jsonl").write_bytes("\n".join(lines).encode() + b"\n\xff\xfe\n")
+    log = RunLog(tmp_path, "events.jsonl")
+    log.read()
+    point = {"kind": "metric", "stage": "train", "data": {"name": "loss", "value": 0.5, "step": 10}, "time_s": 2.0}
+    with (tmp_path / "events.jsonl").open("a") as file:
+        file.write(json.dumps(point)[:20])
+        file.flush()
+        log.read()
+        file.write(json.dumps(point)[20:] + "\n")
+    log.read()
+    assert log.curves["loss"].points == [(10, 0.5)]
+    (tmp_path / "events.jsonl").unlink()
+    (tmp_path / "events.jsonl").symlink_to("/etc/passwd")
+    log.read()
+    assert log.curves["loss"].points == [(10, 0.5)]
+
+
+def test_a_curve_stays_short_however_long_it_is_watched() -> None:
+    curve = Curve()
+    for step in range(50_000):
+        curve.add(step, float(step))
+    assert len(curve.points) <= MOST_POINTS
+    steps = [step for step, _ in curve.points]
+    assert steps == sorted(steps) and steps[0] < 100 and steps[-1] > 49_900
+    curve.add(100, 0.0)  # a run that went on from an earlier checkpoint
+    assert all(step <= 100 for step, _ in curve.points)
