@@ -68,7 +68,7 @@ def render_normals(gaussians: Gaussians, camera: Camera, options: raster.RenderO
 
     From the rasterizer's own sums: a Gaussian's normal is that of the plane on which rays are deepest in it (the one
     that the depths come from: Zhang et al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting", 2024), and takes the
-    place of its colour. Half as noisy as the gradient of the median depth.
+    place of its colour. The median depth's gradient would have a step wherever one Gaussian takes over from the next.
     """
     with torch.no_grad():
         splats = project(gaussians, camera, options)

@@ -13,9 +13,10 @@ import pytest
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.ply import read_splat
 from splatpipe.stages import evaluate, initialize, train
-from splatpipe.stages.options import EvaluateConfig, InitializeConfig, TrainConfig
+from splatpipe.stages.options import FILM_FROM_BUDGET_S, EvaluateConfig, InitializeConfig, TrainConfig
 from splatpipe.stages.train import loop, planning
 from splatpipe.stages.train.budget import (
     FEWEST,
@@ -33,8 +34,9 @@ from splatpipe.stages.train.budget import (
     forecast,
 )
 from splatpipe.stages.train.densify import room_at
+from splatpipe.stages.train.measure import Measured
 from splatpipe.stages.train.memory import FIXED_BYTES, bytes_per_gaussian, resident_bytes, return_free_heap
-from splatpipe.stages.train.plan import Plan, coarse_levels, duration, means_rate, resolve_schedule
+from splatpipe.stages.train.plan import Plan, coarse_levels, duration, make_plan, means_rate, resolve_schedule
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import TrainingPhoto
 
@@ -326,6 +328,7 @@ import tiny_scene
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
+from splatpipe.stages.train.measure import Measured
 from splatpipe.stages.train.memory import FIXED_BYTES, resident_bytes
 
 scene, out = Path(sys.argv[2]), Path(sys.argv[3])
@@ -369,3 +372,16 @@ def test_growth_ends_where_memory_runs_out_all_the_same(
     assert len(recorder.warnings) == 1 and "no Gaussian is added after iteration 10" in recorder.warnings[0]
     history = json.loads((tmp_path / "history.json").read_text())
     assert history["growth_ended"] == 10 and [event["iteration"] for event in history["density"]] == [10]
+
+
+def test_a_budget_long_enough_for_a_film_keeps_time_for_it() -> None:
+    """Ten seconds of film take as long as measuring forty photos; shorter budgets have no film."""
+    views = [View(camera, Path("photo.jpg"), None) for camera in tiny_scene.cameras()]
+    measured = Measured(SPEED, 0.0, 2.0)
+    left = []
+    for budget in (FILM_FROM_BUDGET_S - 1.0, FILM_FROM_BUDGET_S):
+        config = TrainConfig(time_budget_s=budget)
+        plan = make_plan(config, views, 4, "", 100)
+        scene = planning.Scene(config, tiny_scene.true_model(), views, 3, Machine())
+        left.append(planning._task(plan, scene, measured, 500.0).seconds(0.5))
+    assert left[0] - left[1] == pytest.approx(planning.FILM_VIEWS * 2.0 * 0.5)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -179,6 +180,24 @@ def test_photos_straight_down_make_a_map_that_slides_by() -> None:
     assert_smooth(route)
 
 
+def test_a_swaying_kite_is_followed_where_it_looked() -> None:
+    """Nearly down, leaning to the side of the picture, one photo far enough to have a heading of its own."""
+    cameras = []
+    for k, y in enumerate(np.linspace(-8, 8, 14)):
+        lean = 33.0 if k == 6 else 17.0 + 3.0 * (-1) ** k
+        camera = photo((0.0, y, 30.0), (0.0, y, 0.0))
+        turn = np.eye(4)
+        turn[:3, :3] = rotation_matrix(np.array([0.0, math.radians(lean), 0.0]))  # about the picture's top
+        cameras.append(replace(camera, cam_from_world=turn @ camera.cam_from_world))
+    route = film(cameras)
+    assert np.ptp(route.headings) < 1e-9
+    mean = np.mean([TILT.T @ camera.cam_from_world[2, :3] for camera in cameras], axis=0)
+    aside = np.degrees(angles_between(route.directions(), np.tile(mean / np.linalg.norm(mean), (FRAMES, 1))))
+    assert aside.max() < 12.0 and np.median(aside) < 4.0
+    tops = np.array([-camera.cam_from_world[1, :3] for camera in cameras_along(route, Lens(64, 36, 50.0), UP)])
+    assert np.degrees(angles_between(tops, np.tile(-cameras[0].cam_from_world[1, :3], (FRAMES, 1)))).max() < 5.0
+
+
 def test_from_the_side_to_straight_down_without_spinning() -> None:
     over = [photo((x, 0.3 * x, 26.0), (x, 0.3 * x, 0.0), 1.3 * k) for k, x in enumerate(np.linspace(-6, 6, 5))]
     route = film([*ring(24, turn=2.0)[18:], *over])
@@ -227,7 +246,7 @@ def test_a_spline_meets_its_values_and_rests_where_two_are_the_same() -> None:
 
 def test_a_spline_through_places_unevenly_apart_has_no_corner_and_stays_near() -> None:
     places = np.array([(0, 0, 0), (1, 0, 0), (1.5, 2, 0), (9, 3, 1), (9, 8, 0)], float)
-    route = Route(places, np.zeros(5), np.zeros(5))
+    route = Route(places, np.zeros(5), np.zeros(5), np.zeros(5))
     knots = centripetal_knots(route, 1.0)
     fine = spline(places, knots, np.linspace(0.0, knots[-1], 8001))
     steps = np.diff(fine, axis=0)

@@ -1,6 +1,7 @@
 """Ways of a camera through a scene: upright, smooth in speed and turn, timed into the frames of a film.
 
-A camera on its way is a place, a heading and a pitch, so that it cannot roll. A way along photos is the broken line
+A camera on its way is a place, a heading and a pitch, so that it cannot roll; looking down, where there is no horizon,
+it may lean aside as its photo did. A way along photos is the broken line
 through them, smoothed by a Gaussian; a way through keyframes is a spline that meets each of them: Catmull-Rom's with
 centripetal knots, which does not overshoot where places are unevenly far apart (Yuksel, Schaefer, Keyser:
 "Parameterization and Applications of Catmull-Rom Curves", 2011).
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -23,7 +24,8 @@ from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.upright import rotation_to_up
 
 STEEP = math.radians(-60.0)  # looking down more steeply, a camera has no heading of its own: the horizon is far away
-TILTED = 0.1  # horizontal part of the mean view of cameras that look down, from which on it is their common heading
+TILTED = 0.1  # part of the mean view of cameras that look down, from which on it is ahead
+FEW = 0.2  # of the cameras: fewer that do not are no reason to turn the others
 FINE_STEPS, FINE_STEPS_A_PLACE = 4000, 10  # of a way, between which it is a line
 START_SHARE, START_S = 0.2, 1.0  # of a film's time, and at most, to come up to speed, and as long to stop
 SLOW = 0.5  # of the median speed: where a route's own is below, the film's follows it down
@@ -41,26 +43,33 @@ class Route:
         places: World units.
         headings: Of the view, radians from x to y, without jumps by whole turns.
         pitches: 0 level, -π/2 straight down, radians; beyond that it looks back between its feet.
+        leans: To the right out of the upright plane of heading and pitch, radians; 0 but for photos looking down.
     """
 
     places: Float64[np.ndarray, "n 3"]
     headings: Float64[np.ndarray, " n"]
     pitches: Float64[np.ndarray, " n"]
+    leans: Float64[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.places)
 
     def __getitem__(self, chosen: slice) -> Route:
-        return Route(self.places[chosen], self.headings[chosen], self.pitches[chosen])
+        return Route(self.places[chosen], self.headings[chosen], self.pitches[chosen], self.leans[chosen])
 
-    def values(self) -> Float64[np.ndarray, "n 5"]:
-        """Places, headings and pitches side by side."""
-        return np.column_stack((self.places, self.headings, self.pitches))
+    def values(self) -> Float64[np.ndarray, "n 6"]:
+        """Places, headings, pitches and leans side by side."""
+        return np.column_stack((self.places, self.headings, self.pitches, self.leans))
 
     def directions(self) -> Float64[np.ndarray, "n 3"]:
         """Unit vectors of the views."""
         flat = np.cos(self.pitches)
-        return np.column_stack((flat * np.cos(self.headings), flat * np.sin(self.headings), np.sin(self.pitches)))
+        level = np.column_stack((flat * np.cos(self.headings), flat * np.sin(self.headings), np.sin(self.pitches)))
+        return np.asarray(np.cos(self.leans)[:, None] * level + np.sin(self.leans)[:, None] * self.rights())
+
+    def rights(self) -> Float64[np.ndarray, "n 3"]:
+        """Level unit vectors to the right of the headings."""
+        return np.column_stack((np.sin(self.headings), -np.cos(self.headings), np.zeros(len(self))))
 
     def steps(self, distance: float) -> Float64[np.ndarray, " m"]:
         """Length from each to the next: moved distance over ``distance``, and turned radians, as one vector."""
@@ -69,9 +78,9 @@ class Route:
         return np.asarray(np.hypot(moved, turned))
 
 
-def route_of(values: Float64[np.ndarray, "n 5"]) -> Route:
+def route_of(values: Float64[np.ndarray, "n 6"]) -> Route:
     """The opposite of ``Route.values``."""
-    return Route(values[:, :3], values[:, 3], values[:, 4])
+    return Route(values[:, :3], values[:, 3], values[:, 4], values[:, 5])
 
 
 def angles_between(first: Float64[np.ndarray, "n 3"], second: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
@@ -109,8 +118,8 @@ def angle_of(cameras: Sequence[Camera]) -> float:
 def upright_route(cameras: Sequence[Camera], up: Float64[np.ndarray, " 3"]) -> Route:
     """Where cameras stood and looked, without their roll.
 
-    One that looks down steeply takes its heading from those around it in the sequence; where all look down, all get the
-    same heading, and the film is a map that slides by.
+    One that looks down steeply takes its heading from those around it in the sequence; where hardly any does not, all
+    get the same heading, along the pictures' shorter sides, and the film is a map that slides by.
 
     Args:
         cameras: In the order of the way.
@@ -119,17 +128,27 @@ def upright_route(cameras: Sequence[Camera], up: Float64[np.ndarray, " 3"]) -> R
     upright = rotation_to_up(up)
     places = np.array([camera.centre() for camera in cameras]) @ upright.T
     views = np.array([camera.cam_from_world[2, :3] for camera in cameras]) @ upright.T
-    tops = np.array([-camera.cam_from_world[1, :3] for camera in cameras]) @ upright.T
     own = np.flatnonzero(views[:, 2] > math.sin(STEEP))
-    if len(own):
+    if len(own) > FEW * len(cameras):
         known = np.unwrap(np.arctan2(views[own, 1], views[own, 0]))
         headings = np.interp(np.arange(len(cameras)), own, known)
     else:
-        mean = views.mean(axis=0)
-        ahead = mean if np.hypot(mean[0], mean[1]) > TILTED else tops[0]
-        headings = np.full(len(cameras), math.atan2(ahead[1], ahead[0]))
+        short = [-camera.cam_from_world[0 if camera.height > camera.width else 1, :3] for camera in cameras]
+        headings = np.full(len(cameras), _common_axis(np.array(short) @ upright.T, views.mean(axis=0)))
+    right = views[:, 0] * np.sin(headings) - views[:, 1] * np.cos(headings)
     along = views[:, 0] * np.cos(headings) + views[:, 1] * np.sin(headings)
-    return Route(places, headings, np.arctan2(views[:, 2], along))
+    return Route(places, headings, np.arctan2(views[:, 2], along), np.arcsin(np.clip(right, -1.0, 1.0)))
+
+
+def _common_axis(axes: Float64[np.ndarray, "n 3"], ahead: Float64[np.ndarray, " 3"]) -> float:
+    """Azimuth of the mean of axes, radians, whatever their sense: it is rather ahead, or that of most axes."""
+    doubled = 2.0 * np.arctan2(axes[:, 1], axes[:, 0])
+    azimuth = 0.5 * math.atan2(float(np.sin(doubled).sum()), float(np.cos(doubled).sum()))
+    mean = np.array([math.cos(azimuth), math.sin(azimuth)])
+    sense = float(mean @ ahead[:2])
+    if abs(sense) < TILTED:
+        sense = float(mean @ axes[:, :2].mean(axis=0))
+    return azimuth if sense >= 0.0 else azimuth + math.pi
 
 
 def cameras_along(route: Route, lenses: Lens | Sequence[Lens], up: Float64[np.ndarray, " 3"]) -> list[Camera]:
@@ -143,12 +162,11 @@ def cameras_along(route: Route, lenses: Lens | Sequence[Lens], up: Float64[np.nd
     upright = rotation_to_up(up)
     each = [lenses] * len(route) if isinstance(lenses, Lens) else lenses
     cameras = []
-    for number, (place, heading, view, lens) in enumerate(
-        zip(route.places, route.headings, route.directions(), each, strict=True)
-    ):
-        right = np.array([math.sin(heading), -math.cos(heading), 0.0])
+    level = replace(route, leans=np.zeros(len(route))).directions()
+    each_one = zip(route.places, route.directions(), np.cross(level, route.rights()), each, strict=True)
+    for number, (place, view, down, lens) in enumerate(each_one):
         pose = np.eye(4)
-        pose[:3, :3] = np.stack((right, np.cross(view, right), view)) @ upright
+        pose[:3, :3] = np.stack((np.cross(down, view), down, view)) @ upright
         pose[:3, 3] = -pose[:3, :3] @ (upright.T @ place)
         middle = (0.5 * lens.width, 0.5 * lens.height)
         cameras.append(Camera(f"{number:05d}", lens.width, lens.height, lens.focal_px, lens.focal_px, *middle, pose))
@@ -285,4 +303,4 @@ def towards(places: Float64[np.ndarray, "n 3"], targets: Float64[np.ndarray, "n 
     """The route of a camera that looks at targets."""
     ahead = targets - places
     headings = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-    return Route(places, headings, np.arctan2(ahead[:, 2], np.hypot(ahead[:, 0], ahead[:, 1])))
+    return Route(places, headings, np.arctan2(ahead[:, 2], np.hypot(ahead[:, 0], ahead[:, 1])), np.zeros(len(places)))

@@ -72,4 +72,4 @@ def _clear(clearance: Clearance, wanted: tuple[np.ndarray, float, float], uprigh
 def _circle(middle: np.ndarray, distance: float, elevation: float, angles: np.ndarray) -> Route:
     flat, height = distance * math.cos(elevation), distance * math.sin(elevation)
     around = np.column_stack((flat * np.cos(angles), flat * np.sin(angles), np.full(len(angles), height)))
-    return Route(middle + around, angles + math.pi, np.full(len(angles), -elevation))
+    return Route(middle + around, angles + math.pi, np.full(len(angles), -elevation), np.zeros(len(angles)))
