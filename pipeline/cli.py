@@ -6,7 +6,7 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -53,9 +53,6 @@ from splatpipe.pipeline.engine.errors import (
     UsageError,
     exit_code,
 )
-
-if TYPE_CHECKING:
-    pass
 
 app = typer.Typer(
     name="splatpipe",

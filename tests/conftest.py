@@ -20,6 +20,7 @@ DEMO = (
     "flythrough.seconds=4.0",
     "evaluate.every=4",
 )
+PATIENCE_MS = 240_000.0  # for what the browser is to show: far more than it takes, of a busy machine
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -83,6 +84,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Watched]]:
 
     def open_page(address: str, width: int = 1440, height: int = 900, touch: bool = False) -> Watched:
         context = browser.new_context(viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch)
+        context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
         watched = Watched(context.new_page())
         watched.open(address)

@@ -94,6 +94,31 @@ def test_a_point_outlives_its_last_mark(tmp_path: Path) -> None:
     assert [(p.name, p.marks) for p in read_control_file(path).points] == [("P 1", ())]
 
 
+UNNAMED = ("1 2 3 10 11 A.JPG", "4 5 6 20 21 A.JPG", "1 2 3 12 13 Ö.jpg", "7 8 9 30 31 A.JPG", "4 5 6 40 41 A.JPG P")
+
+
+@pytest.mark.parametrize("as_csv", [False, True])
+@pytest.mark.parametrize(("name", "photo"), [("point 1", "A.JPG"), ("point 2", "A.JPG"), ("P", "A.JPG")])
+def test_points_without_names_stay_themselves_when_a_mark_goes(
+    tmp_path: Path, as_csv: bool, name: str, photo: str
+) -> None:
+    lines = ["EPSG:32633", *(["x,y,z,pixel_x,pixel_y,photo,name"] if as_csv else []), *UNNAMED]
+    text = written(tmp_path / "marks", "\n".join(line.replace(" ", ",") if as_csv else line for line in lines) + "\n")
+    expected = {
+        "point 1": {"A.JPG": (10.0, 11.0), "Ö.jpg": (12.0, 13.0)},
+        "point 2": {"A.JPG": (20.0, 21.0)},
+        "point 3": {"A.JPG": (30.0, 31.0)},
+        "P": {"A.JPG": (40.0, 41.0)},
+    }
+    assert text.marks == expected
+    text.without_mark(point(name), photo).save()
+    del expected[name][photo]
+    found = ControlText.read(tmp_path / "marks", find)
+    assert {each: seen for each, seen in found.marks.items() if seen} == {k: v for k, v in expected.items() if v}
+    again = found.with_mark(point("point 3"), "Ö.jpg", (5.0, 6.0))
+    assert again.marks["point 3"] == {"A.JPG": (30.0, 31.0), "Ö.jpg": (5.0, 6.0)}
+
+
 def test_what_a_photo_does_not_show_is_a_comment(tmp_path: Path) -> None:
     path = tmp_path / "gcp_list.txt"
     text = ControlText.begin(path, "EPSG:32633", False, find).with_mark(point("P1"), "A.JPG", (1.0, 2.0))

@@ -111,10 +111,13 @@ class ControlText:
         here = next((row for row in group if row.mark and self.find(row.mark.photo) == photo), None)
         if here is None:
             return self
+        numbered = any(not row.name for row in self.table.rows)  # by their first lines, of which none may go
+        if self.table.header is not None and (numbered or len(group) == 1):
+            return self._put(here.line, self._marked(self._line(here.line), "", None, keep=False))
+        if numbered:
+            return self._named().without_mark(point, photo)
         if len(group) > 1:
             return self._put(here.line, None)
-        if self.table.header is not None:
-            return self._put(here.line, self._marked(self._line(here.line), "", None, keep=False))
         fields = _split(self._line(here.line))[:3]
         return self._put(here.line, f"{UNMARKED}\t" + "\t".join([*fields, point.name]))
 
@@ -152,6 +155,17 @@ class ControlText:
             raise MachineError(
                 f"Cannot write {self.path}: {error.strerror}.", hint="Check its permissions and the free space."
             ) from error
+
+    def _named(self) -> ControlText:
+        """The text of ODM's list with the names written out that points without one go by."""
+        lines = [text for _, text in self.table.lines]
+        for name, group in self.table.groups.items():
+            for row in group:
+                if not row.name:
+                    fields = _split(lines[row.line - 1])
+                    fields[6:7] = [name]
+                    lines[row.line - 1] = _joined(fields, tabs=True)
+        return self._with_lines(lines)
 
     def _line(self, number: int) -> str:
         return self.table.lines[number - 1][1]

@@ -130,10 +130,10 @@ class Marking:
         return x, y
 
     def _fresh(self) -> ControlText:
-        """The file as it is now, with what somebody else wrote into it meanwhile."""
+        """The file as it is now, with what somebody else wrote into it meanwhile; one taken away is written again."""
         if self.job.text.path.is_file():
             return ControlText.read(self.job.text.path, NameFinder(self._photos))
-        return self.job.text
+        return self._text
 
     def _state(self, text: ControlText, point: str, photo: str) -> State:
         if (point, photo) in text.hidden:

@@ -12,7 +12,7 @@ const MODELS = { initial: "the start, before training", checkpoint: "iteration",
 let told = null;
 let updates = 0;
 let view = null; // name of the photo that is shown
-let pictured = "";
+let pictured = { address: "" };
 const plots = {};
 
 async function ask() {
@@ -107,21 +107,21 @@ function showViews() {
 
 // The picture before stays until the new one is there; one at a time.
 async function picture(stamp, number) {
-  const wanted = `/live/${stamp}/${number}`;
-  if (pictured.startsWith(wanted)) return;
-  pictured = `${wanted} loading`;
+  const address = `/live/${stamp}/${number}`;
+  if (pictured.address === address) return;
+  const mine = { address };
+  pictured = mine;
   try {
     for (const what of ["render", "photo"]) {
       const image = new Image();
-      image.src = `${wanted}/${what}.jpg`;
+      image.src = `${address}/${what}.jpg`;
       await image.decode();
-      if (!pictured.startsWith(wanted)) return;
+      if (pictured !== mine) return;
       $(what).src = image.src;
       $(what).hidden = false;
     }
-    pictured = wanted;
   } catch {
-    if (pictured.startsWith(wanted)) pictured = ""; // the model went on meanwhile: the next answer names it
+    if (pictured === mine) pictured = { address: "" }; // the model went on meanwhile: the next answer names it
   }
 }
 
