@@ -87,11 +87,11 @@ def picture(page: Page) -> np.ndarray:
 
 def wait_until(page: Page, happened: Callable[[], bool]) -> None:
     """The browser draws in software: what takes a moment may take seconds on a busy machine."""
-    for _ in range(300):
+    for _ in range(2400):
         if happened():
             return
         page.wait_for_timeout(100)
-    raise AssertionError("it did not happen within 30 s")
+    raise AssertionError("it did not happen within four minutes")
 
 
 def state(page: Page) -> dict:

@@ -17,12 +17,16 @@ const { metafile } = await build({
   logLevel: "warning",
 });
 
+const modules = join(import.meta.dirname, "node_modules");
+const facts = (name) => JSON.parse(readFileSync(join(modules, name, "package.json"), "utf8"));
 for (const [path, { inputs }] of Object.entries(metafile.outputs)) {
   const packages = new Set(Object.keys(inputs).map((name) => name.match(/node_modules\/((?:@[^/]+\/)?[^/]+)/)?.[1]));
+  for (const name of packages) { // grows: a package's bundle may have its own dependencies in it
+    if (name) for (const other of Object.keys(facts(name).dependencies ?? {})) packages.add(other);
+  }
   const licences = [...packages].filter(Boolean).sort().map((name) => {
-    const folder = join(import.meta.dirname, "node_modules", name);
-    const { version } = JSON.parse(readFileSync(join(folder, "package.json"), "utf8"));
-    return `${name} ${version}\n${readFileSync(join(folder, "LICENSE"), "utf8").replaceAll("*/", "* /").trim()}`;
+    const text = readFileSync(join(modules, name, "LICENSE"), "utf8").replaceAll("*/", "* /").trim();
+    return `${name} ${facts(name).version}\n${text}`;
   });
   if (licences.length) writeFileSync(path, `/*! With:\n\n${licences.join("\n\n")}\n*/\n${readFileSync(path, "utf8")}`);
 }

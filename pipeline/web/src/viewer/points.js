@@ -32,14 +32,19 @@ void main() {
 /** The foremost point near a place in the window; null where none is. */
 export function nearestPoint(points, view, x, y) {
   const xyz = points.geometry.getAttribute("position").array;
-  const point = new Vector3();
-  let [best, least] = [null, Infinity];
-  for (let i = 0; i < xyz.length; i += 3) {
-    const at = view.project(point.fromArray(xyz, i));
-    const off = Math.hypot(at.x - x, at.y - y);
-    if (at.depth <= 0 || off > REACH_PX) continue;
-    const cost = at.depth * (1 + off / REACH_PX);
-    if (cost < least) [best, least] = [point.clone(), cost];
+  const { fx, fy, cx, cy } = view.intrinsics();
+  const { right, up, forward } = view.axes();
+  const eye = view.position;
+  let [best, least] = [-1, Infinity];
+  for (let i = 0; i < xyz.length; i += 3) { // as view.project, which for each of 150,000 makes vectors anew
+    const [x0, y0, z0] = [xyz[i] - eye.x, xyz[i + 1] - eye.y, xyz[i + 2] - eye.z];
+    const depth = x0 * forward.x + y0 * forward.y + z0 * forward.z;
+    const across = cx + (fx * (x0 * right.x + y0 * right.y + z0 * right.z)) / depth;
+    const down = cy - (fy * (x0 * up.x + y0 * up.y + z0 * up.z)) / depth;
+    const off = Math.hypot(across - x, down - y);
+    if (depth <= 0 || off > REACH_PX) continue;
+    const cost = depth * (1 + off / REACH_PX);
+    if (cost < least) [best, least] = [i, cost];
   }
-  return best;
+  return best < 0 ? null : new Vector3().fromArray(xyz, best);
 }
