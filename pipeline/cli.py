@@ -204,7 +204,7 @@ def render(
 @app.command()
 def view(
     out: OutArgument,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for any that is free.")] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     mark: Annotated[bool, typer.Option("--mark", help="Mark control points in the photos.")] = False,
     points: Annotated[

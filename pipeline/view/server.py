@@ -30,6 +30,9 @@ from splatpipe.pipeline.view.opened import Run, open_run
 from splatpipe.pipeline.web import asset
 
 ADDRESS = "127.0.0.1"
+MARKING_PORT = (
+    8474  # if it is free: marks that a browser keeps belong to an address, and the next server has to have it
+)
 ASSETS = {
     "landing.css": "text/css",
     "live.css": "text/css",
@@ -71,7 +74,7 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
         MachineError: if the port is taken.
     """
     run = open_run(out)
-    listening = _listen(options.port)
+    listening = _listen_for_marks() if options.mark and options.port == 0 else _listen(options.port)
     live, token = Live(run), secrets.token_urlsafe(32)
     pages = Pages(run, live, token)
     try:
@@ -137,6 +140,13 @@ def _settings(app: ASGIApp) -> uvicorn.Config:
         timeout_graceful_shutdown=1,
         limit_concurrency=64,
     )
+
+
+def _listen_for_marks() -> socket.socket:
+    try:
+        return _listen(MARKING_PORT)
+    except MachineError:
+        return _listen(0)
 
 
 def _listen(port: int) -> socket.socket:
