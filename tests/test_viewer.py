@@ -22,8 +22,10 @@ from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.store import open_store
 from splatpipe.pipeline.scene.dataset import load_views
 from splatpipe.pipeline.scene.frames import Frame, Origin, Similarity, load_frame
+from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, panorama_of, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.scene.sh import rgb_to_dc
 from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.viewing import Look, upright, viewer_scene, write_viewer
 
@@ -62,11 +64,11 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def write_tiny(folder: Path, title: str = "Tiny", largest_bytes: float = 1e9) -> None:
+def write_tiny(folder: Path, title: str = "Tiny", largest_bytes: float = 1e9, model: Gaussians | None = None) -> None:
     dataset = tiny_scene.write_dataset(folder / "dataset")
     frame = Frame("arbitrary", Similarity(1.0, UP_FROM_DOWN, np.zeros(3)))
     look = Look(antialias=False, background=(0.0, 0.0, 0.0), near=0.01, sky=tiny_sky())
-    model = tiny_scene.true_model()
+    model = tiny_scene.true_model() if model is None else model
     scene = viewer_scene(dataset, frame, look, ["flight 1/photo_0.png"], len(model), title)
     turned = model.transformed(1.0, torch.from_numpy(UP_FROM_DOWN), torch.zeros(3, dtype=torch.float64))
     write_viewer(folder, scene, turned, largest_bytes)
@@ -273,6 +275,31 @@ def test_blur_without_antialiasing_the_sky_and_an_off_centre_lens_are_ours(tiny:
     ours = render_pixels((tiny_scene.true_model(), tiny_sky()), camera, options)
     bare = render_pixels((tiny_scene.true_model(), None), camera, options)
     assert psnr(ours, bare) < LIKE_OURS_DB  # the sky is seen
+    assert psnr(picture(page), ours) >= LIKE_OURS_DB
+
+
+def test_the_last_splat_of_a_batch_is_drawn_whole(tmp_path: Path, view: Opened) -> None:
+    """Many are drawn at a time, 16,384 at most: of twice as many, the large one is in the middle from either side."""
+    camera = tiny_scene.cameras()[4]
+    count = 2 * 16384 - 1
+    generator = torch.Generator().manual_seed(3)
+    model = Gaussians.empty(count, 0)
+    middle = count // 2
+    places = 2.0 * torch.rand(count, 3, generator=generator).double() - 1.0
+    places[:, 2] = torch.linspace(2.0, 6.0, count) + 0.5 * (torch.arange(count) - middle).sign()  # the camera's depths
+    places[middle] = torch.tensor([0.0, 0.0, 4.0])
+    pose = torch.from_numpy(camera.cam_from_world)
+    model.means = ((places - pose[:3, 3]) @ pose[:3, :3]).float()
+    model.log_scales = torch.full((count, 3), -6.0)
+    model.quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    model.opacity_logits = torch.full((count,), 3.0 / 255.0).logit()
+    model.sh = rgb_to_dc(torch.full((count, 1, 3), 0.3))
+    model.log_scales[middle], model.opacity_logits[middle] = -1.0, 3.0
+    model.sh[middle] = rgb_to_dc(torch.ones(1, 3))
+    write_tiny(tmp_path, model=model)
+    page = view(tmp_path / "viewer.html", camera.width, camera.height)
+    page.evaluate("name => splatpipe.goToCamera(name)", camera.name)
+    ours = render_pixels((model, tiny_sky()), camera, raster.RenderOptions(sh_degree=0))
     assert psnr(picture(page), ours) >= LIKE_OURS_DB
 
 
