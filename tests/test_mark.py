@@ -212,6 +212,26 @@ def test_keys_move_remove_hide_and_take_back(marking: tuple[Served, Path], open_
     assert state(page)["point"] == "P17"
 
 
+def test_a_click_before_the_photo_is_there_marks_nothing(marking: tuple[Served, Path], open_page: Callable) -> None:
+    """Else what is seen in one photo would be marked in the next."""
+    server, file = marking
+    page = opened(open_page, server).page
+    page.evaluate("splatpipe.mark.goTo('P16', 'DJI_0034.JPG')")
+    held: list[Any] = []
+    page.route("**/photo/*", lambda route: held.append(route))  # noqa: PLW0108 - playwright marks what it calls
+    with page.expect_request("**/photo/*"):
+        page.evaluate("() => { splatpipe.mark.goTo('P16', 'DJI_0005.JPG'); }")
+    page.locator("#canvas").click()
+    assert state(page)["waiting"] == 0 and not file.exists()
+    for route in held:
+        route.continue_()
+    page.unroute("**/photo/*")
+    page.evaluate("splatpipe.mark.goTo('P16', 'DJI_0005.JPG')")
+    page.locator("#canvas").click()
+    state(page)
+    assert list(marks_in(file)) == [("P16", "DJI_0005.JPG")]
+
+
 def read_points(file: Path) -> list[Any]:
     lines = [line for line in file.read_text().splitlines()[1:] if not line.startswith("#")]
     return list(read_control_file(file).points) if lines else []

@@ -29,7 +29,7 @@ SCRIPT = """async ([bytes, type, times]) => {
     const shown = new Promise(done => video.requestVideoFrameCallback(done));
     video.currentTime = time;
     await there;
-    await Promise.race([shown, new Promise(done => setTimeout(done, 500))]);  // no callback where it was shown before
+    await Promise.race([shown, new Promise(done => setTimeout(done, 3000))]);  // no callback where it was shown before
     pen.drawImage(video, 0, 0);
     const pixels = pen.getImageData(0, 0, canvas.width, canvas.height).data;
     let text = '';

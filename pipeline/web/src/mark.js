@@ -25,7 +25,7 @@ const KEYS = [
   ["R  Ctrl+Y", "redo"],
 ];
 
-const state = { told: null, detail: null, point: 0, photo: -1, moved: null, order: new Map(), wanted: 6, acting: Promise.resolve() };
+const state = { told: null, detail: null, point: 0, asked: 0, photo: -1, moved: null, order: new Map(), wanted: 6, acting: Promise.resolve() };
 const photos = new Photos();
 const picture = new Picture($("canvas"), $("overall"), {
   click: (place) => row() && mark(place, false),
@@ -74,12 +74,13 @@ function setDetail(detail) {
   state.detail = detail;
 }
 
+// Until the point's photos are known, and then until its photo is there, all that is clicked is for what is shown.
 async function choosePoint(number, photo) {
-  state.point = number;
-  state.order.delete(pointName());
-  const wanted = number;
+  state.asked = number;
   const detail = await fetchJson(`/api/mark/${number}`);
-  if (state.point !== wanted) return;
+  if (state.asked !== number) return;
+  state.point = number;
+  state.order.delete(detail.name);
   setDetail(detail);
   const rows = detail.photos;
   const first = rows.find(isLeft) ?? rows.find((each) => each.mark) ?? rows[0];
@@ -92,8 +93,9 @@ async function choosePhoto(number) {
   state.photo = number;
   state.moved = null;
   hint("");
-  showAll();
   const size = state.told.photos[number];
+  picture.show(null, size); // where nothing is shown, nothing can be clicked
+  showAll();
   try {
     const bitmap = await photos.get(number, size);
     if (state.photo !== number) return;
