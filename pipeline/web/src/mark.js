@@ -231,12 +231,12 @@ function showSaved() {
 function showAll() {
   const { told, detail } = state;
   showEstimate($("estimate"), told);
-  showPoints($("list"), told, state.point, state.wanted, (number) => choosePoint(number));
+  showPoints($("list"), told, state.point, state.wanted, (number) => atOnce(() => choosePoint(number)));
   showFile();
   $("undo").disabled = !told.can_undo && !outbox?.count;
   $("redo").disabled = !told.can_redo;
   if (detail) {
-    showPhotos(document.querySelector("#photos ol"), detail.photos, state.photo, (number) => choosePhoto(number));
+    showPhotos(document.querySelector("#photos ol"), detail.photos, state.photo, (number) => atOnce(() => choosePhoto(number)));
     $("point").textContent = detail.name;
     const marked = detail.photos.filter((each) => each.mark).length;
     const left = detail.photos.filter(isLeft).length;
@@ -301,6 +301,12 @@ function onKey(event) {
 // One after the other, however fast the keys come.
 function run(act) {
   state.acting = state.acting.then(act).catch((error) => hint(error.message, true));
+}
+
+// What is chosen from a list waits for nothing, but what comes next waits for it.
+function atOnce(act) {
+  const done = act().catch((error) => hint(error.message, true));
+  state.acting = Promise.all([state.acting, done]);
 }
 
 function help() {
