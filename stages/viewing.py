@@ -183,7 +183,7 @@ def _reduced(camera: Camera, height: int) -> int:
     """How OpenCV is to read a photo: reduced while decoding, still of twice the thumb's size; that is far faster."""
     room = min(camera.width, camera.height) // (2 * height)
     steps = ((8, cv2.IMREAD_REDUCED_COLOR_8), (4, cv2.IMREAD_REDUCED_COLOR_4), (2, cv2.IMREAD_REDUCED_COLOR_2))
-    return next((flag for factor, flag in steps if room >= factor), cv2.IMREAD_COLOR)
+    return int(next((flag for factor, flag in steps if room >= factor), cv2.IMREAD_COLOR))
 
 
 def _thumb(picture: Pixels, height: int) -> bytes:

@@ -387,6 +387,7 @@ def test_a_log_of_rubbish_is_passed_over(tmp_path: Path) -> None:
     good = {"kind": "run_started", "stage": "", "data": {"stages": ["train"]}, "time_s": 1.0}
     lines = [json.dumps(good), "", "{", "[]", "null", '{"kind": 1}', "[" * 100_000, "x" * 400_000]
     lines += [json.dumps({**good, "data": {"stages": 3}}), json.dumps({**good, "kind": "metric", "data": {}})]
+    lines += [json.dumps({**good, "kind": "metric", "data": {"name": "loss", "value": 1.0, "step": 1e999}})]
     (tmp_path / "events.jsonl").write_bytes("\n".join(lines).encode() + b"\n\xff\xfe\n")
     log = RunLog(tmp_path, "events.jsonl")
     log.read()

@@ -119,7 +119,7 @@ def read_story(path: Path, *, running: bool) -> Story:
     for event in _events(path):
         try:
             reader.take(event)
-        except (KeyError, TypeError, ValueError, AttributeError):
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             continue
     return reader.finish(running)
 

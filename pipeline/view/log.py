@@ -144,7 +144,7 @@ class RunLog:
         try:
             event: dict[str, Any] = json.loads(line)
             self._event(str(event["kind"]), str(event["stage"]), event["data"], float(event["time_s"]))
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             return
 
     def _event(self, kind: str, stage: str, data: Mapping[str, JSON], time_s: float) -> None:
