@@ -179,7 +179,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
             assert running.poll() is None, running.stderr and running.stderr.read()
             time.sleep(0.1)
         running.send_signal(signal.SIGINT)
-        _, said = running.communicate(timeout=60)
+        _, said = running.communicate(timeout=240)
     assert running.returncode == 130 and "Traceback" not in said
     assert not list(copy_of_run.glob("report.html.*"))
     splatpipe("report", copy_of_run)

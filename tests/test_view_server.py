@@ -324,7 +324,7 @@ def test_the_viewer_opens_from_here_with_its_splat_inside_or_beside_it(served: S
 def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> None:
     def view(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "splatpipe.pipeline.cli", "view", *map(str, arguments), "--no-browser"]
-        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=240)
 
     done = view(tmp_path)
     assert done.returncode == 2 and "holds no run" in done.stderr
@@ -341,7 +341,7 @@ def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> 
 def test_it_ends_when_asked_to(demo_run: Path, number: signal.Signals, code: int) -> None:
     with serving(demo_run) as server:
         server.process.send_signal(number)
-        assert server.process.wait(timeout=30) == code
+        assert server.process.wait(timeout=240) == code
 
 
 def test_a_file_behind_a_link_or_a_pipe_is_not_there(tmp_path: Path) -> None:

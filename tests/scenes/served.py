@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+PATIENCE_S = 240.0  # far more than an end takes, of a busy machine
 WRITTEN_INTO = ("events.jsonl", "splatpipe.log", ".lock")
 ADDRESS = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)")
 
@@ -101,7 +102,10 @@ def serving(out: Path, *options: object) -> Iterator[Served]:
             raise AssertionError(told)
     finally:
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+        try:
+            process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()  # nothing where it has ended
 
 
 def linked_copy(run: Path, target: Path) -> Path:
