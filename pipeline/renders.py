@@ -78,7 +78,10 @@ class Wanted:
         """
         what: What | None = next((known for known in get_args(What) if known == self.what), None)
         if what is None:
-            raise UsageError(f'There is nothing called "{self.what}".', hint=f"Choose {', '.join(get_args(What))}.")
+            raise UsageError(
+                f'--what "{self.what[:20]}" is nothing that can be rendered.',
+                hint=f"Choose {', '.join(get_args(What))}.",
+            )
         if not self.size:
             return what, None
         match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", self.size)
@@ -101,6 +104,8 @@ class Wanted:
         target = self.to or out / FOLDER / f"{stem}-{self.what}{'' if self.stills else '.webm'}"
         if self.stills and target.exists() and not target.is_dir():
             raise UsageError(f"{target} is a file.", hint="Stills go into a folder: name another one with -o.")
+        if self.stills and target.suffix in CODECS:
+            raise UsageError(f"{target} is a film's name.", hint="Stills go into a folder: name one with -o.")
         if not self.stills and (target.suffix not in CODECS or target.is_dir()):
             raise UsageError(f"{target} is no film.", hint=f"A film ends in {' or '.join(CODECS)}.")
         folder = target if self.stills else target.absolute().parent

@@ -172,6 +172,7 @@ WRONG = [
     (Wanted(to=Path("{tmp}/film.avi")), 2, "is no film"),
     (Wanted(to=Path("{tmp}/folder.webm")), 2, "is no film"),
     (Wanted(stills=True, to=Path("{tmp}/broken.json")), 2, "is a file"),
+    (Wanted(stills=True, to=Path("{tmp}/stills.webm")), 2, "is a film's name"),
     (Wanted(to=Path("/proc/films/film.webm")), 4, "Cannot make"),
 ]
 

@@ -309,6 +309,16 @@ def test_a_damaged_part_costs_its_chapter_and_not_the_report(copy_of_run: Path, 
     assert "How it was made" in page
 
 
+def test_a_finished_run_whose_artifact_is_damaged_is_not_told_as_one_that_was_asked_to_end_there(
+    copy_of_run: Path,
+) -> None:
+    (open_holdings(copy_of_run).part("sparse.summary").parent / "manifest.json").write_text("{")
+    verdict = judge(open_holdings(copy_of_run))
+    assert verdict.level == "bad"
+    assert verdict.headline == "Finished, but its results are damaged"
+    assert "sparse" in verdict.text
+
+
 def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
     """Change a part of an artifact, which stays whole."""
     told = json.loads(path.read_text())

@@ -1,6 +1,7 @@
 """viewer.html in a real browser: its picture, its places and lengths, its hands, and what it says where it cannot."""
 
 import io
+import itertools
 import json
 import shutil
 import sys
@@ -371,8 +372,29 @@ def test_points_take_the_splats_place_and_measurements_are_taken_back(tiny: Path
     page.mouse.click(300, 190)
     page.mouse.click(340, 210)
     assert page.locator(".measured").inner_text().startswith("Δh ")
+    assert page.locator("#hint").inner_text().startswith("Length ")
     page.keyboard.press("Backspace")
     assert page.locator(".measured").count() == 0
+    assert page.locator("#hint").inner_text().startswith("Click the first point")
+
+
+def test_next_and_previous_count_from_the_photo_chosen_last(tiny: Path, view: Opened) -> None:
+    page = view(tiny / "viewer.html")
+    page.evaluate("() => splatpipe.goToCamera(splatpipe.facts.cameras[0].name)")
+    page.keyboard.type("nNb")  # faster than the view travels
+    wait_until(page, lambda: state(page)["photo"] == "flight 1/photo_1.png")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844), (844, 390)])
+def test_nothing_that_floats_over_the_model_hides_another(tiny: Path, view: Opened, width: int, height: int) -> None:
+    page = view(tiny / "viewer.html", width, height)
+    page.keyboard.press("m")
+    page.locator("#compass").evaluate("element => element.removeAttribute('hidden')")
+    page.locator("#crs").evaluate("element => element.replaceChildren('a long sentence '.repeat(8))")
+    boxes = [page.locator(name).bounding_box() for name in ("#compass", "#where", "#strip", "#hint")]
+    for a, b in itertools.combinations(filter(None, boxes), 2):
+        (left, right), (top, bottom) = [sorted((a, b), key=lambda box: box[axis]) for axis in "xy"]
+        assert left["x"] + left["width"] <= right["x"] or top["y"] + top["height"] <= bottom["y"]
 
 
 def test_the_screenshot_is_the_picture(tiny: Path, view: Opened, tmp_path: Path) -> None:

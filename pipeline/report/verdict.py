@@ -55,7 +55,8 @@ def judge(holdings: Holdings) -> Verdict:
     ended, text = _ended(holdings)
     told = sum(len(stage.told.warnings) for stage in holdings.story.stages.values())
     if told:
-        findings.append(Finding("doubt", "Warnings", f"The run gave {plural(told, 'warning')}; they stand below."))
+        stand = "it stands" if told == 1 else "they stand"
+        findings.append(Finding("doubt", "Warnings", f"The run gave {plural(told, 'warning')}; {stand} below."))
     if ended is not None:
         return Verdict(ended.level, ended.title, ended.text, findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
@@ -76,6 +77,10 @@ def _ended(holdings: Holdings) -> tuple[Finding | None, str]:
         last = [stage.name for stage in LINE if stage.name in holdings.artifacts][-1:]
         if last == [LINE[-1].name]:
             return None, f"The run ended on {when}."
+        gone = [name for name in story.stages if name not in holdings.artifacts]
+        if gone:
+            lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or cannot be read any more."
+            return Finding("bad", "Finished, but its results are damaged", f"{lost} The same command mends it."), ""
         got = f"up to {last[0]}" if last else "without a result"
         return Finding("doubt", f"The line was run {got}, as asked for", f"It ended on {when}."), ""
     stage = story.culprit

@@ -40,6 +40,7 @@ class Viewer {
     this.view = new View({ near: facts.near, far: facts.size * FAR_PER_SIZE });
     this.centre = vector(facts.centre);
     this.photo = null; // whose view it is
+    this.last = null; // chosen last: where the next and the one before count from
     this.tool = null;
   }
 
@@ -110,7 +111,10 @@ class Viewer {
       cameras: () => this.showCameras(!this.frusta.group.visible),
       distance: () => this.use("distance"),
       height: () => this.use("height"),
-      undo: () => this.measuring.undo(),
+      undo: () => {
+        this.measuring.undo();
+        this.tellTool(null);
+      },
       screenshot: () => this.screenshot(),
       help_button: () => ($("help").open ? $("help").close() : $("help").showModal()),
     };
@@ -122,19 +126,21 @@ class Viewer {
       if (event.key === "Escape") this.use(null);
       else if (event.key === "Tab" || $("help").open) return;
       else actions[keys[event.key.length === 1 ? event.key.toLowerCase() : event.key]]?.();
-      if (event.key === "n" || event.key === "b") this.step(event.key === "n" ? 1 : -1);
+      const by = { n: 1, b: -1 }[event.key.toLowerCase()];
+      if (by && !$("help").open) this.step(by);
     });
     this.showCameras(false);
   }
 
   /** The next or previous photo's view. */
   step(by) {
-    const now = this.photos.indexOf(this.photo);
-    this.goTo(this.photos[(now + by + this.photos.length) % this.photos.length]);
+    const count = this.photos.length;
+    this.goTo(this.photos[(this.photos.indexOf(this.last) + by + count) % count]);
   }
 
   goTo(photo, atOnce) {
     if (!photo) return false;
+    this.last = photo;
     this.view.travel(this.view.poseOf(photo), atOnce, () => {
       this.photo = photo;
       this.choose?.(photo);
@@ -155,7 +161,11 @@ class Viewer {
     if (photo) return this.goTo(photo);
     const point = this.pick(x, y);
     this.tellPoint(point);
-    if (!this.tool || !point) return;
+    if (!this.tool) return;
+    if (!point) {
+      $("hint").textContent = "There is nothing to measure here: click on the model.";
+      return;
+    }
     const result = this.measuring.click(point);
     this.tellTool(result);
   }
