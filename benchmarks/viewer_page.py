@@ -23,7 +23,7 @@ from playwright.sync_api import Page, sync_playwright
 from splatpipe.pipeline.scene.frames import load_frame
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.export import in_world
-from splatpipe.stages.viewing import Look, viewer_scene, write_viewer
+from splatpipe.stages.viewing import look_of, viewer_scene, write_viewer
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SPREAD = 0.9  # of the parent's standard deviations: how its parts lie in it
@@ -55,7 +55,7 @@ def write_page(run: OpenedRun, count: int, folder: Path) -> None:
     """Write the page of a model of that many Gaussians, the splat within."""
     gaussians, sky = run.model
     frame = load_frame(run.parts["georef.frame"].path)
-    look = Look(run.options.antialias, run.options.background, run.options.near, sky)
+    look = look_of(run.options, sky)
     scene = viewer_scene(run.parts["undistort.dataset"].path, frame, look, run.held_out, count, f"{count:,} Gaussians")
     write_viewer(folder, scene, in_world(multiplied(gaussians, count), frame), largest_bytes=1e9)
 

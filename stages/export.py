@@ -28,6 +28,7 @@ from splatpipe.pipeline.scene.georeference import georeference, scene_box, told_
 from splatpipe.pipeline.scene.panorama import read_panorama
 from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.stages.options import ExportConfig
+from splatpipe.stages.rendering import as_trained
 from splatpipe.stages.viewing import look_of, viewer_scene, write_viewer
 
 Doubles = npt.NDArray[np.float64]
@@ -95,7 +96,8 @@ def write_viewer_of(inputs: Inputs, gaussians: Gaussians, folder: Path, config: 
     folder.mkdir()
     if config.viewer_megabytes == 0.0:
         return
-    look = look_of(inputs["train.plan"], read_panorama(inputs["train.sky"]))
+    options, _ = as_trained(inputs["train.plan"], gaussians)
+    look = look_of(options, read_panorama(inputs["train.sky"]))
     held_out = {view["name"] for view in _read_json(inputs["evaluate.metrics"])["per_view"]}
     frame = load_frame(inputs["georef.frame"])
     scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out, len(gaussians), config.title)

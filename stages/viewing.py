@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.raster import RenderOptions
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View, load_points, load_views
 from splatpipe.pipeline.scene.frames import Frame
@@ -51,19 +51,9 @@ class Look:
     sky: Panorama | None = None
 
 
-def look_of(plan: Path, sky: Panorama | None) -> Look:
-    """Read `plan.json`.
-
-    Raises:
-        StageError: if it is not one.
-    """
-    try:
-        fields = json.loads(plan.read_text(encoding="utf-8"))
-        white = fields["options"]["background"] == "white"
-        background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
-        return Look(bool(fields["options"]["antialias"]), background, float(fields["near"]), sky)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StageError("Training's plan.json cannot be read.", hint="Run again with --rerun-from train.") from error
+def look_of(options: RenderOptions, sky: Panorama | None) -> Look:
+    """What of the rasterizer's options (see `as_trained`) counts in the page as well."""
+    return Look(options.antialias, options.background, options.near, sky)
 
 
 def viewer_scene(

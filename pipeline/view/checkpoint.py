@@ -19,14 +19,13 @@ from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.images import reduced_view
 from splatpipe.pipeline.scene.panorama import Panorama, read_panorama
 from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.pipeline.scene.spz import SPZ_FROM_Z_UP, spz_bytes
 from splatpipe.pipeline.view.opened import Opened
 from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.stages.export import in_world
 from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.smoothing import smoothed
-from splatpipe.stages.viewing import SPLAT, look_of, viewer_scene
+from splatpipe.stages.viewing import SPLAT, look_of, viewer_scene, viewer_splat
 
 CHECKPOINT = "checkpoint.npz"
 JPEG_QUALITY = 92
@@ -161,12 +160,11 @@ def viewer(shown: Shown, source: Source, opened: Opened, name: str) -> tuple[str
         raise SplatpipeError("There is nothing to show in 3D yet.")
     frame = load_frame(opened.parts["georef.frame"].path)
     gaussians = in_world(shown.gaussians, frame)
-    look = look_of(source.plan, shown.sky)
+    look = look_of(shown.options, shown.sky)
     dataset, held_out = opened.parts["undistort.dataset"].path, set(held_out_of(source))
     title = f"{name}, iteration {shown.iteration:,}"
     scene = viewer_scene(dataset, frame, look, held_out, len(gaussians), title)
-    upright = gaussians.transformed(1.0, torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64), torch.zeros(3))
-    return viewer_page(scene, SPLAT), spz_bytes(upright, scene.antialias)
+    return viewer_page(scene, SPLAT), viewer_splat(gaussians, scene.antialias)
 
 
 def _from_checkpoint(path: Path, opened: Opened) -> tuple[Gaussians, Panorama | None]:
