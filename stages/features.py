@@ -3,45 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.parallel import ordered_map
-from splatpipe.pipeline.scene.photos import Photo, PhotoList, decode, decode_mask, load_photo_list
-from splatpipe.stages.options import FeaturesConfig
+from splatpipe.pipeline.scene.photos import PhotoList, load_photo_list
+from splatpipe.pipeline.sfm.keypoints import Bytes, extract, single_threaded_opencv
+from splatpipe.pipeline.sfm.options import FeaturesConfig
 
-Floats = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
-
-DESCRIPTOR_NORM = 512.0  # COLMAP's: 8-bit descriptors are 512 times the unit vector
 LEAST_KEYPOINTS = 16  # below COLMAP's 15 inliers of a pair a photo can never be placed
-
-
-@dataclass(frozen=True)
-class Features:
-    """What was found in a photo.
-
-    Attributes:
-        keypoints: (n, 6) x, y in pixels of the photo's stored grid, and the 2x2 shape matrix, row by row.
-        descriptors: (n, 128) square-rooted SIFT times 512.
-        colours: (n, 3) RGB.
-    """
-
-    keypoints: Floats
-    descriptors: Bytes
-    colours: Bytes
 
 
 def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -56,11 +32,17 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     colours: list[Bytes] = []
     with (
         tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch,
-        _single_threaded_opencv(),
+        single_threaded_opencv(),
         pycolmap.Database.open(out / "database.db") as database,
     ):
         _write_cameras(database, cameras, photo_list)
-        work = partial(_features_of, config=config, inputs=inputs, scratch=Path(scratch))
+        work = partial(
+            extract,
+            config=config,
+            part=inputs["ingest.photos"],
+            photos_dir=inputs.photos_dir,
+            scratch=Path(scratch),
+        )
         found = ordered_map(work, photo_list.photos, inputs.machine.threads)
         for number, features in enumerate(found, start=1):
             database.write_keypoints(number, features.keypoints)
@@ -94,17 +76,6 @@ def _check(photo_list: PhotoList, counts: list[int], report: Reporter) -> None:
         )
 
 
-@contextmanager
-def _single_threaded_opencv() -> Iterator[None]:
-    """Photos are the unit of parallel work: OpenCV's own threads would only get in their way."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
-
-
 def _write_cameras(database: pycolmap.Database, cameras: list[JSON], photo_list: PhotoList) -> None:
     """A camera and a trivial rig for each group, an image and a frame for each photo."""
     for number, group in enumerate(cameras, start=1):
@@ -126,117 +97,3 @@ def _write_cameras(database: pycolmap.Database, cameras: list[JSON], photo_list:
         frame = pycolmap.Frame(frame_id=number, rig_id=photo.camera + 1)
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
-
-
-def _features_of(photo: Photo, config: FeaturesConfig, inputs: Inputs, scratch: Path) -> Features:
-    part = inputs["ingest.photos"]
-    pixels = decode(photo, part, inputs.photos_dir)
-    mask = decode_mask(photo, part)
-    share = 1.0 if mask is None else float(np.count_nonzero(mask)) / mask.size
-    if share == 0.0:
-        return Features(np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8))
-    small = reduced(pixels, config.max_image_size)
-    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    if config.extractor == "opencv-sift":
-        keypoints, descriptors = opencv_sift(grey)
-    else:
-        keypoints, descriptors = colmap_sift(grey, math.ceil(config.max_features / share), scratch)
-    scale = np.array([pixels.shape[1] / grey.shape[1], pixels.shape[0] / grey.shape[0]])
-    rows = np.arange(len(keypoints))
-    if mask is not None:
-        rows = rows[_pixels_at(mask, keypoints[:, :2] * scale) > 0]
-    if config.extractor == "opencv-sift":
-        rows = rows[largest(keypoints[rows], config.max_features)]
-    colours = _pixels_at(small, keypoints[rows, :2])
-    full = keypoints[rows].astype(np.float64)
-    full[:, :2] *= scale
-    full[:, 2:] *= scale.mean()
-    return Features(full.astype(np.float32), np.ascontiguousarray(descriptors[rows]), colours)
-
-
-def largest(keypoints: Floats, places: int) -> npt.NDArray[np.int64]:
-    """Rows of the largest keypoints, which are the most repeatable, the largest first; equal ones in their order.
-
-    Args:
-        keypoints: (n, 6) as in ``Features``.
-        places: Distinct places wanted; a place with several orientations counts once.
-    """
-    sizes = np.hypot(keypoints[:, 2], keypoints[:, 4])
-    order = np.argsort(-sizes, kind="stable")
-    _, first, index = np.unique(keypoints[order, :2], axis=0, return_index=True, return_inverse=True)
-    ranks = np.argsort(np.argsort(first))  # of each place, by its largest keypoint
-    return np.asarray(order[ranks[index.ravel()] < places], np.int64)
-
-
-def reduced(pixels: Bytes, longest: int) -> Bytes:
-    """Shrink a picture to a longer side of at most ``longest`` pixels, averaging; smaller ones stay as they are."""
-    height, width = pixels.shape[:2]
-    scale = longest / max(height, width)
-    if scale >= 1.0:
-        return pixels
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _pixels_at(image: Bytes, points: npt.NDArray[np.floating]) -> Bytes:
-    """Values of the pixels that points (n, 2; centre of the first pixel 0.5, 0.5) fall into."""
-    x = np.clip(np.floor(points[:, 0]).astype(int), 0, image.shape[1] - 1)
-    y = np.clip(np.floor(points[:, 1]).astype(int), 0, image.shape[0] - 1)
-    return np.asarray(image[y, x])
-
-
-def colmap_sift(grey: Bytes, limit: int, scratch: Path) -> tuple[Floats, Bytes]:
-    """COLMAP's SIFT.
-
-    Called through ``extract_features``: pycolmap's direct extractor keeps the GIL, hence one photo at a time.
-
-    Args:
-        grey: (h, w).
-        limit: Keypoints wanted, coarse scales first. The scale at which it is reached is still taken whole.
-        scratch: An existing folder for temporary files.
-
-    Returns:
-        (n, 6) keypoints as ``Features`` has them but in pixels of ``grey``, and (n, 128) descriptors.
-    """
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = 1
-    options.max_image_size = max(grey.shape)
-    options.sift.max_num_features = limit
-    with tempfile.TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True) as folder:
-        path = Path(folder) / "database.db"
-        (Path(folder) / "photo.pgm").write_bytes(b"P5 %d %d 255\n" % grey.shape[::-1] + grey.tobytes())
-        pycolmap.Database.open(path).close()
-        pycolmap.extract_features(
-            path, folder, image_names=["photo.pgm"], extraction_options=options, device=pycolmap.Device.cpu
-        )
-        with pycolmap.Database.open(path) as database:
-            keypoints = np.asarray(database.read_keypoints(1), np.float32).reshape(-1, 6)
-            descriptors = np.asarray(database.read_descriptors(1).data, np.uint8).reshape(-1, 128)
-    return keypoints, descriptors
-
-
-def opencv_sift(grey: Bytes) -> tuple[Floats, Bytes]:
-    """OpenCV's SIFT with square-rooted descriptors (RootSIFT; Arandjelović and Zisserman, CVPR 2012).
-
-    All keypoints are returned: OpenCV's own cap keeps the strongest responses, which costs half the matches.
-
-    Args:
-        grey: (h, w).
-
-    Returns:
-        As ``colmap_sift``.
-    """
-    # Without precise upscaling every keypoint is a quarter of a pixel off.
-    detector = cv2.SIFT_create(enable_precise_upscale=True)
-    found, values = detector.detectAndCompute(grey, None)
-    if values is None or len(found) == 0:
-        return np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8)
-    place = np.array([keypoint.pt for keypoint in found], np.float64) + 0.5
-    radius = np.array([keypoint.size / 2 for keypoint in found])
-    angle = np.radians([keypoint.angle for keypoint in found])
-    cos, sin = radius * np.cos(angle), radius * np.sin(angle)
-    keypoints = np.column_stack([place, cos, -sin, sin, cos]).astype(np.float32)
-    sums = np.maximum(values.sum(axis=1, keepdims=True, dtype=np.float64), 1e-12)
-    rooted = np.rint(DESCRIPTOR_NORM * np.sqrt(values / sums))
-    return keypoints, np.minimum(rooted, 255).astype(np.uint8)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from splatpipe.pipeline.engine.stage import NamedFile, Stage
+from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.stages.options import (
     EvaluateConfig,
     ExportConfig,
-    FeaturesConfig,
     FlythroughConfig,
     GeorefConfig,
     IngestConfig,
     InitializeConfig,
-    MatchesConfig,
-    SparseConfig,
     TrainConfig,
     UndistortConfig,
 )

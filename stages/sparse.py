@@ -17,10 +17,10 @@ import pycolmap
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.dataset import some
-from splatpipe.pipeline.scene.focal import UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.scene.parallel import watched
-from splatpipe.pipeline.scene.sparse_model import write_model
-from splatpipe.stages.options import SparseConfig
+from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
+from splatpipe.pipeline.sfm.options import SparseConfig
+from splatpipe.pipeline.sfm.sparse_model import write_model
 
 Model: TypeAlias = pycolmap.Reconstruction
 

@@ -18,7 +18,7 @@ from splatpipe.pipeline.scene.dataset import MASKS, MODEL, SKY_MASKS, image_path
 from splatpipe.pipeline.scene.names import match_names
 from splatpipe.pipeline.scene.parallel import ordered_map
 from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, decode_sky_mask, load_photo_list
-from splatpipe.pipeline.scene.sparse_model import write_model
+from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.stages.options import UndistortConfig
 from splatpipe.stages.resampling import resample
 

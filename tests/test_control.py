@@ -15,8 +15,8 @@ import pytest
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Summary
 from splatpipe.pipeline.scene.confidence import chi_squared_cdf, chi_squared_quantile, rmse_interval
-from splatpipe.pipeline.scene.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.scene.frames import load_frame
+from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
 from splatpipe.stages.georef import run
 from splatpipe.stages.options import GeorefConfig
 

@@ -9,12 +9,12 @@ import pytest
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.scene.photos import Photo
 from splatpipe.pipeline.scene.upright import enu_from_gimbal
-from splatpipe.stages.footprints import Views, crossing_distances, overlaps
+from splatpipe.pipeline.sfm.footprints import Views, crossing_distances, overlaps
+from splatpipe.pipeline.sfm.layout import make_layout, make_views
+from splatpipe.pipeline.sfm.pairs import Costs, Layout, choose_pairing, components, select_pairs
 from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
 from splatpipe.stages.ingest.positions import positions_json, read_positions
 from splatpipe.stages.ingest.scan import Candidate
-from splatpipe.stages.matches import make_layout, make_views
-from splatpipe.stages.pairs import Costs, Layout, choose_pairing, components, select_pairs
 
 HALF_SIZE = (0.6, 0.45)
 

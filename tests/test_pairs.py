@@ -8,8 +8,8 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.photos import Photo
-from splatpipe.stages.matches import make_layout, viewing_direction
-from splatpipe.stages.pairs import (
+from splatpipe.pipeline.sfm.layout import make_layout, viewing_direction
+from splatpipe.pipeline.sfm.pairs import (
     Costs,
     Layout,
     choose_pairing,
@@ -19,7 +19,7 @@ from splatpipe.stages.pairs import (
     select_pairs,
     sequences,
 )
-from splatpipe.stages.retrieval import codebook, look_alike_costs
+from splatpipe.pipeline.sfm.retrieval import codebook, look_alike_costs
 
 UNKNOWN = float("nan")
 

@@ -11,8 +11,9 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
+from splatpipe.pipeline.sfm.keypoints import largest, reduced
+from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.stages import features, matches, sparse
-from splatpipe.stages.options import FeaturesConfig, MatchesConfig, SparseConfig
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos
@@ -169,17 +170,17 @@ def test_the_cap_keeps_the_largest_and_counts_places() -> None:
     sizes = [1.0, 5.0, 5.0, 3.0]
     places = [[0, 0], [1, 1], [1, 1], [2, 2]]
     keypoints = np.array([[*place, size, 0, 0, size] for place, size in zip(places, sizes, strict=True)], np.float32)
-    assert features.largest(keypoints, 2).tolist() == [1, 2, 3]
-    assert features.largest(keypoints, 9).tolist() == [1, 2, 3, 0]
-    assert features.largest(keypoints[:0], 9).tolist() == []
+    assert largest(keypoints, 2).tolist() == [1, 2, 3]
+    assert largest(keypoints, 9).tolist() == [1, 2, 3, 0]
+    assert largest(keypoints[:0], 9).tolist() == []
 
 
 def test_a_photo_of_another_size_is_reduced_by_averaging() -> None:
     checker = ((np.indices((400, 800)).sum(axis=0) % 2) * 255).astype(np.uint8)
-    small = features.reduced(checker, 400)
+    small = reduced(checker, 400)
     assert small.shape == (200, 400)
     assert np.abs(small.astype(int) - 127).max() <= 1
-    assert features.reduced(checker, 800) is checker
+    assert reduced(checker, 800) is checker
 
 
 def test_opencv_threads_are_as_before(capture: Inputs, tmp_path: Path) -> None:

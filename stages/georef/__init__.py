@@ -16,8 +16,8 @@ from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.crs import parse_vertical
 from splatpipe.pipeline.scene.frames import Frame, save_frame
 from splatpipe.pipeline.scene.photos import Photo, load_photo_list
-from splatpipe.pipeline.scene.sparse_model import write_model
 from splatpipe.pipeline.scene.world import in_crs
+from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.stages.georef.accuracy import Placed, accuracy_json, control_json, no_control
 from splatpipe.stages.georef.blunders import gsd_m
 from splatpipe.stages.georef.control import ByControl, Capture, place_by_control

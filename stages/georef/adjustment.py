@@ -20,8 +20,8 @@ import pycolmap
 import pycolmap.cost_functions
 from jaxtyping import Float64
 
-from splatpipe.pipeline.scene.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
 from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity
+from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
 from splatpipe.stages.georef.place import Stations
 
 LEAST_SIGMA_PX = 1.0  # of features: they err together, in one photo, by lens and shutter; control should not

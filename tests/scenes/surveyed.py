@@ -18,7 +18,7 @@ from splatpipe.demo.truth import true_surface
 from splatpipe.pipeline.scene.geodesy import Origin
 from splatpipe.pipeline.scene.photos import Photo, PhotoList, save_photo_list
 from splatpipe.pipeline.scene.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.scene.sparse_model import write_model
+from splatpipe.pipeline.sfm.sparse_model import write_model
 
 Array = NDArray[np.float64]
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.stages.footprints import Views, overlaps
+from splatpipe.pipeline.sfm.footprints import Views, overlaps
 
 Pair = tuple[int, int]
 Costs = Callable[[int], Float64[np.ndarray, " n"]]

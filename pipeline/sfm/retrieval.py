@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from splatpipe.stages.pairs import Costs
+from splatpipe.pipeline.sfm.pairs import Costs
 
 WORDS = 64
 ROUNDS = 12  # of k-means; it need not converge

@@ -1,0 +1,42 @@
+"""The options of the stages that find the cameras. Light to import."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from splatpipe.pipeline.engine.stage import StageConfig
+
+PositiveInt = Annotated[int, Field(ge=1)]
+NonNegativeInt = Annotated[int, Field(ge=0)]
+
+
+class FeaturesConfig(StageConfig):
+    extractor: Literal["sift", "opencv-sift"] = "sift"
+    """`sift` is COLMAP's, the most points; `opencv-sift` takes a third of the time for a few points less."""
+    max_image_size: Annotated[int, Field(ge=320, le=20000)] = 2000
+    """Photos are reduced to this longer side, in pixels, before keypoints are looked for."""
+    max_features: Annotated[int, Field(ge=100, le=100_000)] = 8192
+    """Keypoints wanted a photo, the largest first; `sift` takes whole scales, so gives up to twice as many."""
+
+
+class MatchesConfig(StageConfig):
+    pairing: Literal["auto", "exhaustive", "spatial", "sequential", "retrieval"] = "auto"
+    """Which pairs are matched: `auto` takes all for small sets, neighbours by position where there is GPS,
+    sequence where names and times agree on one, else look-alikes."""
+    exhaustive_up_to: PositiveInt = 30
+    """`auto` matches every pair up to this many photos."""
+    neighbours: Annotated[int, Field(ge=2, le=200)] = 20
+    """Pairs a photo, for `spatial`, `sequential` and `retrieval`."""
+    seed: NonNegativeInt = 0
+    """Seed of the geometric verification (RANSAC)."""
+
+
+class SparseConfig(StageConfig):
+    min_model_size: Annotated[int, Field(ge=3)] = 3
+    """Models of fewer photos are dropped."""
+    parallel_adjustment: bool = False
+    """Let bundle adjustment use every thread: faster, but no longer the same bits for any number of threads."""
+    seed: NonNegativeInt = 0
+    """Seed of the incremental mapper."""
