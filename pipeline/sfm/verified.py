@@ -1,0 +1,56 @@
+"""What matching left, in memory: each photo's keypoints, and which of them verified pairs of photos share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float32, UInt32
+
+
+@dataclass(frozen=True)
+class Verified:
+    """The view graph; images and cameras under COLMAP's numbers, which count from 1 in name order.
+
+    Attributes:
+        names: Of all photos, placed or not.
+        camera_of: The camera of each.
+        cameras: As they were before mapping: focal lengths from the metadata.
+        keypoints: Places in the stored grid, pixels, the centre of the first at (0.5, 0.5).
+        matches: Of each pair (i, j), i < j, that has any: rows of keypoints in i and in j that its geometry verified.
+    """
+
+    names: Mapping[int, str]
+    camera_of: Mapping[int, int]
+    cameras: Mapping[int, pycolmap.Camera]
+    keypoints: Mapping[int, Float32[np.ndarray, "_ 2"]]
+    matches: Mapping[tuple[int, int], UInt32[np.ndarray, "_ 2"]]
+
+
+def read_verified(database: Path) -> Verified:
+    """Read the view graph of a database that matching left."""
+    with pycolmap.Database.open(database) as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
+        keypoints = {
+            image.image_id: np.ascontiguousarray(
+                np.asarray(opened.read_keypoints(image.image_id), np.float32).reshape(-1, 6)[:, :2]
+            )
+            for image in images
+        }
+        numbers, geometries = opened.read_two_view_geometries()
+        found = {}
+        for pair, geometry in sorted(zip(numbers, geometries, strict=True), key=lambda entry: entry[0]):
+            i, j = pycolmap.pair_id_to_image_pair(pair)
+            rows = np.asarray(geometry.inlier_matches, np.uint32).reshape(-1, 2)
+            if len(rows):
+                found[i, j] = rows if i < j else np.ascontiguousarray(rows[:, ::-1])
+        return Verified(
+            names={image.image_id: image.name for image in images},
+            camera_of={image.image_id: image.camera_id for image in images},
+            cameras={camera.camera_id: camera for camera in opened.read_all_cameras()},
+            keypoints=keypoints,
+            matches={tuple(sorted(pair)): rows for pair, rows in found.items()},  # type: ignore[misc]
+        )
