@@ -43,9 +43,16 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=2,
+    version=3,
     config=SparseConfig,
-    reads=("matches.database", "features.colours"),
+    reads=(
+        "matches.database",
+        "features.database",
+        "features.colours",
+        "ingest.photos",
+        "ingest.positions",
+        "ingest.cameras",
+    ),
     parts={"model": "sparse/0", "summary": "models.json"},
     entry="splatpipe.stages.sparse:run",
 )

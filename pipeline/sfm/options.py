@@ -34,9 +34,15 @@ class MatchesConfig(StageConfig):
 
 
 class SparseConfig(StageConfig):
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    """How cameras are found: `incremental` adds photo after photo, `global` solves for all at once; `auto` judges the
+    answer, and where it looks doubtful maps the other way, too, and takes the better one."""
+    ladder: bool = True
+    """Go after photos that could not be placed: more pairs, stronger keypoints, registration, joined sub-models."""
+    lens: Literal["auto", "simple", "held"] = "auto"
+    """`auto` frees principal point and further distortion where held-out matches improve; `simple` keeps focal length
+    and one distortion coefficient; `held` keeps given lenses as they are."""
     min_model_size: Annotated[int, Field(ge=3)] = 3
     """Models of fewer photos are dropped."""
-    parallel_adjustment: bool = False
-    """Let bundle adjustment use every thread: faster, but no longer the same bits for any number of threads."""
     seed: NonNegativeInt = 0
-    """Seed of the incremental mapper."""
+    """Seed of the mappers."""

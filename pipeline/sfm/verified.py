@@ -52,5 +52,5 @@ def read_verified(database: Path) -> Verified:
             camera_of={image.image_id: image.camera_id for image in images},
             cameras={camera.camera_id: camera for camera in opened.read_all_cameras()},
             keypoints=keypoints,
-            matches={tuple(sorted(pair)): rows for pair, rows in found.items()},  # type: ignore[misc]
+            matches={tuple(sorted(pair)): rows for pair, rows in found.items()},
         )

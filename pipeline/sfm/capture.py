@@ -1,0 +1,67 @@
+"""What finding the cameras may look at, and what it has found so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import UInt8
+
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.scene.photos import PhotoList
+from splatpipe.pipeline.sfm.verified import Verified
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The photos of a run, and all that is known of them before mapping.
+
+    Attributes:
+        database: Cameras with their priors, images 1, 2, … in name order, keypoints, verified two-view geometries.
+        features: The same images and keypoints, with descriptors.
+        colours: (n, 3) RGB of all keypoints of ``features``, image after image.
+        photos: The checked list.
+        photos_part: The folder of the part ``ingest.photos``.
+        photos_dir: The user's folder.
+        positions: The entries of ``positions.json``.
+        cameras: The camera groups of ``ingest.cameras``; the camera of group 0 has COLMAP's id 1.
+        scratch: An existing folder for temporary files.
+        threads: That may work at a time; the answer does not depend on it.
+    """
+
+    database: Path
+    features: Path
+    colours: UInt8[np.ndarray, "_ 3"]
+    photos: PhotoList
+    photos_part: Path
+    photos_dir: Path
+    positions: Sequence[JSON]
+    cameras: Sequence[JSON]
+    scratch: Path
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Found:
+    """Cameras and points so far.
+
+    Attributes:
+        model: The one that goes on.
+        others: Sub-models that could not be joined to it, the largest first.
+        database: The one that the keypoint indices of ``model`` refer to.
+        verified: Its view graph.
+        colours: (n, 3) RGB of all its keypoints, image after image.
+        tried: A row for each mapper that was tried, for ``models.json``.
+        rungs: A row for each rung of the ladder that was climbed, for ``models.json``.
+    """
+
+    model: pycolmap.Reconstruction
+    others: tuple[pycolmap.Reconstruction, ...]
+    database: Path
+    verified: Verified
+    colours: UInt8[np.ndarray, "_ 3"]
+    tried: tuple[JSON, ...] = ()
+    rungs: tuple[JSON, ...] = ()
