@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -12,9 +11,9 @@ import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
+from splatpipe.pipeline.sfm.mapping import MappingOptions, map_incremental
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.verified import read_verified
 
@@ -65,62 +64,14 @@ def reconstruct(capture: Capture, config: SparseConfig, report: Reporter) -> Fou
     return Found(models[0], tuple(models[1:]), capture.database, verified, capture.colours, tried)
 
 
-def _options(config: SparseConfig, attempt: Attempt) -> pycolmap.IncrementalPipelineOptions:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = config.min_model_size
-    options.extract_colors = False  # the keypoints have theirs
-    options.random_seed = config.seed
-    options.mapper.random_seed = config.seed
-    options.triangulation.random_seed = config.seed
-    # With several threads COLMAP's and Ceres' sums depend on which ends first.
-    options.num_threads = 1
-    if attempt.relaxed:
-        options.mapper.init_min_num_inliers = 50
-        options.mapper.init_min_tri_angle = 6.0
-        options.mapper.abs_pose_min_num_inliers = 15
-        options.mapper.abs_pose_min_inlier_ratio = 0.15
-    if attempt.hold_focal:
-        options.ba_refine_focal_length = False
-        options.mapper.abs_pose_refine_focal_length = False
-    return options
-
-
 def _map(capture: Capture, config: SparseConfig, attempt: Attempt, report: Reporter) -> list[Model]:
     """Every sub-model that mapping finds, the largest first."""
-    database = capture.database
-    with pycolmap.Database.open(database) as opened:
-        total = opened.num_images()
-    placed, begun = 0, 0
-    stop = pycolmap.CancellationToken()
+    options = MappingOptions(config.seed, config.min_model_size, attempt.relaxed, attempt.hold_focal)
 
-    def begin() -> None:
-        nonlocal placed, begun
-        placed, begun = 2, begun + 1
+    def tell(placed: int, total: int, what: str) -> None:
+        report.progress(placed, total, what, "photos")
 
-    def place() -> None:
-        nonlocal placed
-        placed += 1
-
-    def look() -> None:
-        what = "placing photos" if begun < 2 else f"placing photos (model {begun})"
-        report.progress(min(placed, total), total, what, "photos")
-
-    pycolmap.set_random_seed(config.seed)
-    with tempfile.TemporaryDirectory(prefix="scratch-", dir=capture.scratch, ignore_cleanup_errors=True) as scratch:
-        found: Mapping[int, Model] = watched(
-            lambda: pycolmap.incremental_mapping(
-                database,
-                scratch,
-                scratch,
-                _options(config, attempt),
-                initial_image_pair_callback=begin,
-                next_image_callback=place,
-                cancellation_token=stop,
-            ),
-            look,
-            stop.cancel,
-        )
-    return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    return map_incremental(capture.database, capture.scratch, options, tell)
 
 
 def _registered(models: Sequence[Model]) -> int:

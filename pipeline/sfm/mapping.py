@@ -1,0 +1,148 @@
+"""Cameras and points from verified matches: COLMAP's incremental and its global mapper, each the same bits again.
+
+Both work in a thread of their own, so that the calling one can tell of progress and be interrupted.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import pycolmap
+
+from splatpipe.pipeline.scene.parallel import watched
+
+Model: TypeAlias = pycolmap.Reconstruction
+Tell: TypeAlias = Callable[[int, int, str], None]
+"""Told a few times a second: photos placed, of how many, and what is being done."""
+
+
+ONE_THREAD = 1  # with several, COLMAP's and Ceres' sums depend on which ends first
+
+
+@dataclass(frozen=True)
+class MappingOptions:
+    """How to map.
+
+    Attributes:
+        seed: Of everything that draws lots.
+        min_model_size: Models of fewer photos are dropped.
+        relaxed: Accept fewer and worse inliers for a photo's pose (incremental only).
+        hold_focal: Keep focal lengths at what the database says.
+    """
+
+    seed: int = 0
+    min_model_size: int = 3
+    relaxed: bool = False
+    hold_focal: bool = False
+
+
+def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
+    """Every sub-model that photo after photo gives, the largest first.
+
+    Args:
+        database: Cameras, images, keypoints and verified two-view geometries; only read.
+        scratch: A folder in which temporary files may come and go.
+        options: How.
+        tell: Called from this thread.
+    """
+    total = _photos(database)
+    placed, begun = 0, 0
+    stop = pycolmap.CancellationToken()
+
+    def begin() -> None:
+        nonlocal placed, begun
+        placed, begun = 2, begun + 1
+
+    def place() -> None:
+        nonlocal placed
+        placed += 1
+
+    def look() -> None:
+        tell(min(placed, total), total, "placing photos" if begun < 2 else f"placing photos (model {begun})")
+
+    def work() -> Mapping[int, Model]:
+        pycolmap.set_random_seed(options.seed)  # is this thread's own
+        with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
+            found: Mapping[int, Model] = pycolmap.incremental_mapping(
+                database,
+                folder,
+                folder,
+                incremental_options(options),
+                initial_image_pair_callback=begin,
+                next_image_callback=place,
+                cancellation_token=stop,
+            )
+            return found
+
+    return largest_first(watched(work, look, stop.cancel))
+
+
+def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
+    """Every sub-model that all photos at once give (GLOMAP; Pan et al., ECCV 2024), the largest first.
+
+    COLMAP cannot be asked to stop here: where this thread is interrupted, the call is left to itself.
+
+    Args:
+        database: Cameras, images, keypoints and verified two-view geometries; only read.
+        scratch: A folder in which temporary files may come and go.
+        options: How.
+        tell: Called from this thread.
+    """
+    total = _photos(database)
+
+    def work() -> Mapping[int, Model]:
+        pycolmap.set_random_seed(options.seed)
+        with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
+            found: Mapping[int, Model] = pycolmap.global_mapping(database, folder, folder, global_options(options))
+            return found
+
+    return largest_first(watched(work, lambda: tell(0, total, "placing all photos at once"), lambda: None))
+
+
+def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's options of incremental mapping."""
+    result = pycolmap.IncrementalPipelineOptions()
+    result.min_model_size = options.min_model_size
+    result.extract_colors = False  # the keypoints have theirs
+    result.random_seed = options.seed
+    result.mapper.random_seed = options.seed
+    result.triangulation.random_seed = options.seed
+    result.num_threads = ONE_THREAD
+    if options.relaxed:
+        result.mapper.init_min_num_inliers = 50
+        result.mapper.init_min_tri_angle = 6.0
+        result.mapper.abs_pose_min_num_inliers = 15
+        result.mapper.abs_pose_min_inlier_ratio = 0.15
+    if options.hold_focal:
+        result.ba_refine_focal_length = False
+        result.mapper.abs_pose_refine_focal_length = False
+    return result
+
+
+def global_options(options: MappingOptions) -> pycolmap.GlobalPipelineOptions:
+    """COLMAP's options of global mapping."""
+    result = pycolmap.GlobalPipelineOptions()
+    result.multiple_models = True
+    result.min_model_size = options.min_model_size
+    result.num_threads = ONE_THREAD
+    result.mapper.num_threads = ONE_THREAD
+    for part in (result, result.mapper, result.mapper.rotation_averaging, result.mapper.global_positioning):
+        part.random_seed = options.seed
+    result.mapper.retriangulation.random_seed = options.seed
+    result.mapper.bundle_adjustment.ceres.solver_options.num_threads = ONE_THREAD
+    result.mapper.bundle_adjustment.refine_focal_length = not options.hold_focal
+    return result
+
+
+def largest_first(models: Mapping[int, Model]) -> list[Model]:
+    """By photos, then by points; COLMAP's first may be the smaller."""
+    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def _photos(database: Path) -> int:
+    with pycolmap.Database.open(database) as opened:
+        return int(opened.num_images())
