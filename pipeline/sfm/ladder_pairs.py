@@ -1,0 +1,203 @@
+"""More pairs of photos for a finished model: which to try, and their verified matches in a database that has grown.
+
+Photos are under COLMAP's numbers here, as in ``Verified``.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.sfm.capture import Capture
+from splatpipe.pipeline.sfm.matching import match_pairs
+from splatpipe.pipeline.sfm.pairs import Pair
+from splatpipe.pipeline.sfm.structure import Structure, poses_of, read_structure
+from splatpipe.pipeline.sfm.verified import Verified
+
+SAMPLE = 64  # points of a photo that are looked for in the others
+LEAST_POINTS = 8  # of a photo; fewer tell nothing about what it shows
+ALIKE_COS = float(np.cos(np.radians(40.0)))  # SIFT matches little past it, and another side of things shows there
+LEAST_SCALE = 0.4  # of the distances to a point: past a factor of 2.5 keypoints are of other sizes
+LEAST_SHARE = 0.2  # of a photo's points in the other picture
+NEAREST = 60  # photos that are looked at for each, by what they look at: the cost grows like the photos
+
+
+def propose_pairs(model: pycolmap.Reconstruction, verified: Verified, count: int) -> list[Pair]:
+    """Pairs of placed photos that, by the model, show the same thing and yet have no verified matches.
+
+    Those that close a loop come first: no third photo has matches with both. They are spread over the photos.
+
+    Args:
+        model: With points.
+        verified: Its view graph.
+        count: Most pairs wanted.
+
+    Returns:
+        (i, j), i < j, COLMAP's numbers; the most telling first.
+    """
+    poses, structure = poses_of(model), read_structure(model)
+    numbers = np.array(sorted(poses))
+    shares = shared_views(model, structure, numbers)
+    joined = np.zeros((len(numbers), len(numbers)), bool)
+    place = {int(number): at for at, number in enumerate(numbers)}
+    for i, j in verified.matches:
+        if i in place and j in place:
+            joined[place[i], place[j]] = joined[place[j], place[i]] = True
+    common = (joined.astype(np.float32) @ joined.astype(np.float32)) > 0.0
+    first, second = np.nonzero(np.triu((shares >= LEAST_SHARE) & ~joined, 1))
+    ranked = sorted(
+        (bool(common[i, j]), -float(shares[i, j]), int(i), int(j)) for i, j in zip(first, second, strict=True)
+    )
+    most = max(1, -(-2 * count // max(len(numbers), 1)))
+    taken = np.zeros(len(numbers), int)
+    chosen, later = [], []
+    for _, _, i, j in ranked:
+        if taken[i] < most and taken[j] < most:
+            taken[[i, j]] += 1
+            chosen.append((i, j))
+        else:
+            later.append((i, j))
+    return [(int(numbers[i]), int(numbers[j])) for i, j in (chosen + later)[:count]]
+
+
+def shared_views(
+    model: pycolmap.Reconstruction, structure: Structure, numbers: np.ndarray
+) -> Float64[np.ndarray, "n n"]:
+    """Of points that photo i observes, the share that lies in photo j's picture too and is seen alike; the mean of
+    both ways. What stands between is not known.
+
+    Args:
+        model: With the poses and cameras.
+        structure: Its points.
+        numbers: (n,) placed photos, sorted.
+    """
+    samples = _samples(structure, numbers)
+    centres = np.array([model.images[int(number)].projection_center() for number in numbers])
+    middles = np.array([np.median(points, axis=0) if len(points) else np.full(3, np.inf) for points in samples])
+    shares = np.zeros((len(numbers), len(numbers)))
+    for j, number in enumerate(numbers.tolist()):
+        image = model.images[number]
+        others = _nearest(middles, j)
+        stacked = [samples[i] for i in others.tolist()]
+        if not stacked:
+            continue
+        points = np.concatenate(stacked)
+        owners = np.repeat(others, [len(rows) for rows in stacked])
+        seen = _seen_alike(points, centres[owners], image, model.cameras[image.camera_id], centres[j])
+        totals = np.bincount(owners, minlength=len(numbers))
+        hits = np.bincount(owners[seen], minlength=len(numbers))
+        shares[:, j] = np.where(totals >= LEAST_POINTS, hits / np.maximum(totals, 1), 0.0)
+    return (shares + shares.T) / 2.0
+
+
+def _samples(structure: Structure, numbers: np.ndarray) -> list[Float64[np.ndarray, "_ 3"]]:
+    """Some of the points that each photo observes, evenly over their order."""
+    rows: dict[int, list[int]] = {int(number): [] for number in numbers}
+    for row, track in enumerate(structure.tracks):
+        for photo, _ in track:
+            rows[photo].append(row)
+    return [structure.points[found[:: max(1, -(-len(found) // SAMPLE))]] for found in rows.values()]
+
+
+def _nearest(middles: Float64[np.ndarray, "n 3"], j: int) -> np.ndarray:
+    """The photos whose points lie nearest to those of photo j; without it and those without points."""
+    if not np.isfinite(middles[j]).all():
+        return np.zeros(0, int)
+    with np.errstate(invalid="ignore"):
+        distances = ((middles - middles[j]) ** 2).sum(axis=1)
+    order = np.argsort(distances, kind="stable")
+    order = order[np.isfinite(distances[order]) & (order != j)]
+    return np.asarray(order[:NEAREST])
+
+
+def _seen_alike(
+    points: Float64[np.ndarray, "m 3"],
+    owners: Float64[np.ndarray, "m 3"],
+    image: pycolmap.Image,
+    camera: pycolmap.Camera,
+    centre: Float64[np.ndarray, " 3"],
+) -> Bool[np.ndarray, " m"]:
+    """Which points lie in a picture and are seen at nearly the angle and distance at which their owners see them."""
+    pose = image.cam_from_world().matrix()
+    in_camera = points @ pose[:, :3].T + pose[:, 3]
+    inside = in_camera[:, 2] > 0.0
+    pixels = np.full((len(points), 2), -1.0)
+    if inside.any():
+        pixels[inside] = camera.img_from_cam(in_camera[inside])
+    size = np.array([camera.width, camera.height])
+    inside &= ((pixels >= 0.0) & (pixels < size)).all(axis=1)
+    here, there = points - centre, points - owners
+    far, near = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
+    cosines = (here * there).sum(axis=1) / np.maximum(far * near, 1e-12)
+    alike = (cosines >= ALIKE_COS) & (np.minimum(far, near) >= LEAST_SCALE * np.maximum(far, near))
+    return np.asarray(inside & alike)
+
+
+def match_more(capture: Capture, base: Path, pairs: Sequence[Pair], seed: int, report: Reporter) -> Path:
+    """Match and verify more pairs with the keypoints of ``capture.features``.
+
+    Args:
+        capture: Whose scratch folder takes the new database.
+        base: Verified pairs so far; its keypoints start with those of ``capture.features``. Only read.
+        pairs: (i, j), COLMAP's numbers. One that is verified already is matched again.
+        seed: Of the verification.
+        report: Told of the progress.
+
+    Returns:
+        A database with everything of ``base`` and what holds of the pairs, also where that is nothing.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="pairs-", dir=capture.scratch))
+    target = folder / "database.db"
+    work = folder / "work.db"
+    counted = sorted({(min(i, j) - 1, max(i, j) - 1) for i, j in pairs})
+    shutil.copyfile(base, target)
+    if counted:
+        match_pairs(capture.features, work, counted, seed, capture.threads, report)
+        take_verified(work, target)
+    work.unlink(missing_ok=True)
+    return target
+
+
+def take_verified(work: Path, target: Path, starts: dict[int, int] | None = None) -> int:
+    """Put the two-view geometries of one database into another, in place of what is there for their pairs.
+
+    Args:
+        work: Where pairs were matched.
+        target: Where to.
+        starts: Of photos whose keypoints in ``work`` were appended to those in ``target``: where they begin there.
+
+    Returns:
+        Pairs with verified matches among them.
+    """
+    starts = starts or {}
+    held = 0
+    with pycolmap.Database.open(work) as matched, pycolmap.Database.open(target) as database:
+        numbers, geometries = matched.read_two_view_geometries()
+        for pair_id, geometry in sorted(zip(numbers, geometries, strict=True), key=lambda entry: entry[0]):
+            i, j = pycolmap.pair_id_to_image_pair(pair_id)
+            rows = np.asarray(geometry.inlier_matches, np.uint32).reshape(-1, 2)
+            held += len(rows) > 0
+            if database.exists_two_view_geometry(i, j):
+                if starts:
+                    before = np.asarray(database.read_two_view_geometry(i, j).inlier_matches, np.uint32)
+                    rows = np.concatenate([before.reshape(-1, 2), rows + np.array([starts[i], starts[j]], np.uint32)])
+                    geometry.inlier_matches = rows
+                database.delete_two_view_geometry(i, j)
+            elif starts:
+                geometry.inlier_matches = rows + np.array([starts[i], starts[j]], np.uint32)
+            database.write_two_view_geometry(i, j, geometry)
+    return held
+
+
+def tried_pairs(database: Path) -> set[Pair]:
+    """Pairs that were matched, whether anything held or not."""
+    with pycolmap.Database.open(database) as opened:
+        numbers, _ = opened.read_two_view_geometries()
+    return {tuple(sorted(pycolmap.pair_id_to_image_pair(number))) for number in numbers}
