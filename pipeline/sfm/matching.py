@@ -12,6 +12,7 @@ import pycolmap
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.sfm.pairs import Costs, Pair
+from splatpipe.pipeline.sfm.reduction import copy_photos
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
 TILE = 16  # photos; pairs are matched tile by tile, so that a block needs few photos' descriptors
@@ -81,16 +82,7 @@ def write_verified(work: Path, features: Path, target: Path) -> dict[Pair, int]:
         pycolmap.Database.open(work) as matched,
         pycolmap.Database.open(target) as database,
     ):
-        for camera in sorted(source.read_all_cameras(), key=lambda camera: camera.camera_id):
-            database.write_camera(camera, use_camera_id=True)
-        for rig in sorted(source.read_all_rigs(), key=lambda rig: rig.rig_id):
-            database.write_rig(rig, use_rig_id=True)
-        for frame in sorted(source.read_all_frames(), key=lambda frame: frame.frame_id):
-            database.write_frame(frame, use_frame_id=True)
-        for image in sorted(source.read_all_images(), key=lambda image: image.image_id):
-            database.write_image(image, use_image_id=True)
-        for number in range(1, source.num_images() + 1):
-            database.write_keypoints(number, source.read_keypoints(number))
+        copy_photos(source, database)
         numbers, geometries = matched.read_two_view_geometries()
         for pair_id, geometry in sorted(zip(numbers, geometries, strict=True), key=lambda entry: entry[0]):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)

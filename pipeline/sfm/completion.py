@@ -1,0 +1,92 @@
+"""A model that stands on some of the verified matches gets all of them, and one last adjustment over everything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pycolmap
+
+LEAST_MATCHES = 15  # verified ones of a pair; COLMAP's own bound
+STRICT_PX = 2.0  # observations that were thrown out come back only within it, or they would come and go for ever
+SETTLED = 5e-4  # of the observations; fewer changes are none
+MOST_ROUNDS = 4
+ROUGH_TOLERANCE, ROUGH_ITERATIONS = 1e-4, 10  # relative change of the cost: before the wrong observations are out
+FINE_TOLERANCE, FINE_ITERATIONS = 1e-6, 100
+GRADIENT_TOLERANCE = 1e-6  # COLMAP's 1.0 ends where a focal length still has some pixels to go
+ROBUST_PX = 1.0  # residuals from which on SOFT_L1 counts less than squares: twice what keypoints scatter
+
+
+def complete(
+    model: pycolmap.Reconstruction,
+    database: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    stop: pycolmap.CancellationToken,
+) -> None:
+    """Bring all verified matches into a model, in place, and adjust it to convergence, on one thread.
+
+    Every verified match is triangulated against the cameras as they stand, tracks are completed and merged, photos
+    that only all matches can place are placed, and wrong observations are filtered between the adjustments.
+
+    Args:
+        model: Some of the database's photos with cameras, in any frame.
+        database: Whose keypoint indices the model refers to.
+        options: The mapper's, with its seeds.
+        stop: Ends an adjustment early.
+    """
+    cache_options = pycolmap.DatabaseCacheOptions()
+    cache_options.min_num_matches = LEAST_MATCHES
+    with pycolmap.Database.open(database) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, cache_options)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    triangulation, mapping = options.get_triangulation(), options.get_mapper()
+    for number in sorted(model.reg_image_ids()):
+        mapper.triangulate_image(triangulation, number)
+    mapper.complete_and_merge_tracks(triangulation)
+    _place_left(mapper, mapping, triangulation)
+    _adjust(mapper, options, stop, rough=True)
+    mapper.filter_points(mapping)
+    triangulation.complete_max_reproj_error = STRICT_PX
+    for _ in range(MOST_ROUNDS):
+        mapper.complete_and_merge_tracks(triangulation)
+        _adjust(mapper, options, stop, rough=False)
+        if mapper.filter_points(mapping) <= SETTLED * model.compute_num_observations():
+            break
+    mapper.filter_frames(mapping)
+    mapper.end_reconstruction(False)
+    model.update_point_3d_errors()
+
+
+def _place_left(
+    mapper: pycolmap.IncrementalMapper,
+    mapping: pycolmap.IncrementalMapperOptions,
+    triangulation: pycolmap.IncrementalTriangulatorOptions,
+) -> None:
+    """Place the photos that some matches could not; the mapper tries each a few times."""
+    candidates = mapper.find_next_images(mapping, False)
+    while candidates:
+        for number in candidates:
+            if mapper.register_next_image(mapping, number):
+                mapper.triangulate_image(triangulation, number)
+                break
+        candidates = mapper.find_next_images(mapping, False)
+
+
+def _adjust(
+    mapper: pycolmap.IncrementalMapper,
+    options: pycolmap.IncrementalPipelineOptions,
+    stop: pycolmap.CancellationToken,
+    rough: bool,
+) -> None:
+    """Adjust over everything; COLMAP's own call, since the mapper's holds Python's lock all the time."""
+    adjustment = options.get_global_bundle_adjustment()
+    solver = adjustment.ceres.solver_options
+    solver.num_threads = 1
+    solver.gradient_tolerance = GRADIENT_TOLERANCE
+    solver.function_tolerance = ROUGH_TOLERANCE if rough else FINE_TOLERANCE
+    solver.max_num_iterations = ROUGH_ITERATIONS if rough else FINE_ITERATIONS
+    if not rough:
+        adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+        adjustment.ceres.loss_function_scale = ROBUST_PX
+    mapper.observation_manager.filter_observations_with_negative_depth()
+    pycolmap.bundle_adjustment(mapper.reconstruction, adjustment, stop)

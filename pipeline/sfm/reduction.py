@@ -1,0 +1,137 @@
+"""The matches that mapping starts from: those of each photo's best keypoints, spread over the photo.
+
+A keypoint that more pairs of photos verified ties more cameras together, and some hundred well spread over a photo
+place it as well as thousands. Mapping costs as its matches do, so the others come in when the cameras stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Int64
+
+from splatpipe.pipeline.sfm.verified import Verified
+
+GRID = 8  # cells along either side of a photo; its keypoints are taken cell by cell
+WEAK_PAIR = 60  # verified matches; of pairs with no more, all are kept: COLMAP wants 15, and 100 to begin with
+
+
+def best_keypoints(verified: Verified, wanted: int) -> dict[int, Bool[np.ndarray, " n"]]:
+    """Which keypoints of each photo mapping starts from.
+
+    Photo after photo, in the order of their numbers: those that are in already because they match one of an earlier
+    photo, then the most often verified of each cell in turn until there are enough. What matches a keypoint that comes
+    in comes in as well, so that tracks stay whole.
+
+    Args:
+        verified: The view graph.
+        wanted: Keypoints a photo; it may get more by its partners.
+
+    Returns:
+        By COLMAP's number of the photo, a flag for each of its keypoints.
+    """
+    numbers = sorted(verified.keypoints)
+    counts = np.array([len(verified.keypoints[number]) for number in numbers], np.int64)
+    starts = dict(zip(numbers, (np.cumsum(counts) - counts).tolist(), strict=True))
+    first, second, weak = _edges(verified, starts)
+    degree = np.bincount(np.concatenate([first, second]), minlength=int(counts.sum()))
+    chosen = np.zeros(int(counts.sum()), bool)
+    chosen[first[weak]] = chosen[second[weak]] = True
+    partners, offsets = _neighbours(first, second, len(chosen))
+    for number in numbers:
+        begin, end = starts[number], starts[number] + len(verified.keypoints[number])
+        new = begin + _spread_best(verified.keypoints[number], degree[begin:end], chosen[begin:end], wanted)
+        chosen[new] = True
+        chosen[_gather(partners, offsets, new)] = True
+    return {number: chosen[starts[number] : starts[number] + len(verified.keypoints[number])] for number in numbers}
+
+
+def _edges(
+    verified: Verified, starts: dict[int, int]
+) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Both ends of each verified match among all keypoints, photo after photo, and whether its pair has few."""
+    pairs = sorted(verified.matches)
+    if not pairs:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool)
+    rows = [verified.matches[pair].astype(np.int64) for pair in pairs]
+    first = np.concatenate([starts[i] + matches[:, 0] for (i, _), matches in zip(pairs, rows, strict=True)])
+    second = np.concatenate([starts[j] + matches[:, 1] for (_, j), matches in zip(pairs, rows, strict=True)])
+    weak = np.concatenate([np.full(len(matches), len(matches) <= WEAK_PAIR) for matches in rows])
+    return first, second, weak
+
+
+def _neighbours(
+    first: Int64[np.ndarray, " m"], second: Int64[np.ndarray, " m"], count: int
+) -> tuple[Int64[np.ndarray, " twice"], Int64[np.ndarray, " offsets"]]:
+    """All partners, keypoint after keypoint, and where each keypoint's begin."""
+    ends = np.concatenate([first, second])
+    order = np.argsort(ends, kind="stable")
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=count))])
+    return np.concatenate([second, first])[order], offsets
+
+
+def _gather(
+    partners: Int64[np.ndarray, " twice"], offsets: Int64[np.ndarray, " offsets"], rows: Int64[np.ndarray, " n"]
+) -> Int64[np.ndarray, " _"]:
+    lengths = offsets[rows + 1] - offsets[rows]
+    places = np.repeat(offsets[rows] - (np.cumsum(lengths) - lengths), lengths) + np.arange(int(lengths.sum()))
+    return np.asarray(partners[places])
+
+
+def _spread_best(
+    places: np.ndarray, degree: Int64[np.ndarray, " n"], chosen: Bool[np.ndarray, " n"], wanted: int
+) -> Int64[np.ndarray, " _"]:
+    """Rows to add so that ``wanted`` are chosen: each cell's first, then each cell's second, and so on."""
+    usable = np.flatnonzero(degree > 0)
+    missing = wanted - int(np.count_nonzero(chosen))
+    if missing <= 0 or len(usable) == 0:
+        return np.zeros(0, np.int64)
+    low, high = places[usable].min(axis=0), places[usable].max(axis=0)
+    at = np.minimum(((places[usable] - low) / np.maximum(high - low, 1e-6) * GRID).astype(np.int64), GRID - 1)
+    cell = at[:, 1] * GRID + at[:, 0]
+    order = np.lexsort((usable, -degree[usable], ~chosen[usable], cell))  # the last key leads
+    sizes = np.bincount(cell, minlength=GRID * GRID)
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    ranked = usable[order[np.lexsort((usable[order], -degree[usable[order]], rank))]]
+    return np.asarray(ranked[~chosen[ranked]][:missing])
+
+
+def write_reduced(database: Path, target: Path, chosen: Mapping[int, Bool[np.ndarray, " n"]]) -> tuple[int, int]:
+    """Write a database whose verified matches are those between chosen keypoints; keypoints keep their numbers.
+
+    Args:
+        database: The whole one; only read.
+        target: The database to write.
+        chosen: Flags of each photo's keypoints.
+
+    Returns:
+        Verified matches kept, and of how many.
+    """
+    kept, total = 0, 0
+    with pycolmap.Database.open(database) as source, pycolmap.Database.open(target) as reduced:
+        copy_photos(source, reduced)
+        numbers, geometries = source.read_two_view_geometries()
+        for pair, geometry in sorted(zip(numbers, geometries, strict=True), key=lambda entry: entry[0]):
+            i, j = pycolmap.pair_id_to_image_pair(pair)
+            matches = geometry.inlier_matches
+            rows = matches[chosen[i][matches[:, 0]] & chosen[j][matches[:, 1]]] if len(matches) else matches
+            kept, total = kept + len(rows), total + len(matches)
+            geometry.inlier_matches = rows
+            reduced.write_two_view_geometry(i, j, geometry)
+    return kept, total
+
+
+def copy_photos(source: pycolmap.Database, target: pycolmap.Database) -> None:
+    """Copy cameras, rigs, frames, images and keypoints under their numbers."""
+    for camera in sorted(source.read_all_cameras(), key=lambda camera: camera.camera_id):
+        target.write_camera(camera, use_camera_id=True)
+    for rig in sorted(source.read_all_rigs(), key=lambda rig: rig.rig_id):
+        target.write_rig(rig, use_rig_id=True)
+    for frame in sorted(source.read_all_frames(), key=lambda frame: frame.frame_id):
+        target.write_frame(frame, use_frame_id=True)
+    for image in sorted(source.read_all_images(), key=lambda image: image.image_id):
+        target.write_image(image, use_image_id=True)
+        target.write_keypoints(image.image_id, source.read_keypoints(image.image_id))
