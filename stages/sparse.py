@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -16,6 +17,8 @@ from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.dataset import some
 from splatpipe.pipeline.scene.photos import load_photo_list
 from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.lens_model import stated_lenses
+from splatpipe.pipeline.sfm.lenses import calibrate, tell_lenses
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.sparse_model import write_model
@@ -35,11 +38,15 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         capture = _capture(inputs, Path(scratch))
         found = reconstruct(capture, config, report)
+        stated = stated_lenses(capture.cameras)
+        model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
+        found = replace(found, model=model)
     model = canonical(found.model, found.colours, _keypoint_counts(found.verified))
     write_model(model, out / "sparse" / "0")
-    summary = _summary(model, found)
+    summary = {**_summary(model, found), "lenses": list(lenses)}
     (out / "models.json").write_text(json.dumps(summary, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
     _warn(summary, report)
+    tell_lenses(summary, report)
     return {**summary, "unregistered": len(summary["unregistered"]), "other_models": len(summary["other_models"])}
 
 

@@ -16,6 +16,8 @@ import numpy as np
 import pyceres
 import pycolmap
 
+from splatpipe.pipeline.sfm.lens_blocks import keep_shape
+
 UNOBSERVED = 0.01  # relative standard deviation from which on the photos do not tell a focal length
 PRINCIPAL_POINT_SIGMA = 0.01  # of the width
 MOST_DENSE = 60  # photos up to which the reduced system is solved densely
@@ -41,7 +43,7 @@ def focal_sigmas(model: pycolmap.Reconstruction) -> dict[int, float]:
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, copy)
-    kept = []
+    kept: list[object] = []
     for _, camera in sorted(copy.cameras.items()):
         if not adjuster.problem.has_parameter_block(camera.params):
             continue
@@ -51,6 +53,7 @@ def focal_sigmas(model: pycolmap.Reconstruction) -> dict[int, float]:
         prior = pyceres.factors.NormalPrior(np.array(camera.params), np.diag(sigmas**2))
         kept.append(prior)
         adjuster.problem.add_residual_block(prior, None, [camera.params])
+        kept += keep_shape(adjuster.problem, camera, principal_point=True)
     return posterior_focal_sigmas(copy, adjuster.problem)
 
 
@@ -67,9 +70,11 @@ def adjust_within(model: pycolmap.Reconstruction, focals: Mapping[int, float], s
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(pycolmap.BundleAdjustmentOptions(), config, model)
+    kept = [keep_shape(adjuster.problem, camera) for _, camera in sorted(model.cameras.items())]
     for number, focal in sorted(focals.items()):
         keep_near(adjuster.problem, model.cameras[number], focal, share)
     pyceres.solve(solver_options(len(model.reg_image_ids())), adjuster.problem, pyceres.SolverSummary())
+    del kept
     model.update_point_3d_errors()
 
 

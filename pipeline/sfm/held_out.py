@@ -1,0 +1,156 @@
+"""Tracks that an adjustment does not see, and how well its cameras explain them.
+
+Each observation of a held-out track is predicted from the track's others: they are intersected without it, and the
+place is projected into its photo. That asks cameras and lenses, and no point of the adjustment.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64, Int64
+
+LEAST_VIEWS = 3  # two that intersect, and one that is predicted
+REWEIGHTINGS = 2  # by the distances of the place that was found before
+LEAST_ANGLE = 0.02  # of the smaller eigenvalue's share: rays that are nearly parallel place nothing
+CAP = 4.0  # times the median error: one wrong match shall not decide
+BOOTSTRAPS = 500
+DOUBT = 0.01  # of the bootstraps may say otherwise
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of tracks, one after the other.
+
+    Attributes:
+        track: Number of each one's track, from 0, ascending.
+        image: COLMAP's image id of each.
+        pixels: Where it is seen.
+    """
+
+    track: Int64[np.ndarray, " n"]
+    image: Int64[np.ndarray, " n"]
+    pixels: Float64[np.ndarray, "n 2"]
+
+
+def tracks_of(model: pycolmap.Reconstruction, points: Int64[np.ndarray, " k"]) -> Tracks:
+    """The observations of some of a model's points, in their order."""
+    rows = [
+        (number, element.image_id, *model.images[element.image_id].points2D[element.point2D_idx].xy)
+        for number, point in enumerate(points.tolist())
+        for element in model.points3D[point].track.elements
+    ]
+    table = np.array(rows, np.float64).reshape(-1, 4)
+    return Tracks(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:])
+
+
+def of_photos(tracks: Tracks, images: set[int]) -> Tracks:
+    """The tracks as some photos see them, those of three photos or more."""
+    inside = np.isin(tracks.image, sorted(images))
+    lengths = np.bincount(tracks.track[inside], minlength=int(tracks.track.max(initial=-1)) + 1)
+    inside &= lengths[tracks.track] >= LEAST_VIEWS
+    _, numbers = np.unique(tracks.track[inside], return_inverse=True)
+    return Tracks(numbers.astype(np.int64), tracks.image[inside], tracks.pixels[inside])
+
+
+def predicted_errors(model: pycolmap.Reconstruction, tracks: Tracks) -> Float64[np.ndarray, " n"]:
+    """How far each observation lies from where the others of its track have it, pixels.
+
+    Args:
+        model: Whose poses and lenses count, and no points.
+        tracks: Of three observations or more each.
+
+    Returns:
+        Infinite where the others place nothing.
+    """
+    rotations, centres, rays = _rays(model, tracks)
+    count = int(tracks.track[-1]) + 1 if len(tracks.track) else 0
+    weights = np.ones(len(rays))
+    predicted = np.zeros((len(rays), 3))
+    for _ in range(REWEIGHTINGS):
+        blocks = weights[:, None, None] * (np.eye(3) - rays[:, :, None] * rays[:, None, :])
+        sides = np.einsum("nij,nj->ni", blocks, centres)
+        whole = np.zeros((count, 3, 3))
+        side = np.zeros((count, 3))
+        np.add.at(whole, tracks.track, blocks)
+        np.add.at(side, tracks.track, sides)
+        left = whole[tracks.track] - blocks
+        sound = np.isfinite(left).all(axis=(1, 2)) & (weights > 0.0)
+        sound[sound] = _well_placed(left[sound])
+        left[~sound] = np.eye(3)
+        predicted = np.linalg.solve(left, (side[tracks.track] - sides)[:, :, None])[:, :, 0]
+        distance = np.linalg.norm(predicted - centres, axis=1)
+        weights = np.where(sound, 1.0 / np.maximum(distance, 1e-9) ** 2, 0.0)
+    errors = np.full(len(rays), np.inf)
+    in_camera = np.einsum("nij,nj->ni", rotations, predicted - centres)
+    ahead = (in_camera[:, 2] > 0.0) & (weights > 0.0)
+    for number, rows in rows_by_camera(model, tracks):
+        rows = rows[ahead[rows]]
+        if len(rows):
+            shown = np.asarray(model.cameras[number].img_from_cam(in_camera[rows]), np.float64)
+            distance = np.linalg.norm(shown - tracks.pixels[rows], axis=1)
+            errors[rows] = np.where(np.isfinite(distance), distance, np.inf)
+    return errors
+
+
+def improves(
+    before: Float64[np.ndarray, " n"],
+    after: Float64[np.ndarray, " n"],
+    images: Int64[np.ndarray, " n"],
+    least: float,
+    seed: int,
+) -> tuple[float, bool]:
+    """Whether errors became smaller, and not by chance: photos are drawn again and again, each with all it sees.
+
+    Args:
+        before: Pixels.
+        after: Likewise, of the same observations.
+        images: Each one's photo: errors in one photo go together.
+        least: What of the squares' sum has to go.
+        seed: Of the draws.
+
+    Returns:
+        The share that went, and whether it is enough, and nearly all draws say that some went.
+    """
+    if not len(before):
+        return 0.0, False
+    _, photo = np.unique(images, return_inverse=True)
+    cap = CAP * float(np.median(before))
+    if not math.isfinite(cap):
+        return 0.0, False
+    was = np.bincount(photo, np.minimum(before, cap) ** 2)
+    gained = was - np.bincount(photo, np.minimum(after, cap) ** 2)
+    share = float(gained.sum() / max(float(was.sum()), 1e-300))
+    drawn = np.random.default_rng(seed).integers(0, len(was), (BOOTSTRAPS, len(was)))
+    wrong = float((gained[drawn].sum(axis=1) <= 0.0).mean())
+    return share, share >= least and wrong <= DOUBT
+
+
+def _well_placed(left: Float64[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n"]:
+    values = np.linalg.eigvalsh(left)
+    return np.asarray(values[:, 0] > LEAST_ANGLE**2 * values[:, 2])
+
+
+def rows_by_camera(model: pycolmap.Reconstruction, tracks: Tracks) -> list[tuple[int, Int64[np.ndarray, " k"]]]:
+    of_image = {number: model.images[number].camera_id for number in np.unique(tracks.image).tolist()}
+    cameras = np.array([of_image[number] for number in tracks.image.tolist()], np.int64)
+    return [(number, np.flatnonzero(cameras == number)) for number in np.unique(cameras).tolist()]
+
+
+def _rays(
+    model: pycolmap.Reconstruction, tracks: Tracks
+) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Of each observation: the photo's rotation, its centre, and the unit ray in the model's frame."""
+    numbers, which = np.unique(tracks.image, return_inverse=True)
+    poses = np.stack([model.images[number].cam_from_world().matrix() for number in numbers.tolist()])
+    turns = poses[:, :, :3]
+    centres = -np.einsum("nji,nj->ni", turns, poses[:, :, 3])
+    flat = np.full((len(tracks.track), 3), 1.0)
+    for number, rows in rows_by_camera(model, tracks):
+        flat[rows, :2] = model.cameras[number].cam_from_img(tracks.pixels[rows])
+    flat = np.where(np.isfinite(flat).all(axis=1)[:, None], flat, 0.0)
+    flat /= np.maximum(np.linalg.norm(flat, axis=1), 1e-12)[:, None]
+    return turns[which], centres[which], np.einsum("nji,nj->ni", turns[which], flat)

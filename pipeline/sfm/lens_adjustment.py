@@ -1,0 +1,206 @@
+"""Bundle adjustment of chosen lens parameters, with what is known of them beforehand, on one thread.
+
+COLMAP frees groups of parameters for all cameras alike; here each camera has its own, by Ceres' manifolds. The wide
+models have two focal lengths, which stay one, and FULL_OPENCV a denominator, which stays as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyceres
+import pycolmap
+from jaxtyping import Float64
+
+from splatpipe.pipeline.sfm.focal import solver_options
+from splatpipe.pipeline.sfm.lens_blocks import hold, tie_focals
+from splatpipe.pipeline.sfm.lens_model import NAMES, is_known, named_params
+
+PRINCIPAL_POINT_SHARE = 0.01  # of the width: how far a principal point lies from the middle
+WEAK_SIGMA = {"k1": 0.2, "k2": 0.2, "k3": 0.2, "k4": 0.2, "p1": 0.01, "p2": 0.01}  # no lens of a camera has more
+STATED_SHARE = 1e-3  # of the width, at the corner: how far a lens strays from its calibration, by warmth and focus
+STATED_FOCAL_SHARE = 3e-3
+FREE = 1e6
+ROBUST_PX = 1.0  # residuals from which on SOFT_L1 counts less than squares: as the last adjustment of mapping
+BASE = ("fx", "fy", "k1")
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """What is known of a lens before the photos are asked.
+
+    Attributes:
+        mean: By name; of the wide model.
+        sigmas: Likewise; of those that are missing nothing is known.
+    """
+
+    mean: Mapping[str, float]
+    sigmas: Mapping[str, float]
+
+
+def weak_prior(camera: pycolmap.Camera) -> LensPrior:
+    """What holds of every lens: its principal point is near the middle, its distortion no larger than lenses have."""
+    if not is_known(camera.model_name):
+        return LensPrior({}, {})
+    sigmas = {name: WEAK_SIGMA[name] for name in named_params(camera) if name in WEAK_SIGMA}
+    centre = {"cx": camera.width / 2, "cy": camera.height / 2}
+    share = PRINCIPAL_POINT_SHARE * camera.width
+    return LensPrior({**dict.fromkeys(sigmas, 0.0), **centre}, {**sigmas, "cx": share, "cy": share})
+
+
+def stated_prior(camera: pycolmap.Camera) -> LensPrior:
+    """About a calibrated lens: each parameter may stray by what is seen at the corner.
+
+    Args:
+        camera: The lens as it is stated, of a wide model.
+    """
+    named = named_params(camera)
+    effects = corner_effects(camera)
+    share = STATED_SHARE * camera.width
+    sigmas = {name: share / max(float(np.abs(effect).max()), 1e-12) for name, effect in effects.items()}
+    focal = STATED_FOCAL_SHARE * named["fx"]
+    return LensPrior(named, {**sigmas, "fx": focal, "fy": focal, "cx": share, "cy": share})
+
+
+def corner_effects(camera: pycolmap.Camera) -> dict[str, Float64[np.ndarray, "n 2"]]:
+    """How far pixels at corners and edges go a unit of each parameter."""
+    places = [[x, y] for x in (0.0, camera.width / 2, camera.width) for y in (0.0, camera.height / 2, camera.height)]
+    rays = np.asarray(camera.cam_from_img(np.array(places)), np.float64)
+    rays = np.concatenate([np.where(np.isfinite(rays), rays, 0.0), np.ones((len(rays), 1))], axis=1)
+    names = NAMES[camera.model_name]
+    result = {}
+    for index, name in enumerate(names):
+        moved = pycolmap.Camera(camera.todict())
+        step = 1e-4 if index < 4 else 1e-7
+        params = np.array(moved.params)
+        params[index] += step
+        moved.params = params
+        difference = np.asarray(moved.img_from_cam(rays)) - np.asarray(camera.img_from_cam(rays))
+        result[name] = np.where(np.isfinite(difference), difference, 0.0) / step
+    return result
+
+
+@dataclass(frozen=True)
+class LensFreedom:
+    """What an adjustment may do to a camera.
+
+    Attributes:
+        free: Names of the wide model's parameters; none holds the lens.
+        prior: What is known of them.
+    """
+
+    free: tuple[str, ...]
+    prior: LensPrior
+
+
+@dataclass(frozen=True)
+class Solved:
+    """An adjusted model.
+
+    Attributes:
+        model: Its poses, lenses and points.
+        covariances: Of the free parameters of each lens, in the order of the wide model, by camera id, with features
+            known to a pixel; missing where nothing determines them.
+    """
+
+    model: pycolmap.Reconstruction
+    covariances: Mapping[int, Float64[np.ndarray, "_ _"]]
+
+
+def adjust_lenses(model: pycolmap.Reconstruction, freedoms: Mapping[int, LensFreedom], doubt: bool = False) -> Solved:
+    """Adjust poses, points and what is free of the lenses, in place, all features alike; scale and place stay.
+
+    Args:
+        model: Its cameras are of wide models.
+        freedoms: By camera id.
+        doubt: Estimate covariances, too.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = True
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = ROBUST_PX
+    config = pycolmap.BundleAdjustmentConfig()
+    photos = sorted(model.reg_image_ids())
+    for number in photos:
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    ratios = {number: _ratio(camera) for number, camera in model.cameras.items() if "fx" in freedoms[number].free}
+    kept = [free_lens(adjuster.problem, camera, freedoms[number]) for number, camera in sorted(model.cameras.items())]
+    pyceres.solve(solver_options(len(photos)), adjuster.problem, pyceres.SolverSummary())
+    covariances: dict[int, Float64[np.ndarray, "_ _"]] = {}
+    if doubt:
+        covariance = pycolmap.estimate_ba_covariance_from_problem(_all_covariances(), model, adjuster.problem)
+        for number, camera in sorted(model.cameras.items()):
+            block = None if covariance is None else covariance.get_other_params_cov(camera.params)
+            if block is not None and np.isfinite(block).all():
+                covariances[number] = np.asarray(block)
+    del kept
+    for number, ratio in ratios.items():
+        params = np.array(model.cameras[number].params)
+        params[1] = params[0] * ratio  # to the last bit
+        model.cameras[number].params = params
+    return Solved(model, covariances)
+
+
+def _ratio(camera: pycolmap.Camera) -> float:
+    return float(camera.params[1] / camera.params[0])
+
+
+def _all_covariances() -> pycolmap.BACovarianceOptions:
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    return options
+
+
+def free_lens(problem: Any, camera: pycolmap.Camera, freedom: LensFreedom) -> list[object]:
+    """Let a problem change some parameters of a camera, and only these.
+
+    Args:
+        problem: pyceres', as COLMAP builds it.
+        camera: The problem's own, of a wide model.
+        freedom: What may change.
+
+    Returns:
+        What has to be kept until the problem is solved.
+    """
+    params = camera.params
+    if not problem.has_parameter_block(params):
+        return []
+    if not is_known(camera.model_name):
+        return hold(problem, camera, list(range(len(params))))
+    names = NAMES[camera.model_name]
+    held = [index for index, name in enumerate(names) if name not in freedom.free]
+    if len(held) == len(names):
+        return hold(problem, camera, held)
+    kept = hold(problem, camera, held)
+    mean = np.array([freedom.prior.mean.get(name, value) for name, value in zip(names, params, strict=True)])
+    sigmas = np.array([freedom.prior.sigmas.get(name, FREE) for name in names])
+    prior = pyceres.factors.NormalPrior(mean, np.diag(sigmas**2))
+    problem.add_residual_block(prior, None, [params])
+    kept.append(prior)
+    return kept + tie_focals(problem, camera) if "fx" in freedom.free else kept
+
+
+def corner_sigma_px(
+    camera: pycolmap.Camera, names: Iterable[str], covariance: Float64[np.ndarray, "k k"], free: Iterable[str]
+) -> float:
+    """Standard deviation of where the corners are seen, by some of the parameters alone: the worst corner, pixels.
+
+    Args:
+        camera: Of a wide model.
+        names: Of the parameters.
+        covariance: Of all the free ones, in the model's order.
+        free: Their names.
+    """
+    order = [name for name in NAMES[camera.model_name] if name in set(free)]
+    rows = [order.index(name) for name in names]
+    part = covariance[np.ix_(rows, rows)]
+    effects = corner_effects(camera)
+    design = np.stack([effects[name] for name in names], axis=2)  # corner, axis, parameter
+    spread = np.einsum("cap,pq,caq->c", design, part, design)
+    return math.sqrt(max(float(spread.max()), 0.0))

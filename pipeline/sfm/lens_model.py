@@ -1,0 +1,195 @@
+"""Lenses as COLMAP's camera models: which parameters mean what, made wider for calibration and narrow again after it.
+
+Calibration works on the widest model of a kind, FULL_OPENCV or OPENCV_FISHEYE, with one focal length for both axes;
+what goes on is the narrowest one that says the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.stage import JSON
+
+WIDE, WIDE_FISHEYE = "FULL_OPENCV", "OPENCV_FISHEYE"
+FISHEYES = frozenset({"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"})
+NAMES = {
+    WIDE: ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    WIDE_FISHEYE: ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+NARROW = {  # of each kind, the narrowest first
+    WIDE: ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    WIDE_FISHEYE: ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
+}
+PARAMETERS = {  # of each model, by the names of the wide ones; f is both focal lengths
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": NAMES[WIDE],
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV_FISHEYE": NAMES[WIDE_FISHEYE],
+}
+GRID = 21  # places a side of the picture where two lenses are compared
+
+
+@dataclass(frozen=True)
+class StatedLens:
+    """A lens that a file or the photos' metadata state.
+
+    Attributes:
+        model: COLMAP's camera model.
+        width: Of the pictures that ``params`` are about, pixels.
+        height: Likewise.
+        params: COLMAP's, pixels; the centre of the first pixel is (0.5, 0.5).
+        source: ``file``, ``xmp-dewarp``.
+        camera: What the file calls the camera; empty where it does not.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+    source: str
+    camera: str = ""
+
+    def colmap(self, number: int = 1) -> pycolmap.Camera:
+        """COLMAP's camera of it."""
+        return pycolmap.Camera(
+            camera_id=number, model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+
+
+def stated_lenses(groups: Sequence[JSON]) -> dict[int, StatedLens]:
+    """What ``ingest.cameras`` has of stated lenses, in each group's pixels, by COLMAP's camera id."""
+    found = ((number, group.get("lens")) for number, group in enumerate(groups, start=1))
+    return {
+        number: StatedLens(
+            lens["model"], lens["width"], lens["height"], tuple(lens["params"]), lens["source"], lens["camera"]
+        )
+        for number, lens in found
+        if lens is not None
+    }
+
+
+def is_known(model: str) -> bool:
+    """Whether a camera model is one of those that calibration can widen."""
+    return model in PARAMETERS
+
+
+def kind_of(model: str) -> str:
+    """The widest model of the kind of a model."""
+    return WIDE_FISHEYE if model in FISHEYES else WIDE
+
+
+def named_params(camera: pycolmap.Camera) -> dict[str, float]:
+    """All parameters of the camera's wide model by name."""
+    own = dict(zip(PARAMETERS[camera.model_name], (float(value) for value in camera.params), strict=True))
+    if "f" in own:
+        own["fx"] = own["fy"] = own.pop("f")
+    return {name: own.get(name, 0.0) for name in NAMES[kind_of(camera.model_name)]}
+
+
+def set_lens(camera: pycolmap.Camera, model: str, named: Mapping[str, float]) -> None:
+    """Give a camera, in place, another model and its parameters; its size and number stay."""
+    focal = 0.5 * (named["fx"] + named["fy"])
+    camera.model = pycolmap.CameraModelId.__members__[model]
+    camera.params = [focal if name == "f" else named[name] for name in PARAMETERS[model]]
+
+
+def widen(camera: pycolmap.Camera) -> None:
+    """Make a camera, in place, the widest model of its kind; it sees the same."""
+    set_lens(camera, kind_of(camera.model_name), named_params(camera))
+
+
+def narrow(camera: pycolmap.Camera) -> None:
+    """Make a camera, in place, the narrowest model of its kind that sees the same."""
+    named = named_params(camera)
+    for model in NARROW[kind_of(camera.model_name)]:
+        kept = PARAMETERS[model]
+        lost = [name for name in named if name not in kept and name not in ("fx", "fy")]
+        if all(named[name] == 0.0 for name in lost) and ("f" not in kept or named["fx"] == named["fy"]):
+            set_lens(camera, model, named)
+            return
+
+
+def picture_rays(width: int, height: int, camera: pycolmap.Camera) -> Float64[np.ndarray, "n 2"]:
+    """x/z and y/z of a grid over the picture, as the camera has them; not finite where it has none."""
+    x, y = np.meshgrid(np.linspace(0.0, width, GRID), np.linspace(0.0, height, GRID))
+    return np.asarray(camera.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1)), np.float64)
+
+
+def simplest(lens: pycolmap.Camera) -> tuple[str, tuple[float, ...]]:
+    """The simple model with a centred principal point that is nearest to a lens: what mapping starts from.
+
+    By least squares over the picture, in pixels: both unknowns, f and f k1, are linear.
+
+    Returns:
+        SIMPLE_RADIAL or, of a fisheye, SIMPLE_RADIAL_FISHEYE, and its parameters.
+    """
+    fisheye = kind_of(lens.model_name) == WIDE_FISHEYE
+    x, y = np.meshgrid(np.linspace(0.0, lens.width, GRID), np.linspace(0.0, lens.height, GRID))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    rays = np.asarray(lens.cam_from_img(pixels), np.float64)
+    good = np.isfinite(rays).all(axis=1)
+    rays, pixels = rays[good], pixels[good]
+    tangent = np.linalg.norm(rays, axis=1)
+    if fisheye:
+        rays = rays * (np.arctan(tangent) / np.maximum(tangent, 1e-12))[:, None]
+        tangent = np.arctan(tangent)
+    named = named_params(lens)
+    away = (pixels - [named["cx"], named["cy"]]).ravel()
+    design = np.stack([rays.ravel(), (rays * (tangent**2)[:, None]).ravel()], axis=1)
+    solved, *_ = np.linalg.lstsq(design, away, rcond=None)
+    focal, k = float(solved[0]), float(solved[1] / solved[0])
+    return "SIMPLE_RADIAL_FISHEYE" if fisheye else "SIMPLE_RADIAL", (focal, lens.width / 2, lens.height / 2, k)
+
+
+def apart_px(found: pycolmap.Camera, other: pycolmap.Camera, turn: bool = False) -> Float64[np.ndarray, " n"]:
+    """How far apart two lenses see the rays of a grid over the picture, pixels.
+
+    Args:
+        found: One lens.
+        other: Another of the same size, whose picture the grid is over.
+        turn: After the small rotation of all rays that brings them nearest: the poses take it.
+
+    Returns:
+        Distances; infinite where one of them sees nothing.
+    """
+    rays = picture_rays(other.width, other.height, other)
+    rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    want = np.asarray(other.img_from_cam(rays), np.float64)
+    rotation = np.eye(3)
+    for _ in range(6 if turn else 0):
+        turned = rays @ rotation.T
+        have = np.asarray(found.img_from_cam(turned), np.float64)
+        step, columns = 1e-6, []
+        for axis in np.eye(3):
+            moved = np.asarray(found.img_from_cam(turned + step * np.cross(axis, turned)), np.float64)
+            columns.append(((moved - have) / step).ravel())
+        design, residual = np.stack(columns, axis=1), (want - have).ravel()
+        good = np.isfinite(residual) & np.isfinite(design).all(axis=1)
+        angle, *_ = np.linalg.lstsq(design[good], residual[good], rcond=None)
+        rotation = _rotation(angle) @ rotation
+    have = np.asarray(found.img_from_cam(rays @ rotation.T), np.float64)
+    distance = np.linalg.norm(have - want, axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def _rotation(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    angle = float(np.linalg.norm(vector))
+    quat = np.append(np.sin(angle / 2) * vector / max(angle, 1e-300), np.cos(angle / 2))  # x, y, z, w
+    return np.asarray(pycolmap.Rotation3d(quat).matrix(), np.float64)
+
+
+def indices(model: str, names: Sequence[str]) -> list[int]:
+    """Where parameters of a wide model lie."""
+    return [NAMES[model].index(name) for name in names]

@@ -1,0 +1,279 @@
+"""What may be freed of each camera's lens: adjustments with and without it, judged by tracks that took no part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.sfm.focal import UNOBSERVED
+from splatpipe.pipeline.sfm.held_out import Tracks, improves, predicted_errors, rows_by_camera
+from splatpipe.pipeline.sfm.lens_adjustment import (
+    BASE,
+    LensFreedom,
+    Solved,
+    adjust_lenses,
+    corner_effects,
+    corner_sigma_px,
+    stated_prior,
+    weak_prior,
+)
+from splatpipe.pipeline.sfm.lens_model import (
+    NAMES,
+    WIDE,
+    WIDE_FISHEYE,
+    StatedLens,
+    named_params,
+    picture_rays,
+    set_lens,
+    widen,
+)
+
+LEAST_GAIN = 0.002  # of the held-out errors' squares: noise gives a tenth of it
+LEAST_SIGMAS = 3.0
+LEAST_EFFECT = 0.25  # of the held-out error, at the corner: less moves nothing that is measured later
+STEPS = {
+    WIDE: (("k2",), ("cx", "cy"), ("p1", "p2"), ("k3",)),
+    WIDE_FISHEYE: (("k2",), ("cx", "cy"), ("k3",), ("k4",)),
+}
+PASSES = 2  # what was refused beside a wrong lens may be there beside a better one
+WIDE_ANGLE = 1.2  # tangent of half the field of view, at the corner, from which on a lens may be a fisheye
+
+
+@dataclass(frozen=True)
+class LensState:
+    """A camera so far.
+
+    Attributes:
+        freedom: What is free of it.
+        focal_told: Whether the photos tell its focal length.
+        freed: The groups that were kept, in order.
+        tried: A row for every group that was tried.
+        changed: Whether it is no longer the lens that mapping left.
+        stated: Where its lens came from; empty where none is used.
+    """
+
+    freedom: LensFreedom
+    focal_told: bool
+    freed: tuple[str, ...] = ()
+    tried: tuple[JSON, ...] = ()
+    changed: bool = False
+    stated: str = ""
+
+
+class Trial:
+    """Adjustments of the tracks that decide; the best so far, and how well it predicts the tracks that are held out."""
+
+    def __init__(
+        self, model: pycolmap.Reconstruction, tracks: Tracks, states: Mapping[int, LensState], seed: int
+    ) -> None:
+        """Begin with the simple lenses, adjusted to the same tracks as all that follow.
+
+        Args:
+            model: Of the tracks that decide, and wide cameras; changed in place.
+            tracks: Held out; of the photos that take part.
+            states: Of all its cameras.
+            seed: Of the draws of photos.
+        """
+        self.states = dict(states)
+        self._tracks, self._seed = tracks, seed
+        self._rows = dict(rows_by_camera(model, tracks))
+        self._best = adjust_lenses(model, self._freedoms())
+        self._errors = predicted_errors(self._best.model, tracks)
+
+    @property
+    def model(self) -> pycolmap.Reconstruction:
+        """The best so far."""
+        return self._best.model
+
+    def take_stated(self, stated: Mapping[int, StatedLens], held: bool) -> None:
+        """Take stated lenses, refined about what they say, unless held; not where the photos speak against them."""
+        if not stated:
+            return
+        model = pycolmap.Reconstruction(self.model)
+        wanted: dict[int, LensState] = {}
+        for number, lens in sorted(stated.items()):
+            camera = lens.colmap(number)
+            widen(camera)
+            set_lens(model.cameras[number], camera.model_name, named_params(camera))
+            names = () if held else (*BASE, *sum(STEPS[camera.model_name], ()))
+            freedom = LensFreedom(names, stated_prior(camera))
+            state = self.states[number]
+            wanted[number] = replace(state, freedom=freedom, changed=True, stated=lens.source, freed=("stated",))
+        solved, errors = self._solve(model, wanted)
+        kept = {}
+        for number, state in wanted.items():
+            gain, _ = self._gain(number, errors)
+            row = {"freed": "stated", "held_out_gain": round(gain, 4)}
+            good = held or gain > -LEAST_GAIN
+            kept[number] = good
+            told = state if good else self.states[number]
+            wanted[number] = replace(told, tried=(*self.states[number].tried, {**row, "kept": good}))
+        self._keep(solved, errors, wanted, kept)
+
+    def free_steps(self) -> None:
+        """Free what helps, first all together to see whether anything does, then group by group."""
+        open_ = {number for number, state in self.states.items() if state.freedom.free and not state.stated}
+        if not open_:
+            return
+        wanted = {number: self._with(number, sum(self._steps(number), ())) for number in open_}
+        _, errors = self._solve(pycolmap.Reconstruction(self.model), wanted)
+        hopeful = set()
+        for number in sorted(open_):
+            gain, sure = self._gain(number, errors)
+            row = {"freed": "all", "held_out_gain": round(gain, 4), "kept": sure}
+            self.states[number] = replace(self.states[number], tried=(*self.states[number].tried, row))
+            if sure:
+                hopeful.add(number)
+        for _ in range(PASSES):
+            for step in range(max(map(len, STEPS.values())) if hopeful else 0):
+                self._free_group({n: names for n in sorted(hopeful) if (names := self._open(n, step))})
+
+    def try_fisheye(self) -> None:
+        """Take a fisheye's model instead of the other where it predicts better, with one coefficient or more."""
+        wanted = {}
+        model = pycolmap.Reconstruction(self.model)
+        for number, state in sorted(self.states.items()):
+            camera = model.cameras[number]
+            if state.stated or not state.freedom.free or camera.model_name != WIDE or not _is_wide(camera):
+                continue
+            _as_fisheye(camera)
+            base = len(BASE) if state.focal_told else 1
+            free = (*state.freedom.free[:base], *sum(STEPS[WIDE_FISHEYE], ()))
+            freedom = replace(state.freedom, free=free, prior=weak_prior(camera))
+            wanted[number] = replace(state, freedom=freedom, changed=True, freed=("fisheye",))
+        if not wanted:
+            return
+        solved, errors = self._solve(model, wanted)
+        kept = {}
+        for number in wanted:
+            gain, sure = self._gain(number, errors)
+            row = {"freed": "fisheye", "held_out_gain": round(gain, 4), "kept": sure}
+            kept[number] = sure
+            told = wanted[number] if sure else self.states[number]
+            wanted[number] = replace(told, tried=(*self.states[number].tried, row))
+        self._keep(solved, errors, wanted, kept)
+
+    def _free_group(self, groups: Mapping[int, tuple[str, ...]]) -> None:
+        if not groups:
+            return
+        wanted = {number: self._with(number, names) for number, names in groups.items()}
+        solved, errors = self._solve(pycolmap.Reconstruction(self.model), wanted, doubt=True)
+        kept = {}
+        for number, names in groups.items():
+            gain, sure = self._gain(number, errors)
+            effect, sigma, focal = self._doubt(number, names, solved, wanted[number])
+            least = LEAST_EFFECT * self._typical(number)
+            told = effect >= max(least, LEAST_SIGMAS * sigma) and focal <= UNOBSERVED
+            kept[number] = sure and told
+            row = {
+                "freed": " ".join(names),
+                "held_out_gain": round(gain, 4),
+                "corner_px": round(effect, 3),
+                "sigma_px": round(sigma, 3) if math.isfinite(sigma) else None,
+                "kept": kept[number],
+            }
+            state = wanted[number] if kept[number] else self.states[number]
+            state = replace(state, tried=(*self.states[number].tried, row))
+            if kept[number]:
+                state = replace(state, freed=(*state.freed, " ".join(names)), changed=True)
+            wanted[number] = state
+        self._keep(solved, errors, wanted, kept)
+
+    def _doubt(
+        self, number: int, names: tuple[str, ...], solved: Solved, state: LensState
+    ) -> tuple[float, float, float]:
+        """What a group does at the corner, its standard deviation there, pixels; that of the focal length, relative."""
+        camera, covariance = solved.model.cameras[number], solved.covariances.get(number)
+        now, was = named_params(camera), named_params(self.model.cameras[number])
+        effects = corner_effects(camera)
+        moved = np.sum([effects[name] * (now[name] - was[name]) for name in names], axis=0)
+        effect = float(np.linalg.norm(moved, axis=1).max())
+        if covariance is None:
+            return effect, math.inf, math.inf
+        noise = max(self._typical(number), 1.0)
+        sigma = noise * corner_sigma_px(camera, names, covariance, state.freedom.free)
+        focal = noise * math.sqrt(max(float(covariance[0, 0]), 0.0)) / now["fx"]
+        return effect, sigma, focal if state.focal_told else 0.0
+
+    def _open(self, number: int, step: int) -> tuple[str, ...]:
+        """A camera's group of a step, unless it is free or nothing was freed since it was tried; none then."""
+        steps, state = self._steps(number), self.states[number]
+        names = steps[step] if step < len(steps) else ()
+        tried = [row["freed"] for row in state.tried]
+        if " ".join(names) not in tried:
+            return names
+        since = state.tried[len(tried) - tried[::-1].index(" ".join(names)) :]
+        return names if " ".join(names) not in state.freed and any(row["kept"] for row in since) else ()
+
+    def _steps(self, number: int) -> tuple[tuple[str, ...], ...]:
+        """The groups of a camera; where not even the focal length is told, the principal point is not either."""
+        steps = STEPS[self.model.cameras[number].model_name]
+        return steps if self.states[number].focal_told else tuple(step for step in steps if step != ("cx", "cy"))
+
+    def _with(self, number: int, names: tuple[str, ...]) -> LensState:
+        state = self.states[number]
+        return replace(state, freedom=replace(state.freedom, free=(*state.freedom.free, *names)))
+
+    def _freedoms(self) -> dict[int, LensFreedom]:
+        return {number: state.freedom for number, state in self.states.items()}
+
+    def _solve(
+        self, model: pycolmap.Reconstruction, wanted: Mapping[int, LensState], doubt: bool = False
+    ) -> tuple[Solved, Float64[np.ndarray, " n"]]:
+        freedoms = {**self._freedoms(), **{number: state.freedom for number, state in wanted.items()}}
+        solved = adjust_lenses(model, freedoms, doubt)
+        return solved, predicted_errors(solved.model, self._tracks)
+
+    def _gain(self, number: int, errors: Float64[np.ndarray, " n"]) -> tuple[float, bool]:
+        rows = self._rows.get(number, np.zeros(0, np.int64))
+        return improves(self._errors[rows], errors[rows], self._tracks.image[rows], LEAST_GAIN, self._seed)
+
+    def _typical(self, number: int) -> float:
+        """Of the held-out errors along one axis, pixels."""
+        return float(np.median(self._errors[self._rows[number]])) / math.sqrt(2.0 * math.log(2.0))
+
+    def _keep(
+        self,
+        solved: Solved,
+        errors: Float64[np.ndarray, " n"],
+        wanted: Mapping[int, LensState],
+        kept: Mapping[int, bool],
+    ) -> None:
+        """Go on with what was found, where all of it is kept; else adjust again with what is."""
+        self.states.update(wanted)
+        if all(kept.values()):
+            self._best, self._errors = solved, errors
+        elif any(kept.values()):
+            model = solved.model
+            for number in sorted(kept):
+                if not kept[number]:
+                    camera = self.model.cameras[number]
+                    set_lens(model.cameras[number], camera.model_name, named_params(camera))
+            self._best, self._errors = self._solve(model, {})
+
+
+def _is_wide(camera: pycolmap.Camera) -> bool:
+    rays = picture_rays(camera.width, camera.height, camera)
+    tangent = np.linalg.norm(rays, axis=1)
+    return not np.isfinite(tangent).all() or float(tangent.max()) > WIDE_ANGLE
+
+
+def _as_fisheye(camera: pycolmap.Camera) -> None:
+    """The fisheye with one coefficient that is nearest to a lens within what both see, in place."""
+    named = named_params(camera)
+    rays = picture_rays(camera.width, camera.height, camera)
+    tangent = np.linalg.norm(rays, axis=1)
+    good = np.isfinite(tangent) & (tangent > 0.0)
+    angle = np.arctan(tangent[good])
+    flat = np.stack([tangent[good], np.zeros(int(good.sum())), np.ones(int(good.sum()))], axis=1)
+    radius = np.asarray(camera.img_from_cam(flat))[:, 0] - named["cx"]
+    solved, *_ = np.linalg.lstsq(np.stack([angle, angle**3], axis=1), radius, rcond=None)
+    focal, k = float(solved[0]), float(solved[1] / solved[0])
+    shape = {**dict.fromkeys(NAMES[WIDE_FISHEYE], 0.0), "cx": named["cx"], "cy": named["cy"]}
+    set_lens(camera, WIDE_FISHEYE, {**shape, "fx": focal, "fy": focal, "k1": k})

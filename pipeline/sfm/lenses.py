@@ -1,0 +1,209 @@
+"""True lenses: what a simple lens leaves unsaid is freed step by step, where tracks that took no part say it is there.
+
+Mapping keeps one focal length and one coefficient of distortion a camera, which is what its first photos can bear. Then
+principal point, further radial and tangential distortion are freed, a group at a time, in an adjustment that some
+tracks take no part in. A group is kept where these are predicted better, photo by photo and not by chance, and where
+its own standard deviation leaves no doubt that it is there. A lens that is simple stays as it is, to the bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
+from splatpipe.pipeline.sfm.held_out import LEAST_VIEWS, of_photos, tracks_of
+from splatpipe.pipeline.sfm.lens_adjustment import BASE, LensFreedom, adjust_lenses, weak_prior
+from splatpipe.pipeline.sfm.lens_model import StatedLens, apart_px, is_known, named_params, narrow, set_lens, widen
+from splatpipe.pipeline.sfm.lens_trial import LensState, Trial
+from splatpipe.pipeline.sfm.retriangulation import MOST_ERROR_PX, retriangulate
+from splatpipe.pipeline.sfm.verified import Verified
+
+LEAST_PHOTOS = 8  # of a camera: fewer cannot tell its lens from their poses
+LEAST_TRACKS = 400  # that decide; fewer tell nothing
+MOST_TRACKS = 6000  # some 30,000 observations for a dozen unknowns a camera
+HELD_OUT = 0.25
+FAR_FROM_STATED = 2e-3  # of the width: twice what a lens strays from its calibration
+WORDS = {
+    "cx cy": "principal point",
+    "k2": "second radial coefficient",
+    "k3": "third radial coefficient",
+    "k4": "fourth radial coefficient",
+    "p1 p2": "tangential distortion",
+    "fisheye": "a fisheye's projection",
+    "stated": "as it is stated",
+}
+WANTED_A_PHOTO = 80  # of the tracks that decide
+LEAST_A_PHOTO = 20  # of those that are adjusted: six unknowns want more than three points
+
+
+def calibrate(
+    model: pycolmap.Reconstruction, verified: Verified, stated: Mapping[int, StatedLens], how: str, seed: int = 0
+) -> tuple[pycolmap.Reconstruction, tuple[JSON, ...]]:
+    """Free what the photos show of their lenses.
+
+    Args:
+        model: As mapping leaves it, with simple lenses; left as it is.
+        verified: Its view graph, with the cameras as they were before mapping.
+        stated: Lenses that files or metadata state, in each camera's own pixels, by COLMAP's camera id.
+        how: ``auto``; ``simple`` leaves the model alone; ``held`` takes stated lenses as they are.
+        seed: Of the tracks that are held out.
+
+    Returns:
+        The model itself where every lens stays simple, else a new one; and a row a camera for ``models.json``.
+    """
+    usable = {number: lens for number, lens in stated.items() if number in model.cameras}
+    chosen = _deciding(model, seed)
+    if how == "simple" or (len(chosen) < LEAST_TRACKS and not usable):
+        return model, ()
+    held_out, deciding = np.split(chosen, [round(HELD_OUT * len(chosen))])
+    within = _only(model, set(deciding.tolist()))
+    states = _states(within, model)
+    if not usable and not any(state.freedom.free for state in states.values()):
+        return model, ()
+    tracks = of_photos(tracks_of(model, np.sort(held_out)), set(within.reg_image_ids()))
+    trial = Trial(within, tracks, states, seed)
+    trial.take_stated(usable, held=how == "held")
+    trial.free_steps()
+    trial.try_fisheye()
+    if not any(state.changed for state in trial.states.values()):
+        return model, _rows(model, model, trial)
+    result = _finished(model, verified, trial, seed)
+    return result, _rows(model, result, trial, usable)
+
+
+def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
+    """Points of three photos or more, in a seeded order: as many as it takes, and of every photo some."""
+    numbers = np.array(
+        sorted(number for number, point in model.points3D.items() if point.track.length() >= LEAST_VIEWS), np.int64
+    )
+    mixed = np.random.default_rng(seed).permutation(numbers)
+    if len(mixed) <= MOST_TRACKS:
+        return np.asarray(mixed)
+    seen: Counter[int] = Counter()
+    taken = []
+    for place, number in enumerate(mixed.tolist()):
+        photos = {element.image_id for element in model.points3D[number].track.elements}
+        if place < MOST_TRACKS or any(seen[photo] < WANTED_A_PHOTO for photo in photos):
+            seen.update(photos)
+            taken.append(number)
+    return np.random.default_rng(seed).permutation(np.array(taken, np.int64))
+
+
+def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> dict[int, LensState]:
+    """What is free of the cameras as mapping leaves them.
+
+    Those of few photos are held; focal lengths that the photos do not tell stay where mapping, which knows the
+    metadata, left them.
+    """
+    counts = Counter(model.images[number].camera_id for number in model.reg_image_ids())
+    fewer = math.sqrt(within.compute_num_observations() / max(model.compute_num_observations(), 1))
+    sigmas = focal_sigmas(within)
+    states = {}
+    for number, camera in sorted(within.cameras.items()):
+        told = fewer * sigmas.get(number, math.inf) <= UNOBSERVED
+        base = BASE if told else BASE[-1:]
+        free = base if counts[number] >= LEAST_PHOTOS and is_known(camera.model_name) else ()
+        states[number] = LensState(LensFreedom(free, weak_prior(camera)), told)
+    return states
+
+
+def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstruction:
+    """A copy with some of the points alone, the photos that they hold, and wide cameras."""
+    copy = pycolmap.Reconstruction(model)
+    for number in sorted(copy.points3D):
+        if number not in points:
+            copy.delete_point3D(number)
+    seen = Counter(element.image_id for point in copy.points3D.values() for element in point.track.elements)
+    observations = pycolmap.ObservationManager(copy)
+    for number in sorted(copy.reg_image_ids()):
+        if seen[number] < LEAST_A_PHOTO:
+            observations.deregister_frame(copy.images[number].frame_id)
+    for camera in copy.cameras.values():
+        if is_known(camera.model_name):
+            widen(camera)
+    return copy
+
+
+def _finished(model: pycolmap.Reconstruction, verified: Verified, trial: Trial, seed: int) -> pycolmap.Reconstruction:
+    """The whole model with the lenses that were found: adjusted, completed, and adjusted to the end."""
+    result = pycolmap.Reconstruction(model)
+    for number, camera in result.cameras.items():
+        lens = trial.model.cameras[number]
+        if is_known(lens.model_name):
+            set_lens(camera, lens.model_name, named_params(lens))
+    for number in sorted(result.reg_image_ids()):
+        image, found = result.images[number], trial.model.images[number]
+        if found.has_pose:
+            image.frame.set_cam_from_world(image.camera_id, found.cam_from_world())
+    freedoms = {number: state.freedom for number, state in trial.states.items()}
+    adjust_lenses(result, freedoms)
+    retriangulate(result, verified, seed)
+    adjust_lenses(result, freedoms)
+    pycolmap.ObservationManager(result).filter_all_points3D(MOST_ERROR_PX, 0.0)
+    for camera in result.cameras.values():
+        if is_known(camera.model_name):
+            narrow(camera)
+    result.update_point_3d_errors()
+    return result
+
+
+def _rows(
+    before: pycolmap.Reconstruction,
+    after: pycolmap.Reconstruction,
+    trial: Trial,
+    stated: Mapping[int, StatedLens] = MappingProxyType({}),
+) -> tuple[JSON, ...]:
+    rows = []
+    for number, state in sorted(trial.states.items()):
+        camera = after.cameras[number]
+        row = {
+            "camera": number,
+            "model": camera.model_name,
+            "width": camera.width,
+            "freed": list(state.freed),
+            "stated": state.stated,
+            "focal_told": state.focal_told,
+            "tried": list(state.tried),
+            "moved_px": _rms(apart_px(camera, before.cameras[number], turn=True)),
+        }
+        if state.stated:
+            row["off_stated_px"] = _rms(apart_px(camera, stated[number].colmap(), turn=True))
+        rows.append(row)
+    return tuple(rows)
+
+
+def _rms(distances: Float64[np.ndarray, " n"]) -> float | None:
+    """Of those that are known, pixels."""
+    known = distances[np.isfinite(distances)]
+    return round(float(np.sqrt(np.mean(known**2))), 3) if len(known) else None
+
+
+def tell_lenses(summary: Mapping[str, JSON], report: Reporter) -> None:
+    """Say what became of the lenses."""
+    for row in summary["lenses"]:
+        if row["freed"]:
+            what = ", ".join(WORDS.get(name, name) for name in row["freed"])
+            report.note(
+                f"The lens of camera {row['camera']} has more to it than a simple one: {what} ({row['model']})."
+            )
+        if row["stated"] and (row["off_stated_px"] or 0.0) > FAR_FROM_STATED * row["width"]:
+            report.warning(
+                f"The photos take the lens of camera {row['camera']} {row['off_stated_px']:.1f} pixels (RMS) from the"
+                " one that is stated.",
+                hint="Is it this camera's, at this focus and size? --set sparse.lens=held takes it as it is.",
+            )
+        refused = [each for each in row["tried"] if each["freed"] == "stated" and not each["kept"]]
+        if refused:
+            report.warning(
+                f"The lens that is stated for camera {row['camera']} is not the one these photos were taken with: they"
+                f" are predicted {-refused[0]['held_out_gain']:.0%} worse with it, so it is not used.",
+                hint="Give the calibration of this camera, or --set sparse.lens=held to take it all the same.",
+            )

@@ -1,0 +1,43 @@
+"""Tracks as far as better cameras see them: what mapping had to leave out or throw out is triangulated again."""
+
+from __future__ import annotations
+
+import pycolmap
+
+from splatpipe.pipeline.sfm.verified import Verified
+
+MOST_ERROR_PX = 4.0  # COLMAP's own limits of mapping
+LEAST_ANGLE_DEG = 1.5
+
+
+def retriangulate(model: pycolmap.Reconstruction, verified: Verified, seed: int) -> None:
+    """Bring verified matches into a model, in place, as far as its cameras explain them; what they do not goes.
+
+    Args:
+        model: Its keypoints are those of ``verified``.
+        verified: The view graph.
+        seed: Of the triangulation.
+    """
+    graph = pycolmap.CorrespondenceGraph()
+    placed = sorted(model.reg_image_ids())
+    for number in placed:
+        graph.add_image(number, len(verified.keypoints[number]))
+    inside = set(placed)
+    for (first, second), rows in sorted(verified.matches.items()):
+        if first in inside and second in inside:
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = rows
+            graph.add_two_view_geometry(first, second, geometry)
+    graph.finalize()
+    observations = pycolmap.ObservationManager(model, graph)
+    observations.filter_all_points3D(MOST_ERROR_PX, LEAST_ANGLE_DEG)
+    triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    options.random_seed = seed
+    pycolmap.set_random_seed(seed)
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    for number in placed:
+        triangulator.triangulate_image(options, number)
+    observations.filter_all_points3D(MOST_ERROR_PX, LEAST_ANGLE_DEG)
