@@ -17,6 +17,7 @@ from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.dataset import some
 from splatpipe.pipeline.scene.photos import load_photo_list
 from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.judging import judge
 from splatpipe.pipeline.sfm.lens_model import stated_lenses
 from splatpipe.pipeline.sfm.lenses import calibrate, tell_lenses
 from splatpipe.pipeline.sfm.options import SparseConfig
@@ -43,8 +44,10 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         found = replace(found, model=model)
     model = canonical(found.model, found.colours, _keypoint_counts(found.verified))
     write_model(model, out / "sparse" / "0")
-    summary = {**_summary(model, found), "lenses": list(lenses)}
-    (out / "models.json").write_text(json.dumps(summary, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+    verdict = judge(model, found.verified, capture.cameras)
+    summary = {**_summary(model, found), "lenses": list(lenses), "verdict": verdict.as_json()}
+    text = json.dumps(_without_times(summary), ensure_ascii=False, indent=1) + "\n"
+    (out / "models.json").write_text(text, encoding="utf-8")
     _warn(summary, report)
     tell_lenses(summary, report)
     return {**summary, "unregistered": len(summary["unregistered"]), "other_models": len(summary["other_models"])}
@@ -63,6 +66,13 @@ def _capture(inputs: Inputs, scratch: Path) -> Capture:
         scratch=scratch,
         threads=inputs.machine.threads,
     )
+
+
+def _without_times(value: JSON) -> JSON:
+    """The same without CPU seconds: the part's bytes are those of the answer, and times are no part of it."""
+    if isinstance(value, dict):
+        return {key: _without_times(entry) for key, entry in value.items() if key != "cpu_s"}
+    return [_without_times(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
 def _keypoint_counts(verified: Verified) -> npt.NDArray[np.int64]:

@@ -3,83 +3,247 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
-from splatpipe.pipeline.sfm.mapping import MappingOptions, map_incremental
+from splatpipe.pipeline.sfm.judging import Judgement, judge
+from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.verified import read_verified
+from splatpipe.pipeline.sfm.probing import FILL, PROBES, THIN, pairs_a_photo, probe
+from splatpipe.pipeline.sfm.verified import Verified, read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
+Mapper: TypeAlias = Literal["incremental", "global"]
 
 LEAST_SHARE = 0.1  # of the photos; a model of fewer is an accident
-ENOUGH_SHARE = 0.5  # below it a second attempt is worth its time
-STRAY_UNOBSERVED = 0.03  # which it may have where the photos cannot tell it
+ENOUGH_SHARE = 0.5  # below it an attempt with lower demands is worth its time
+MOST_SHARE = 0.85  # below it the other mapper may do better; above it the ladder places what is left for less
+STRAY_UNOBSERVED = 0.03  # which a focal length may have where the photos cannot tell it
+CLEARLY = 0.005  # of the score, by which a second answer has to be better; below it the first one stays
+ROUNDS = 2  # of new pairs
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """How to map.
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What one way of mapping gave.
 
     Attributes:
-        relaxed: Accept fewer and worse inliers for a photo's pose.
-        hold_focal: Keep focal lengths at their priors.
+        how: The way, for people.
+        mapper: Which.
+        options: Its options.
+        models: The largest first; perhaps none.
+        judgement: Of the first; None where there is none.
+        cpu_s: What it took.
     """
 
-    relaxed: bool = False
-    hold_focal: bool = False
+    how: str
+    mapper: Mapper
+    options: MappingOptions
+    models: list[Model]
+    judgement: Judgement | None
+    cpu_s: float
+
+    @property
+    def placed(self) -> int:
+        """Photos of the largest model."""
+        return self.models[0].num_reg_images() if self.models else 0
+
+
+class Reconstructor:
+    """Maps a capture, perhaps more than once, and keeps a row of each try."""
+
+    def __init__(self, capture: Capture, config: SparseConfig, report: Reporter) -> None:
+        self.capture, self.config, self.report = capture, config, report
+        self.database = capture.database
+        self.verified = read_verified(capture.database)
+        self.tried: list[Answer] = []
+        self.notes: dict[int, str] = {}
+
+    def map(self, mapper: Mapper, how: str, **options: bool) -> Answer:
+        """Map one way, and judge."""
+        began = time.process_time()
+        chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size), **options)
+        work = map_incremental if mapper == "incremental" else map_global
+
+        def tell(placed: int, total: int, what: str) -> None:
+            self.report.progress(placed, total, what, "photos")
+
+        models = work(self.database, self.capture.scratch, chosen, tell)
+        tell(len(self.verified.names), len(self.verified.names), "placing photos")
+        judgement = judge(models[0], self.verified, self.capture.cameras) if models else None
+        answer = Answer(how, mapper, chosen, models, judgement, time.process_time() - began)
+        self.tried.append(answer)
+        return answer
+
+    def rows(self, chosen: Answer) -> tuple[JSON, ...]:
+        """What was tried, for ``models.json``."""
+        return tuple(
+            {**_row(answer), "chosen": answer is chosen, "why": self.notes.get(id(answer), "")} for answer in self.tried
+        )
 
 
 def reconstruct(capture: Capture, config: SparseConfig, report: Reporter) -> Found:
     """Find the cameras.
 
+    Args:
+        capture: The photos and what is known of them.
+        config: Which mapper; ``auto`` maps photo after photo first, and all at once where that is doubtful.
+        report: Told of the progress.
+
+    Returns:
+        The better model. Its database may have more pairs than the capture's.
+
     Raises:
         SplatpipeError: if too few photos can be placed.
     """
-    verified = read_verified(capture.database)
-    attempt = Attempt()
-    models = _map(capture, config, attempt, report)
-    if _registered(models) < ENOUGH_SHARE * len(verified.names):
-        again = Attempt(relaxed=True)
-        second = _map(capture, config, again, report)
-        if _registered(second) > _registered(models):
-            attempt, models = again, second
-    _check_enough(models, config, len(verified.names))
-    if _focal_unobserved(models[0], verified.cameras):
-        again = Attempt(attempt.relaxed, hold_focal=True)
-        held = _map(capture, config, again, report)
-        if _registered(held) >= _registered(models):
-            attempt, models = again, held
-            used = {models[0].images[number].camera_id for number in models[0].reg_image_ids()}
-            focals = {number: verified.cameras[number].mean_focal_length() for number in used}
-            adjust_within(models[0], focals, STRAY_UNOBSERVED)
-    tried = ({"mapper": "incremental", "chosen": True, "focal_held": attempt.hold_focal},)
-    return Found(models[0], tuple(models[1:]), capture.database, verified, capture.colours, tried)
+    work = Reconstructor(capture, config, report)
+    answer = _best(work)
+    _check_enough(answer.placed, config, len(work.verified.names))
+    if config.mapper == "auto":
+        answer = _with_new_pairs(work, answer)
+    return Found(
+        answer.models[0],
+        tuple(answer.models[1:]),
+        work.database,
+        work.verified,
+        capture.colours,
+        work.rows(answer),
+    )
 
 
-def _map(capture: Capture, config: SparseConfig, attempt: Attempt, report: Reporter) -> list[Model]:
-    """Every sub-model that mapping finds, the largest first."""
-    options = MappingOptions(config.seed, config.min_model_size, attempt.relaxed, attempt.hold_focal)
+def _best(work: Reconstructor) -> Answer:
+    """The better answer of the mappers that the configuration allows."""
+    mapper: Mapper = "global" if work.config.mapper == "global" else "incremental"
+    best = _with_held_focal(work, work.map(mapper, mapper))
+    total = len(work.verified.names)
+    doubts = _doubts(best, total, work.verified)
+    if work.config.mapper == "auto" and doubts:
+        work.notes[id(best)] = f"doubtful: {'; '.join(doubts)}"
+        best = _better(best, _with_held_focal(work, work.map("global", "global")))
+    if best.placed < ENOUGH_SHARE * total and work.config.mapper != "global":
+        relaxed = work.map("incremental", "incremental, lower demands", relaxed=True)
+        best = _better(best, _with_held_focal(work, relaxed))
+    return best
 
-    def tell(placed: int, total: int, what: str) -> None:
-        report.progress(placed, total, what, "photos")
 
-    return map_incremental(capture.database, capture.scratch, options, tell)
+def _doubts(answer: Answer, total: int, verified: Verified) -> list[str]:
+    """Why to map the other way, too."""
+    if answer.judgement is None:
+        return ["no photo was placed"]
+    found = []
+    if answer.placed < MOST_SHARE * total:
+        found.append(f"{answer.placed} of {total} photos placed")
+    told = {"focal": "the focal length ran away", "bent": "pairs of photos contradict it"}
+    told["unexplained"] = "many matches are not explained"
+    found += sorted({told[reason.kind] for reason in answer.judgement.reasons if reason.kind in told})
+    if not any(verified.cameras[number].has_prior_focal_length for number in _used(answer.models[0])):
+        found.append("nothing was known of the focal length")
+    return found
 
 
-def _registered(models: Sequence[Model]) -> int:
-    return models[0].num_reg_images() if models else 0
+def _better(first: Answer, second: Answer) -> Answer:
+    """Of two answers; the first unless the second is clearly better."""
+    if second.judgement is None or first.judgement is None:
+        return first if second.judgement is None else second
+    bad = first.judgement.level == "bad", second.judgement.level == "bad"
+    if bad[0] != bad[1]:
+        return second if bad[0] else first
+    return second if second.judgement.score > first.judgement.score + CLEARLY else first
 
 
-def _check_enough(models: Sequence[Model], config: SparseConfig, total: int) -> None:
-    count = _registered(models)
+def _with_new_pairs(work: Reconstructor, answer: Answer) -> Answer:
+    """The answer, or where it foretold wrongly or the graph is thin a better one from a graph with more pairs."""
+    for _ in range(ROUNDS):
+        model = answer.models[0]
+        thin = pairs_a_photo(model, work.verified) < THIN
+        if not thin and not _unsure(answer, work.verified):
+            break
+        count = FILL * model.num_reg_images() if thin else PROBES
+        found = probe(work.capture, model, (work.database, work.verified), count, work.config.seed, work.report)
+        if not found.held:
+            break
+        told = f"of {found.tried} pairs that it foretells {found.held} hold, {found.contradicting} of them against it"
+        work.notes[id(answer)] = "; ".join(filter(None, [work.notes.get(id(answer), ""), told]))
+        work.database, work.verified = found.database, found.verified
+        answer = _judged_again(work, answer)
+        if not (thin or found.prove_a_bend):
+            break
+        best = _better(answer, _with_held_focal(work, work.map(answer.mapper, f"{answer.mapper}, with more pairs")))
+        if best.judgement is not None and best.judgement.level == "bad" and answer.mapper == "incremental":
+            best = _better(best, _with_held_focal(work, work.map("global", "global, with more pairs")))
+        if best is answer:
+            break
+        answer = best
+    return answer
+
+
+def _unsure(answer: Answer, verified: Verified) -> bool:
+    """Whether nothing but the matches themselves tells that a model is right."""
+    known = all(verified.cameras[number].has_prior_focal_length for number in _used(answer.models[0]))
+    return not known or (answer.judgement is not None and answer.judgement.level != "good")
+
+
+def _judged_again(work: Reconstructor, answer: Answer) -> Answer:
+    """The same models, held against the graph as it is now."""
+    judgement = judge(answer.models[0], work.verified, work.capture.cameras)
+    fresh = replace(answer, judgement=judgement)
+    work.tried[work.tried.index(answer)] = fresh
+    work.notes[id(fresh)] = work.notes.pop(id(answer), "")
+    return fresh
+
+
+def _with_held_focal(work: Reconstructor, answer: Answer) -> Answer:
+    """The answer, or where the photos cannot tell the focal length one near that of the metadata.
+
+    If they cannot, the one that is held explains the matches just as well.
+    """
+    if not answer.models or not _focal_unobserved(answer.models[0], work.verified.cameras):
+        return answer
+    relaxed = answer.options.relaxed
+    held = work.map(answer.mapper, f"{answer.how}, focal length held", hold_focal=True, relaxed=relaxed)
+    if held.placed < answer.placed:
+        return answer
+    model, priors = held.models[0], work.verified.cameras
+    adjust_within(model, {number: priors[number].mean_focal_length() for number in _used(model)}, STRAY_UNOBSERVED)
+    held = _judged_again(work, held)
+    if held.judgement is None or answer.judgement is None:
+        return answer
+    return held if held.judgement.score >= answer.judgement.score - CLEARLY else answer
+
+
+def _row(answer: Answer) -> dict[str, JSON]:
+    row: dict[str, JSON] = {
+        "mapper": answer.mapper,
+        "how": answer.how,
+        "placed": answer.placed,
+        "focal_held": answer.options.hold_focal,
+        "cpu_s": round(answer.cpu_s, 1),
+    }
+    if answer.judgement is None:
+        return row
+    model, told = answer.models[0], answer.judgement
+    return {
+        **row,
+        "points3d": model.num_points3D(),
+        "error_px": round(model.compute_mean_reprojection_error(), 3),
+        "focal_px": [round(camera.mean_focal_length(), 1) for _, camera in sorted(model.cameras.items())],
+        "explained": round(told.explained, 4),
+        "held_out": round(told.held_out, 4),
+        "contradicted": [told.contradicted, told.pairs],
+        "score": round(told.score, 4),
+        "level": told.level,
+    }
+
+
+def _check_enough(count: int, config: SparseConfig, total: int) -> None:
     if count < max(config.min_model_size, math.ceil(LEAST_SHARE * total)):
         raise SplatpipeError(
             f"Only {count} of {total} photos could be placed." if count else f"None of {total} photos could be placed.",
@@ -90,12 +254,17 @@ def _check_enough(models: Sequence[Model], config: SparseConfig, total: int) -> 
 
 def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bool:
     """Whether a focal length left its prior although the photos cannot tell it; control may, later."""
-    used = {model.images[number].camera_id for number in model.reg_image_ids()}
-    strayed = [number for number in sorted(used) if _stray(model.cameras[number], priors[number]) >= STRAY_UNOBSERVED]
+    used = _used(model)
+    strayed = [number for number in used if _stray(model.cameras[number], priors[number]) >= STRAY_UNOBSERVED]
     if not strayed or not all(priors[number].has_prior_focal_length for number in used):
         return False
     sigmas = focal_sigmas(model)
     return any(sigmas.get(number, math.inf) > UNOBSERVED for number in strayed)
+
+
+def _used(model: Model) -> list[int]:
+    """The cameras of the placed photos."""
+    return sorted({model.images[number].camera_id for number in model.reg_image_ids()})
 
 
 def _stray(camera: pycolmap.Camera, prior: pycolmap.Camera) -> float:

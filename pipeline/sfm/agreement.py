@@ -1,0 +1,127 @@
+"""How far a model explains the verified matches: each pair of photos held against the cameras that were found.
+
+Most verified matches are none of the model's own observations, so they tell of it what its reprojection error cannot:
+photos that were not placed explain nothing, a bend leaves matches across it unexplained, a wrong lens most of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64, Int64
+
+from splatpipe.pipeline.sfm.verified import Verified
+
+EXPLAINED_PX = 4.0  # the distance from the epipolar line that verification itself allows
+LEAST_PARALLAX = 2.0  # of a match, times EXPLAINED_PX, for its depth to have a sign worth asking for
+
+Rays = Float64[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Each verified pair of photos against a model; a row a pair, in the order of ``Verified.matches``.
+
+    Attributes:
+        pairs: Image ids, the smaller first.
+        placed: Whether the model has both photos.
+        matches: Verified.
+        explained: Of these, within ``EXPLAINED_PX`` of their epipolar line and in front of both cameras.
+        closeness: Sum over the matches of 1 on the line, falling to 0 at ``EXPLAINED_PX`` from it.
+        held_out: Verified matches that are no two observations of one point of the model.
+        held_out_explained: Of those.
+        median_px: Distance from the epipolar line; a match behind a camera counts as infinitely far; nan if not placed.
+    """
+
+    pairs: Int64[np.ndarray, "n 2"]
+    placed: Bool[np.ndarray, " n"]
+    matches: Int64[np.ndarray, " n"]
+    explained: Int64[np.ndarray, " n"]
+    closeness: Float64[np.ndarray, " n"]
+    held_out: Int64[np.ndarray, " n"]
+    held_out_explained: Int64[np.ndarray, " n"]
+    median_px: Float64[np.ndarray, " n"]
+
+
+def compare(model: pycolmap.Reconstruction, verified: Verified) -> Agreement:
+    """Hold every verified pair against a model, whose keypoints are those of ``verified``."""
+    placed = sorted(model.reg_image_ids())
+    rays = {number: _rays(model, number, verified) for number in placed}
+    poses = {number: model.images[number].cam_from_world().matrix() for number in placed}
+    points = {number: _points(model, number, len(verified.keypoints[number])) for number in placed}
+    pairs = sorted(verified.matches)
+    rows = np.zeros((len(pairs), 4), np.int64)
+    closeness = np.zeros(len(pairs))
+    median = np.full(len(pairs), np.nan)
+    both = np.array([i in rays and j in rays for i, j in pairs], bool)
+    for row, (i, j) in enumerate(pairs):
+        found = verified.matches[i, j]
+        rows[row, 0] = rows[row, 2] = len(found)
+        if not both[row]:
+            continue
+        focal = (model.images[i].camera.mean_focal_length() + model.images[j].camera.mean_focal_length()) / 2.0
+        errors = epipolar_errors(rays[i][found[:, 0]], rays[j][found[:, 1]], poses[i], poses[j], EXPLAINED_PX / focal)
+        good = errors * focal <= EXPLAINED_PX
+        closeness[row] = np.maximum(1.0 - errors * focal / EXPLAINED_PX, 0.0).sum()
+        own = (points[i][found[:, 0]] == points[j][found[:, 1]]) & (points[i][found[:, 0]] >= 0)
+        rows[row, 1:] = good.sum(), (~own).sum(), (good & ~own).sum()
+        median[row] = float(np.sort(errors)[len(errors) // 2]) * focal  # half of them may be infinite
+    matches, explained, held_out, held_out_explained = rows.T
+    listed = np.array(pairs, np.int64).reshape(-1, 2)
+    return Agreement(listed, both, matches, explained, closeness, held_out, held_out_explained, median)
+
+
+def epipolar_errors(
+    one: Rays,
+    two: Rays,
+    one_from_world: Float64[np.ndarray, "3 4"],
+    two_from_world: Float64[np.ndarray, "3 4"],
+    noise: float,
+) -> Float64[np.ndarray, " n"]:
+    """Distances of matches from their epipolar lines in two calibrated photos.
+
+    The Sampson distance (Hartley and Zisserman, Multiple View Geometry, 11.4.3); infinite for what would lie behind a
+    camera, as long as its rays converge by more than noise.
+
+    Args:
+        one: Matched places in the first photo, undistorted, in units of the focal length.
+        two: The same in the second.
+        one_from_world: Pose of the first.
+        two_from_world: Pose of the second.
+        noise: Of a place, in units of the focal length.
+    """
+    turn = two_from_world[:, :3] @ one_from_world[:, :3].T
+    shift = two_from_world[:, 3] - turn @ one_from_world[:, 3]
+    length = float(np.linalg.norm(shift))
+    shift = shift / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+    cross = np.array([[0, -shift[2], shift[1]], [shift[2], 0, -shift[0]], [-shift[1], shift[0], 0]])
+    essential = cross @ turn
+    first, second = np.column_stack([one, np.ones(len(one))]), np.column_stack([two, np.ones(len(two))])
+    lines, back = first @ essential.T, second @ essential
+    off = np.einsum("ij,ij->i", second, lines)
+    slope = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+    errors = np.abs(off) / np.sqrt(np.maximum(slope, 1e-18))
+    turned = first @ turn.T
+    normal = np.cross(turned, second)
+    ahead_one = -np.einsum("ij,ij->i", np.cross(shift, second), normal)
+    ahead_two = -np.einsum("ij,ij->i", np.cross(shift, turned), normal)
+    angle = np.linalg.norm(normal, axis=1) / (np.linalg.norm(turned, axis=1) * np.linalg.norm(second, axis=1))
+    behind = (np.minimum(ahead_one, ahead_two) < 0.0) & (angle > LEAST_PARALLAX * noise)
+    # A lens whose distortion cannot be undone at a place has no ray there.
+    return np.where(behind | ~np.isfinite(errors), np.inf, errors)
+
+
+def _rays(model: pycolmap.Reconstruction, number: int, verified: Verified) -> Rays:
+    places = np.asarray(verified.keypoints[number], np.float64).reshape(-1, 2)
+    return np.asarray(model.images[number].camera.cam_from_img(places), np.float64).reshape(-1, 2)
+
+
+def _points(model: pycolmap.Reconstruction, number: int, count: int) -> Int64[np.ndarray, " n"]:
+    """The point that each keypoint of a photo belongs to, -1 for none."""
+    result = np.full(count, -1, np.int64)
+    for row, point in enumerate(model.images[number].points2D):
+        if point.has_point3D():
+            result[row] = point.point3D_id
+    return result

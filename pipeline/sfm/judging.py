@@ -1,0 +1,216 @@
+"""Whether the cameras that were found are right: an answer is judged, not the way it was found.
+
+The evidence is what the model did not need to be found: all verified matches (``agreement``), the metadata's focal
+lengths where these deserve trust, and plain shares of the photos. A bent model gives itself away by pairs of photos
+whose matches it contradicts. A few contradictions are usual, since windows and roofs repeat; in a bent or ghosted
+model they are many, as strong as what holds, or they stand between two groups of cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool
+
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.sfm.agreement import Agreement, compare
+from splatpipe.pipeline.sfm.splits import Split, find_split
+from splatpipe.pipeline.sfm.verified import Verified
+
+Level = Literal["good", "doubt", "bad"]
+LEVELS: tuple[Level, ...] = ("good", "doubt", "bad")
+
+PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # share of the photos; Pix4D's quality report asks for 95 %
+TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "lens-file")
+# A trusted focal length errs by a few per cent (a Phantom's by 0.5, sensor tables by up to 5); a 35 mm equivalent was
+# seen 26 % off on a phone, and a resized file's can be anything within reason.
+FOCAL_TRUSTED = (0.10, 0.30)  # stray from which on it is a doubt, and bad
+FOCAL_STATED = (0.35, 1.0)  # the same of a stated one that does not deserve trust, as a ratio less one
+FOCAL_LONGER = (0.25, 6.0)  # of the longer side: the lenses of cameras that people map with, 127 to 10 degrees
+EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed photos; sound models have 0.93 and more
+CONTRADICTED_DOUBT, CONTRADICTED_BAD = 0.04, 0.10  # of the pairs among placed photos; sound models have 0 to 0.03
+STRONG_BAD = 0.02  # the same, of pairs with more matches than half of those that hold
+FEW_PAIRS = 3  # contradicting pairs that may be chance
+LEAST_MATCHES = 15  # of a pair to contradict; COLMAP's own bound of a pair
+SPLIT_DOUBT, SPLIT_BAD = 0.5, 1.0  # matches that contradict between two groups of cameras, to those that agree
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Something that speaks against a model.
+
+    Attributes:
+        level: How heavily.
+        text: What, in plain words, a whole sentence.
+        hint: What to do about it, or nothing.
+        kind: For programs: ``placed``, ``focal``, ``bent``, ``unexplained``.
+    """
+
+    level: Level
+    text: str
+    hint: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is to be held of a model.
+
+    Attributes:
+        level: The worst of the reasons'.
+        reasons: The worst first.
+        score: How much of all verified matches the model explains and how well, 0 to 1; for comparing two models of
+            the same view graph.
+        explained: Share of all verified matches that it explains.
+        held_out: The same of those among placed photos that are none of its own observations.
+        contradicted: Pairs whose matches it contradicts.
+        pairs: Pairs among placed photos.
+    """
+
+    level: Level
+    reasons: tuple[Reason, ...]
+    score: float
+    explained: float
+    held_out: float
+    contradicted: int
+    pairs: int
+
+    def as_json(self) -> JSON:
+        """For ``models.json``."""
+        told = [{"level": it.level, "kind": it.kind, "text": it.text, "hint": it.hint} for it in self.reasons]
+        return {"level": self.level, "reasons": told}
+
+
+def judge(
+    model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON], placeable: int | None = None
+) -> Judgement:
+    """Judge a model.
+
+    Args:
+        model: In any frame, with the keypoints of ``verified``.
+        verified: The view graph.
+        cameras: The camera groups of ``ingest.cameras``, for where their focal lengths are from; COLMAP's ids count
+            from 1 in their order.
+        placeable: Photos that the share of placed ones is counted of; all of them unless given.
+    """
+    agreement = compare(model, verified)
+    contradicts = contradicting(agreement)
+    placed = agreement.placed
+    reasons = [
+        *_placed(model, placeable or len(verified.names)),
+        *_focal_lengths(model, verified, cameras),
+        *_unexplained(agreement),
+        *_bent(agreement, contradicts, verified),
+    ]
+    reasons.sort(key=lambda reason: -LEVELS.index(reason.level))
+    return Judgement(
+        level=reasons[0].level if reasons else "good",
+        reasons=tuple(reasons),
+        score=_score(agreement),
+        explained=_share(agreement.explained, agreement.matches),
+        held_out=_share(agreement.held_out_explained[placed], agreement.held_out[placed]),
+        contradicted=int(contradicts.sum()),
+        pairs=int(placed.sum()),
+    )
+
+
+def contradicting(agreement: Agreement) -> Bool[np.ndarray, " n"]:
+    """Pairs of placed photos less than half of whose matches the model explains."""
+    enough = agreement.placed & (agreement.matches >= LEAST_MATCHES)
+    return np.asarray(enough & (2 * agreement.explained < agreement.matches))
+
+
+def is_trusted(camera: Mapping[str, JSON]) -> bool:
+    """Whether a camera group's focal length before mapping is worth holding a model against."""
+    return bool(camera.get("has_prior")) and camera.get("focal_source") in TRUSTED_SOURCES
+
+
+def _score(agreement: Agreement) -> float:
+    """Pairs count by the root of their matches: a bend shows in the wide ones, which have few."""
+    weights = np.sqrt(agreement.matches)
+    return _share(weights * agreement.closeness / np.maximum(agreement.matches, 1), weights)
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float:
+    total = float(whole.sum())
+    return float(part.sum()) / total if total > 0.0 else 0.0
+
+
+def _placed(model: pycolmap.Reconstruction, total: int) -> list[Reason]:
+    count = model.num_reg_images()
+    if count >= PLACED_GOOD * total:
+        return []
+    level: Level = "doubt" if count >= PLACED_DOUBT * total else "bad"
+    text = f"Only {count} of {total} photos could be placed: what the others show is missing."
+    hint = "Look at the photos that were left out: take more with overlap, or try --set matches.pairing=exhaustive."
+    return [Reason(level, text, hint, "placed")]
+
+
+def _focal_lengths(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[Reason]:
+    found = []
+    used = sorted({model.images[number].camera_id for number in model.reg_image_ids()})
+    for number in used:
+        camera, before, group = model.cameras[number], verified.cameras[number], cameras[number - 1]
+        focal, prior = camera.mean_focal_length(), before.mean_focal_length()
+        which = "The focal length" if len(used) == 1 else f"The focal length of camera {number}"
+        ratio = focal / max(camera.width, camera.height)
+        stray = max(focal / prior, prior / focal) - 1.0
+        doubt, bad = FOCAL_TRUSTED if is_trusted(group) else FOCAL_STATED
+        hint = "Heights and scale are off with it. Add oblique photos, or photos from a second height."
+        if not FOCAL_LONGER[0] <= ratio <= FOCAL_LONGER[1]:
+            text = f"{which} came out as {focal:.0f} pixels, {ratio:.2g} times the photo's longer side: no such lens."
+            found.append(Reason("bad", text, hint, "focal"))
+        elif before.has_prior_focal_length and stray > doubt:
+            text = f"{which} went from {prior:.0f} to {focal:.0f} pixels, {100 * (focal / prior - 1):+.0f} %."
+            if not is_trusted(group):
+                text += " What the metadata say of it is rough."
+            found.append(Reason("bad" if stray > bad else "doubt", text, hint, "focal"))
+    return found
+
+
+def _unexplained(agreement: Agreement) -> list[Reason]:
+    placed = agreement.placed
+    share = _share(agreement.explained[placed], agreement.matches[placed])
+    if share >= EXPLAINED_GOOD or not placed.any():
+        return []
+    level: Level = "doubt" if share >= EXPLAINED_DOUBT else "bad"
+    text = f"The cameras explain only {100 * share:.0f} % of the matches among the placed photos."
+    return [
+        Reason(
+            level, text, "Check that the photos are of one lens setting and of a scene that stood still.", "unexplained"
+        )
+    ]
+
+
+def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: Verified) -> list[Reason]:
+    """Contradictions that are more than the odd wrong match."""
+    count = int(contradicts.sum())
+    if count < FEW_PAIRS:
+        return []
+    pairs = int((agreement.placed & (agreement.matches >= LEAST_MATCHES)).sum())
+    holding = agreement.matches[agreement.placed & ~contradicts]
+    usual = float(np.median(holding)) if len(holding) else 0.0
+    strong = int((contradicts & (agreement.matches >= usual)).sum())
+    split = find_split(agreement, contradicts)
+    bad = count >= CONTRADICTED_BAD * pairs or (strong >= FEW_PAIRS and strong >= STRONG_BAD * pairs)
+    if not bad and split.ratio < SPLIT_DOUBT and count < CONTRADICTED_DOUBT * pairs:
+        return []
+    text = f"{count} of {pairs} pairs of photos contradict the cameras that were found"
+    if split.ratio >= SPLIT_BAD:
+        text += f": {_who(split, verified)} disagree with the others, so the model is bent or has something twice."
+    else:
+        text += ": the model may be bent, or things in it look alike."
+    hint = "Look at sparse.glb for things that stand there twice. Add photos that close the way round, or try"
+    hint += " --set sparse.mapper=global and --set matches.pairing=exhaustive."
+    return [Reason("bad" if bad or split.ratio >= SPLIT_BAD else "doubt", text, hint, "bent")]
+
+
+def _who(split: Split, verified: Verified) -> str:
+    names = [verified.names[number] for number in split.group]
+    if len(names) <= 2:
+        return " and ".join(names)
+    return f"{len(names)} photos ({names[0]}, {names[1]}, …)"

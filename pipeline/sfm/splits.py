@@ -1,0 +1,101 @@
+"""Two groups of cameras that disagree: the mark of a bent or ghosted model.
+
+Photos are the nodes of a graph whose edges are matches that the model explains (they pull together) and matches that it
+contradicts (they push apart). The cut is looked for along the smallest eigenvector of the signed Laplacian (Kunegis et
+al., Spectral analysis of signed graphs for clustering, SDM 2010), whose signs are two groups that agree within and
+contradict each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.sfm.agreement import Agreement
+
+MOST_MATCHES = 200  # of a pair that count: neighbours with thousands prove no more than that they are neighbours
+SMALLEST_GROUP = 2  # photos; one by itself is a wrong photo, not a bend
+SMALLEST_SHARE = 0.02  # of the photos
+DENSE = 600  # photos up to which all eigenvectors are computed
+STEPS = 300  # of the power iteration above
+LEAST_MATCHES_APART = 1.0  # what holds a group that nothing holds counts as
+
+
+@dataclass(frozen=True)
+class Split:
+    """The two groups that disagree most.
+
+    Attributes:
+        group: Image ids of the smaller.
+        ratio: Matches between the groups that contradict the model, to those that agree with it.
+    """
+
+    group: tuple[int, ...] = ()
+    ratio: float = 0.0
+
+
+def find_split(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> Split:
+    """The split of the placed photos with the largest ratio."""
+    numbers = np.unique(agreement.pairs[agreement.placed])
+    if not contradicts.any() or len(numbers) < 2 * SMALLEST_GROUP:
+        return Split()
+    agree, against = _weights(agreement, contradicts, numbers)
+    best = Split()
+    least = max(SMALLEST_GROUP, int(np.ceil(SMALLEST_SHARE * len(numbers))))
+    for order in (np.argsort(_eigenvector(agree, against), kind="stable"), *_detached(agree, against)):
+        held, contra = _crossing(agree, order), _crossing(against, order)
+        ratios = contra / np.maximum(held, LEAST_MATCHES_APART)
+        sizes = np.arange(1, len(order))
+        ratios[(sizes < least) | (len(order) - sizes < least)] = 0.0
+        at = int(np.argmax(ratios))
+        if ratios[at] > best.ratio:
+            first, second = order[: at + 1], order[at + 1 :]
+            group = first if len(first) <= len(second) else second
+            best = Split(tuple(sorted(int(numbers[row]) for row in group)), float(ratios[at]))
+    return best
+
+
+def _weights(
+    agreement: Agreement, contradicts: Bool[np.ndarray, " n"], numbers: np.ndarray
+) -> tuple[Float64[np.ndarray, "m m"], Float64[np.ndarray, "m m"]]:
+    """Matches that hold photos together, and those that contradict, as symmetric matrices."""
+    agree = np.zeros((len(numbers), len(numbers)))
+    against = np.zeros_like(agree)
+    rows = np.searchsorted(numbers, agreement.pairs[agreement.placed])
+    explained = np.minimum(agreement.explained[agreement.placed], MOST_MATCHES)
+    left = np.minimum((agreement.matches - agreement.explained)[agreement.placed], MOST_MATCHES)
+    wrong = contradicts[agreement.placed]
+    for matrix, values in ((agree, explained), (against, np.where(wrong, left, 0))):
+        np.add.at(matrix, (rows[:, 0], rows[:, 1]), values)
+        np.add.at(matrix, (rows[:, 1], rows[:, 0]), values)
+    return agree, against
+
+
+def _eigenvector(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray, "m m"]) -> Float64[np.ndarray, " m"]:
+    """Of the smallest eigenvalue of the signed Laplacian, normalised by degree."""
+    degree = np.maximum((agree + against).sum(axis=1), 1.0)
+    signed = (agree - against) / np.sqrt(degree[:, None] * degree[None, :])
+    if len(signed) <= DENSE:
+        vector = np.linalg.eigh(signed)[1][:, -1]
+    else:
+        vector = np.cos(np.arange(len(signed), dtype=np.float64))  # any start that is no eigenvector
+        for _ in range(STEPS):
+            vector = vector + signed @ vector
+            vector /= np.linalg.norm(vector)
+    return np.asarray(vector / np.sqrt(degree))
+
+
+def _detached(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray, "m m"]) -> list[np.ndarray]:
+    """Orders that begin with the photos that are contradicted most: a small ghosted group."""
+    held, contra = agree.sum(axis=1), against.sum(axis=1)
+    return [np.argsort(-contra / np.maximum(held + contra, 1.0), kind="stable")]
+
+
+def _crossing(weights: Float64[np.ndarray, "m m"], order: np.ndarray) -> Float64[np.ndarray, " k"]:
+    """Weight between the first k photos of an order and the others, for k from 1 to all but one."""
+    ordered = weights[np.ix_(order, order)]
+    before = np.tril(ordered, -1).sum(axis=1)  # to those that came earlier
+    after = np.triu(ordered, 1).sum(axis=1)
+    return np.asarray(np.cumsum(after - before)[:-1])
