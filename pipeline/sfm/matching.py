@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.parallel import watched
@@ -19,14 +20,27 @@ TILE = 16  # photos; pairs are matched tile by tile, so that a block needs few p
 BLOCK_PAIRS = 64  # COLMAP keeps as many photos' search trees in memory
 
 
+class StoredDescriptors(Sequence[UInt8[np.ndarray, "_ 128"]]):
+    """Those of each photo's largest keypoints, read when asked for, so that one photo's are in memory at a time."""
+
+    def __init__(self, database: pycolmap.Database) -> None:
+        self._database = database
+        self._count = int(database.num_images())
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, at: int) -> UInt8[np.ndarray, "_ 128"]:  # type: ignore[override]
+        if not 0 <= at < self._count:
+            raise IndexError(at)
+        stored = np.asarray(self._database.read_descriptors(at + 1).data, np.uint8)
+        return stored.reshape(-1, 128)[:PER_PHOTO]
+
+
 def look_alike(features: Path, seed: int) -> Costs:
+    """Costs from the descriptors that a database of features has."""
     with pycolmap.Database.open(features) as database:
-        count = database.num_images()
-        descriptors = [
-            np.asarray(database.read_descriptors(number).data, np.uint8).reshape(-1, 128)[:PER_PHOTO]
-            for number in range(1, count + 1)
-        ]
-    return look_alike_costs(descriptors, seed)
+        return look_alike_costs(StoredDescriptors(database), seed)
 
 
 def match_pairs(features: Path, work: Path, pairs: Sequence[Pair], seed: int, threads: int, report: Reporter) -> None:

@@ -24,11 +24,13 @@ def look_alike_costs(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: in
     """Costs from the photos' content: the negative similarity of their aggregated descriptors.
 
     Args:
-        descriptors: Of each photo, the largest keypoints first.
+        descriptors: Of each photo, the largest keypoints first; asked for twice, one after the other.
         seed: Of the codebook.
     """
     words = codebook(descriptors, seed)
-    vectors = np.stack([aggregate(photo[:PER_PHOTO], words) for photo in descriptors])
+    vectors = np.empty((len(descriptors), words.size), np.float32)
+    for row, photo in zip(vectors, descriptors, strict=True):
+        row[:] = aggregate(photo[:PER_PHOTO], words)
 
     def costs(i: int) -> Float64[np.ndarray, " n"]:
         return np.asarray(-(vectors @ vectors[i]), np.float64)
@@ -88,5 +90,5 @@ def _sums(
 
 
 def _spread(photo: UInt8[np.ndarray, "n 128"], wanted: int) -> UInt8[np.ndarray, "_ 128"]:
-    """At most ``wanted`` rows, evenly spread over all."""
-    return photo[:: max(1, -(-len(photo) // wanted))]
+    """At most ``wanted`` rows, evenly spread over all; copied, since a view would keep all of them in memory."""
+    return photo[:: max(1, -(-len(photo) // wanted))].copy()
