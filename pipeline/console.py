@@ -184,6 +184,22 @@ def show_outputs(out: Path, seconds: float, ran: int, metrics: Mapping[str, JSON
         console.print(f"[dim]Change an option, or --rerun a stage, to do more. Results: {escape(str(out))}[/]")
 
 
+def show_bad_cameras(verdict: Mapping[str, JSON]) -> None:
+    """The last and loudest words on a run whose cameras are wrong; nothing otherwise.
+
+    Args:
+        verdict: Of the stage `sparse`.
+    """
+    reasons = [reason for reason in verdict.get("reasons", []) if reason["level"] == "bad"]
+    if not reasons:
+        return
+    lines = ["Everything that was made from them is in doubt."]
+    for reason in reasons:
+        lines += [escape(reason["text"])] + ([f"[bold]→[/] {escape(reason['hint'])}"] if reason["hint"] else [])
+    panel = Panel("\n".join(lines), title="The cameras are bad", border_style="red")
+    Console(file=sys.stderr, highlight=False).print(panel)
+
+
 def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON]]) -> None:
     """The accuracy report as a table on stderr, and the surveyed points if they are few; nothing where there is none.
 

@@ -58,10 +58,12 @@ class Ending:
             say(f"{trouble.message} {trouble.hint}".strip())
 
     def _show(self, outcome: Outcome, seconds: float) -> None:
-        from splatpipe.pipeline.console import show_accuracy, show_outputs
+        from splatpipe.pipeline.console import show_accuracy, show_bad_cameras, show_outputs
 
         show_accuracy(*_accuracy(outcome))
         show_outputs(self._out, seconds, len(outcome.ran), _headline(outcome), self._files(outcome))
+        if "sparse" in outcome.artifacts:
+            show_bad_cameras(outcome.artifacts["sparse"].summary.get("verdict") or {})
 
     def _files(self, outcome: Outcome) -> list[Path]:
         from splatpipe.stages.line import LINE

@@ -27,8 +27,6 @@ from splatpipe.pipeline.sfm.verified import Verified
 
 Model: TypeAlias = pycolmap.Reconstruction
 
-STRAY = 0.1  # of a focal length from its prior: worth a warning
-
 
 def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write ``sparse/0``, normalised, and ``models.json``.
@@ -149,13 +147,10 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
     alone = sorted(set(left).difference(*summary["other_models"]))
     if alone:
         report.warning(f"{len(alone)} of {summary['photos']} photos could not be placed: {some(alone)}.")
-    for camera in summary["cameras"]:
-        if camera["has_prior"] and abs(camera["focal_px"] / camera["prior_focal_px"] - 1.0) > STRAY:
-            report.warning(
-                f"Calibration took the focal length from {camera['prior_focal_px']:.0f} to {camera['focal_px']:.0f}"
-                " pixels, more than 10 % from what the metadata say.",
-                hint="Heights and scale may be off: check them against known ones.",
-            )
+    for reason in summary["verdict"]["reasons"]:
+        if reason["kind"] != "placed":  # is told above, by name
+            bad = "The cameras are bad: " if reason["level"] == "bad" else ""
+            report.warning(f"{bad}{reason['text']}", reason["hint"])
     if any(row.get("focal_held") for row in summary["tried"] if row["chosen"]):
         report.warning(
             "Photos of flat ground from one height cannot tell the focal length: it is held to 3 % of the metadata's.",

@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 from splatpipe.demo import capture_path
+from splatpipe.pipeline.console import show_bad_cameras
 from splatpipe.pipeline.report import make_report, write_report
 from splatpipe.pipeline.report.holdings import open_holdings
 from splatpipe.pipeline.report.page import report_page
@@ -355,6 +356,29 @@ def test_the_verdict_follows_the_figures(
     rewrite(open_holdings(copy_of_run).part(part), change)
     found = next(finding for finding in judge(open_holdings(copy_of_run)).findings if said in finding.text)
     assert found.level == level
+
+
+def test_bad_cameras_are_the_first_words_of_page_and_console(
+    copy_of_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reason = {"level": "bad", "kind": "bent", "text": "40 of 90 pairs contradict it.", "hint": "Add photos."}
+    verdict = {"level": "bad", "reasons": [reason]}
+    rewrite(open_holdings(copy_of_run).part("sparse.summary"), lambda told: told.update(verdict=verdict))
+    told = judge(open_holdings(copy_of_run))
+    assert (told.level, told.headline) == ("bad", "The cameras are bad")
+    assert (told.findings[0].level, told.findings[0].text) == ("bad", "40 of 90 pairs contradict it. Add photos.")
+    show_bad_cameras(verdict)
+    assert re.search(
+        "The cameras are bad.*40 of 90 pairs contradict it.*Add photos", capsys.readouterr().err, re.DOTALL
+    )
+    show_bad_cameras({"level": "doubt", "reasons": [{**reason, "level": "doubt"}]})
+    assert capsys.readouterr().err == ""
+
+
+def test_the_page_tells_which_mappers_were_tried(copy_of_run: Path) -> None:
+    page = report_page(open_holdings(copy_of_run), drawn=False)
+    table = page[page.index("Ways of mapping that were tried") : page.index("Calibration</h3>")]
+    assert "incremental" in table and "taken" in table and "nan" not in table
 
 
 def test_a_broken_off_run_is_told_from_a_running_one(copy_of_run: Path) -> None:

@@ -78,6 +78,7 @@ def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapt
         "unregistered_more": max(0, len(unregistered) - MOST_LISTED),
         "other_models": models.get("other_models", []),
         "cameras": [_calibrated(camera) for camera in sparse.get("cameras", [])],
+        "tried": [_tried(row) for row in sparse.get("tried", [])],
     }
     if geometry is not None:
         chapter |= _registration_charts(holdings, geometry)
@@ -166,6 +167,24 @@ def _calibrated(camera: Mapping[str, Any]) -> dict[str, str]:
     told = f"{change:+.2%}".replace("%", " %") if math.isfinite(change) else "–"
     stated = f"{number(prior, 1)} px" if camera.get("has_prior") else "not stated"
     return {"model": str(camera.get("model", "")), "prior": stated, "focal": f"{number(focal, 1)} px", "change": told}
+
+
+def _tried(row: Mapping[str, Any]) -> dict[str, str]:
+    """A way of mapping that was tried; figures that it has not are dashes."""
+    against, pairs = row.get("contradicted") or (None, None)
+    return {
+        "how": str(row.get("how", row.get("mapper", ""))),
+        "placed": count(row.get("placed")),
+        "points": count(row.get("points3d")),
+        "error": number(row.get("error_px"), 2),
+        "focal": ", ".join(number(focal, 0) for focal in row.get("focal_px", [])) or "–",
+        "explained": share(row["explained"], 1) if "explained" in row else "–",
+        "held_out": share(row["held_out"], 1) if "held_out" in row else "–",
+        "against": "–" if against is None else f"{count(against)} of {count(pairs)}",
+        "cpu": number(row.get("cpu_s"), 1),
+        "taken": "taken" if row.get("chosen") else "",
+        "why": str(row.get("why", "")),
+    }
 
 
 def _masks(summary: Mapping[str, Any]) -> str:

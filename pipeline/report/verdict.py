@@ -22,6 +22,8 @@ FOCAL_GOOD = 0.05  # of the prior
 HORIZONTAL_GSDS, VERTICAL_GSDS = 2.0, 3.0  # root mean square at check points
 FEW_CHECKS = 3  # fewer prove little
 PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos, their exposure apart
+CAMERAS = "Cameras"
+CAMERAS_BAD = "The cameras are bad"
 FLOATING = 0.01  # share of what the views show
 
 
@@ -47,7 +49,7 @@ class Verdict:
 def judge(holdings: Holdings) -> Verdict:
     """Judge a run by what there is of it; what cannot be read is passed over, and told where it belongs."""
     findings: list[Finding] = []
-    for look in (_photos, _reprojection, _focal, _place, _splat, _views, _floaters):
+    for look in (_cameras, _photos, _reprojection, _focal, _place, _splat, _views, _floaters):
         try:
             findings += filter(None, [look(holdings)])
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -57,8 +59,11 @@ def judge(holdings: Holdings) -> Verdict:
     if told:
         stand = "it stands" if told == 1 else "they stand"
         findings.append(Finding("doubt", "Warnings", f"The run gave {plural(told, 'warning')}; {stand} below."))
-    if ended is not None:
+    wrong = next((it for it in findings if it.title == CAMERAS and it.level == "bad"), None)
+    if ended is not None and (ended.level == "bad" or wrong is None):
         return Verdict(ended.level, ended.title, ended.text, findings)
+    if wrong is not None:  # nothing that follows from them can be better
+        return Verdict("bad", CAMERAS_BAD, " ".join(filter(None, [text, ended.text if ended else ""])), findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
     if any(finding.level == "bad" for finding in doubtful):
         return Verdict("bad", "Finished, but with a serious shortcoming", text, findings)
@@ -110,6 +115,16 @@ def _far(holdings: Holdings) -> str:
     return f"It had come to {count(stage.reached)} of {count(total)} {unit}."
 
 
+def _cameras(holdings: Holdings) -> Finding | None:
+    """What the mapping holds of its own answer."""
+    told = holdings.read("sparse.summary").get("verdict") or {"level": "good"}
+    if told["level"] == "good":
+        return None
+    worst = [reason for reason in told["reasons"] if reason["level"] == told["level"]]
+    text = " ".join(f"{reason['text']} {reason['hint']}".strip() for reason in worst)
+    return Finding(told["level"], CAMERAS, text)
+
+
 def _photos(holdings: Holdings) -> Finding | None:
     sparse = holdings.summary("sparse")
     if not sparse:
@@ -127,7 +142,8 @@ def _reprojection(holdings: Holdings) -> Finding | None:
     if error is None:
         return None
     level: Level = "good" if error <= ERROR_GOOD_PX else "doubt" if error <= ERROR_DOUBT_PX else "bad"
-    told = {"good": "cameras and points agree", "doubt": "more than usual", "bad": "the cameras contradict each other"}
+    told = {"good": "points and what they were made of agree", "doubt": "more than usual"}
+    told["bad"] = "the cameras contradict each other"
     return Finding(level, "Reprojection error", f"{error:.2f} pixels on average: {told[level]}.")
 
 
