@@ -47,6 +47,7 @@ SPARSE = Stage(
     config=SparseConfig,
     reads=(
         "matches.database",
+        "matches.pairs",
         "features.database",
         "features.colours",
         "ingest.photos",

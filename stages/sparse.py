@@ -18,6 +18,7 @@ from splatpipe.pipeline.scene.dataset import some
 from splatpipe.pipeline.scene.photos import load_photo_list
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.judging import judge
+from splatpipe.pipeline.sfm.ladder import climb
 from splatpipe.pipeline.sfm.lens_model import stated_lenses
 from splatpipe.pipeline.sfm.lenses import calibrate, tell_lenses
 from splatpipe.pipeline.sfm.options import SparseConfig
@@ -36,7 +37,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     """
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         capture = _capture(inputs, Path(scratch))
-        found = reconstruct(capture, config, report)
+        found = climb(capture, reconstruct(capture, config, report), config, report)
         stated = stated_lenses(capture.cameras)
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
@@ -52,17 +53,21 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 
 
 def _capture(inputs: Inputs, scratch: Path) -> Capture:
+    photos = load_photo_list(inputs["ingest.photos"])
+    numbers = {photo.name: number for number, photo in enumerate(photos.photos, start=1)}
+    pairs = json.loads(inputs["matches.pairs"].read_text(encoding="utf-8"))["pairs"]
     return Capture(
         database=inputs["matches.database"],
         features=inputs["features.database"],
         colours=np.load(inputs["features.colours"]),
-        photos=load_photo_list(inputs["ingest.photos"]),
+        photos=photos,
         photos_part=inputs["ingest.photos"],
         photos_dir=inputs.photos_dir,
         positions=json.loads(inputs["ingest.positions"].read_text(encoding="utf-8"))["positions"],
         cameras=json.loads(inputs["ingest.cameras"].read_text(encoding="utf-8"))["cameras"],
         scratch=scratch,
         threads=inputs.machine.threads,
+        tried=frozenset((numbers[first], numbers[second]) for first, second, _ in pairs),
     )
 
 

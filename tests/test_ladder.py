@@ -12,10 +12,12 @@ import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.scene.photos import load_photo_list
-from splatpipe.pipeline.sfm.capture import Capture
+from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.ladder import Work, climb, settle, without
+from splatpipe.pipeline.sfm.ladder_joins import join
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs
 from splatpipe.pipeline.sfm.mapping import MappingOptions, map_incremental
-from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig
+from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.pipeline.sfm.verified import Verified, read_verified
 from splatpipe.stages import features, matches
 
@@ -94,3 +96,120 @@ def test_pairs_that_show_the_same_thing_are_proposed_and_hold(
     assert grown.matches.keys() == verified.matches.keys()
     for pair, rows in verified.matches.items():
         np.testing.assert_array_equal(grown.matches[pair], rows)
+
+
+def found_without(
+    capture: Capture, whole: tuple[pycolmap.Reconstruction, Verified], left: set[int], **more: object
+) -> Found:
+    """A model that lacks photos, on the view graph of a capture."""
+    verified = read_verified(capture.database)
+    model = without(whole[0], verified, left)
+    assert model.num_reg_images() == COUNT - len(left)
+    return Found(model, (), capture.database, verified, capture.colours, **more)
+
+
+def centre_errors(model: pycolmap.Reconstruction) -> dict[int, float]:
+    """Distance of each camera from the truth after a similarity fit, over the size of the scene."""
+    poses = corner_photos.poses(COUNT)
+    true = {number: -pose[:3, :3].T @ pose[:3, 3] for number, pose in enumerate(poses, start=1)}
+    placed = sorted(model.reg_image_ids())
+    fit = pycolmap.estimate_sim3d(
+        np.array([model.images[number].projection_center() for number in placed]), np.array([true[n] for n in placed])
+    )
+    size = np.linalg.norm(np.ptp(np.array(list(true.values())), axis=0))
+    return {n: float(np.linalg.norm(fit * model.images[n].projection_center() - true[n]) / size) for n in placed}
+
+
+def assert_all_right(found: Found, rung: str) -> None:
+    assert found.model.num_reg_images() == COUNT
+    assert max(centre_errors(found.model).values()) < 0.01  # small photos, focal length not known
+    assert [row["rung"] for row in found.rungs if row["placed"]] == [rung]
+    for number, places in found.verified.keypoints.items():
+        points = found.model.images[number].points2D
+        assert len(points) == len(places)
+        np.testing.assert_allclose([point.xy for point in points], places)
+    assert len(found.colours) == sum(len(places) for places in found.verified.keypoints.values())
+
+
+def test_photos_are_registered_to_the_finished_model(
+    room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]
+) -> None:
+    found = climb(room, found_without(room, whole, {1, 5}), SparseConfig(), corner_photos.Recorder())
+    assert_all_right(found, "registration")
+    assert found.model.num_points3D() > 0.9 * whole[0].num_points3D()
+
+
+def test_a_photo_without_pairs_gets_some(room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]) -> None:
+    capture = thinned(room, lambda i, j: 8 not in (i, j), "no pairs")
+    found = climb(capture, found_without(capture, whole, {8}), SparseConfig(), corner_photos.Recorder())
+    assert_all_right(found, "more pairs")
+    assert any(8 in pair for pair in found.verified.matches)
+
+
+def test_weak_keypoints_are_made_stronger(
+    room: Capture, whole: tuple[pycolmap.Reconstruction, Verified], tmp_path: Path
+) -> None:
+    weak = thinned(room, lambda i, j: 8 not in (i, j), "weak")
+    every = frozenset((i, j) for i in range(1, COUNT + 1) for j in range(i + 1, COUNT + 1))
+    capture = replace(weak, tried=every)
+    before = found_without(capture, whole, {8})
+    found = climb(capture, before, SparseConfig(), corner_photos.Recorder())
+    assert_all_right(found, "stronger keypoints")
+    assert found.rungs[-1]["keypoints_added"] == len(found.colours) - len(before.colours) > 0
+
+
+def test_sub_models_are_joined_over_what_they_share(
+    room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]
+) -> None:
+    model, verified = whole
+    first, second = without(model, verified, {5, 6, 7, 8}), without(model, verified, {1, 2, 3})
+    turn = pycolmap.Rotation3d(np.array([0.5, -0.5, 0.5, 0.5]))
+    second.transform(pycolmap.Sim3d(2.5, turn, np.array([3.0, -7.0, 11.0])))
+    united = join(first, second, verified, seed=0)
+    assert united is not None
+    assert united.num_reg_images() == COUNT
+    assert max(centre_errors(united).values()) < 0.01
+    apart = without(model, verified, {1, 2, 3, 4})
+    apart.transform(pycolmap.Sim3d(0.4, turn, np.array([3.0, -7.0, 11.0])))
+    found = climb(
+        room, Found(first, (apart,), room.database, verified, room.colours), SparseConfig(), corner_photos.Recorder()
+    )
+    assert_all_right(found, "registration")
+    assert found.others == ()
+
+
+def test_models_that_share_nothing_but_chance_stay_apart(
+    whole: tuple[pycolmap.Reconstruction, Verified],
+) -> None:
+    model, verified = whole
+    first, second = without(model, verified, {5, 6, 7, 8}), without(model, verified, {1, 2, 3, 4})
+    generator = np.random.default_rng(0)
+    shuffled = {
+        (i, j): np.column_stack([rows[:, 0], generator.permutation(rows[:, 1])]) if i <= 4 < j else rows
+        for (i, j), rows in verified.matches.items()
+    }
+    assert join(first, second, replace(verified, matches=shuffled), seed=0) is None
+
+
+def test_a_photo_of_another_place_is_not_placed(room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]) -> None:
+    """What it shows by chance matches nothing, but for a poster that hangs in the room as well."""
+    before = found_without(room, whole, {8})
+    generator = np.random.default_rng(0)
+    count = len(before.verified.keypoints[8])
+    matches = {pair: rows for pair, rows in before.verified.matches.items() if 8 not in pair}
+    for other in (4, 5, 6):
+        theirs = generator.permutation(len(before.verified.keypoints[other]))[:60]
+        matches[other, 8] = np.column_stack([theirs, generator.permutation(count)[:60]]).astype(np.uint32)
+    poster = [row for row in before.verified.matches[7, 8] if before.verified.keypoints[7][row[0]][0] < 160.0][:25]
+    assert len(poster) == 25
+    matches[7, 8] = np.array(poster, np.uint32)
+    wrong = replace(before, verified=replace(before.verified, matches=matches))
+    work = Work(room, MappingOptions(), corner_photos.Recorder())
+    assert settle(work, wrong).model.num_reg_images() == COUNT - 1
+
+
+def test_where_nothing_is_left_nothing_changes(room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]) -> None:
+    complete = Found(whole[0], (), room.database, whole[1], room.colours)
+    assert climb(room, complete, SparseConfig(), corner_photos.Recorder()) is complete
+    lacking = found_without(room, whole, {2})
+    assert climb(room, lacking, SparseConfig(ladder=False), corner_photos.Recorder()) is lacking

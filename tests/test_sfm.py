@@ -34,6 +34,7 @@ def run_line(inputs: Inputs, out: Path, threads: int = 1) -> tuple[dict[str, obj
         features__database=out / "features" / "database.db",
         features__colours=out / "features" / "colours.npy",
         matches__database=out / "matches" / "database.db",
+        matches__pairs=out / "matches" / "pairs.json",
     )
     matches.run(MatchesConfig(), inputs, out / "matches", recorder)
     return dict(sparse.run(SparseConfig(), inputs, out / "sparse", recorder)), recorder

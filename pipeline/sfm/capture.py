@@ -30,6 +30,7 @@ class Capture:
         cameras: The camera groups of ``ingest.cameras``; the camera of group 0 has COLMAP's id 1.
         scratch: An existing folder for temporary files.
         threads: That may work at a time; the answer does not depend on it.
+        tried: Pairs of photos that were matched, (i, j), i < j, COLMAP's numbers, whether anything held or not.
     """
 
     database: Path
@@ -42,6 +43,7 @@ class Capture:
     cameras: Sequence[JSON]
     scratch: Path
     threads: int = 1
+    tried: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ def complete(
     database: Path,
     options: pycolmap.IncrementalPipelineOptions,
     stop: pycolmap.CancellationToken,
+    place_left: bool = True,
 ) -> None:
     """Bring all verified matches into a model, in place, and adjust it to convergence, on one thread.
 
@@ -32,6 +33,7 @@ def complete(
         database: Whose keypoint indices the model refers to.
         options: The mapper's, with its seeds.
         stop: Ends an adjustment early.
+        place_left: Place photos that only all matches can place; the ladder has demands of its own.
     """
     cache_options = pycolmap.DatabaseCacheOptions()
     cache_options.min_num_matches = LEAST_MATCHES
@@ -43,7 +45,8 @@ def complete(
     for number in sorted(model.reg_image_ids()):
         mapper.triangulate_image(triangulation, number)
     mapper.complete_and_merge_tracks(triangulation)
-    _place_left(mapper, mapping, triangulation)
+    if place_left:
+        _place_left(mapper, mapping, triangulation)
     _adjust(mapper, options, stop, rough=True)
     mapper.filter_points(mapping)
     triangulation.complete_max_reproj_error = STRICT_PX

@@ -166,7 +166,7 @@ def match_more(capture: Capture, base: Path, pairs: Sequence[Pair], seed: int, r
 
 
 def take_verified(work: Path, target: Path, starts: dict[int, int] | None = None) -> int:
-    """Put the two-view geometries of one database into another, in place of what is there for their pairs.
+    """Put the verified matches of one database into another, in place of those of the same keypoints.
 
     Args:
         work: Where pairs were matched.
@@ -183,21 +183,22 @@ def take_verified(work: Path, target: Path, starts: dict[int, int] | None = None
         for pair_id, geometry in sorted(zip(numbers, geometries, strict=True), key=lambda entry: entry[0]):
             i, j = pycolmap.pair_id_to_image_pair(pair_id)
             rows = np.asarray(geometry.inlier_matches, np.uint32).reshape(-1, 2)
+            if len(rows) == 0 and database.exists_two_view_geometry(i, j):
+                continue
             held += len(rows) > 0
+            rows = rows + np.array([starts.get(i, 0), starts.get(j, 0)], np.uint32)
             if database.exists_two_view_geometry(i, j):
                 if starts:
                     before = np.asarray(database.read_two_view_geometry(i, j).inlier_matches, np.uint32)
-                    rows = np.concatenate([before.reshape(-1, 2), rows + np.array([starts[i], starts[j]], np.uint32)])
-                    geometry.inlier_matches = rows
+                    rows = np.concatenate([before.reshape(-1, 2), rows])
                 database.delete_two_view_geometry(i, j)
-            elif starts:
-                geometry.inlier_matches = rows + np.array([starts[i], starts[j]], np.uint32)
+            geometry.inlier_matches = rows
             database.write_two_view_geometry(i, j, geometry)
     return held
 
 
 def tried_pairs(database: Path) -> set[Pair]:
-    """Pairs that were matched, whether anything held or not."""
+    """Pairs whose matches a database has, whether anything held or not; `matches` leaves only those that held."""
     with pycolmap.Database.open(database) as opened:
         numbers, _ = opened.read_two_view_geometries()
     return {tuple(sorted(pycolmap.pair_id_to_image_pair(number))) for number in numbers}

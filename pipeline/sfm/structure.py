@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.sfm.verified import Verified
 
 Track = list[tuple[int, int]]
-"""Photo and keypoint of each observation, sorted, each photo at most once."""
+"""Photo and keypoint of each observation, sorted."""
 
 
 @dataclass(frozen=True)

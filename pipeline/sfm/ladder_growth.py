@@ -1,0 +1,53 @@
+"""What follows when photos were added to a model: points from their matches, and how it went."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from splatpipe.pipeline.sfm.completion import LEAST_MATCHES
+from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
+
+LEAST_OBSERVATIONS = 15  # of a photo that was added, once everything is adjusted
+
+
+class Growth:
+    """COLMAP's mapper over a model that is there already; its database must hold the model's keypoints."""
+
+    def __init__(self, database: Path, model: pycolmap.Reconstruction, options: MappingOptions) -> None:
+        pycolmap.set_random_seed(options.seed)
+        self._options = incremental_options(options)
+        self._triangulation = self._options.get_triangulation()
+        self._triangulation.random_seed = options.seed
+        cache_options = pycolmap.DatabaseCacheOptions()
+        cache_options.min_num_matches = LEAST_MATCHES
+        with pycolmap.Database.open(database) as opened:
+            self._cache = pycolmap.DatabaseCache.create(opened, cache_options)
+        self._mapper = pycolmap.IncrementalMapper(self._cache)
+        self._mapper.begin_reconstruction(model)
+
+    def triangulate(self, photos: Sequence[int]) -> None:
+        """Make points of what placed photos' keypoints match, and lengthen tracks by them."""
+        for number in photos:
+            self._mapper.triangulate_image(self._triangulation, number)
+        self._mapper.complete_and_merge_tracks(self._triangulation)
+
+    def end(self) -> None:
+        """Take leave of the model, which is left whole."""
+        self._mapper.end_reconstruction(False)
+
+
+def observations(model: pycolmap.Reconstruction, photos: Collection[int]) -> dict[int, int]:
+    """Keypoints of each photo that observe a point."""
+    return {number: int(model.images[number].num_points3D) for number in sorted(photos)}
+
+
+def mean_error_px(model: pycolmap.Reconstruction) -> float:
+    """Mean reprojection error over all observations."""
+    model.update_point_3d_errors()
+    if model.num_points3D() == 0:
+        return float(np.inf)
+    return float(model.compute_mean_reprojection_error())

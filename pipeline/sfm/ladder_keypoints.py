@@ -1,0 +1,98 @@
+"""More and stronger keypoints for a few photos, appended to what they have: COLMAP's SIFT on larger pictures."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import UInt8
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.scene.parallel import ordered_map
+from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.keypoints import extract, single_threaded_opencv
+from splatpipe.pipeline.sfm.ladder_pairs import take_verified
+from splatpipe.pipeline.sfm.matching import match_pairs
+from splatpipe.pipeline.sfm.options import FeaturesConfig
+from splatpipe.pipeline.sfm.pairs import Pair
+from splatpipe.pipeline.sfm.reduction import copy_photos
+
+STRONGER = FeaturesConfig(extractor="sift", max_image_size=2400, max_features=12_288)
+"""Half as much again as what `standard` looks at, and half as many keypoints more."""
+
+
+@dataclass(frozen=True)
+class Strengthened:
+    """A database that has grown.
+
+    Attributes:
+        database: All keypoints: those of before, under their numbers, then the new ones.
+        colours: (n, 3) RGB of all of them, image after image.
+        keypoints: So many were added.
+    """
+
+    database: Path
+    colours: UInt8[np.ndarray, "_ 3"]
+    keypoints: int
+
+
+def strengthen(
+    capture: Capture,
+    found: Found,
+    photos: Sequence[int],
+    pairs: Sequence[Pair],
+    seed: int,
+    report: Reporter,
+) -> Strengthened:
+    """Find new keypoints in some photos, and match them among these.
+
+    New ones are matched with new ones only: an old and a new keypoint of one spot have nearly the same descriptor, and
+    each would spoil the other's ratio test.
+
+    Args:
+        capture: The photos' files.
+        found: The database so far, and its view graph; only read.
+        photos: COLMAP's numbers of those to look at again.
+        pairs: Of them, to be matched.
+        seed: Of the verification.
+        report: Told of the progress.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="keypoints-", dir=capture.scratch))
+    target, fresh, work = folder / "database.db", folder / "fresh.db", folder / "work.db"
+    shutil.copyfile(found.database, target)
+    ordered = sorted(photos)
+    starts = {number: len(found.verified.keypoints[number]) for number in ordered}
+    ends = np.cumsum([len(found.verified.keypoints[number]) for number in sorted(found.verified.keypoints)])
+    parts = np.split(found.colours, ends[:-1])
+    look = partial(
+        extract, config=STRONGER, part=capture.photos_part, photos_dir=capture.photos_dir, scratch=capture.scratch
+    )
+    added = 0
+    with (
+        single_threaded_opencv(),
+        pycolmap.Database.open(found.database) as source,
+        pycolmap.Database.open(fresh) as database,
+        pycolmap.Database.open(target) as grown,
+    ):
+        copy_photos(source, database)
+        kind = pycolmap.FeatureExtractorType.SIFT
+        looks = ordered_map(look, [capture.photos.photos[number - 1] for number in ordered], capture.threads)
+        for done, (number, features) in enumerate(zip(ordered, looks, strict=True), start=1):
+            database.update_keypoints(number, features.keypoints)
+            database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, features.descriptors))
+            before = np.asarray(source.read_keypoints(number), np.float32).reshape(-1, features.keypoints.shape[1])
+            grown.update_keypoints(number, np.concatenate([before, features.keypoints]))
+            parts[number - 1] = np.concatenate([parts[number - 1], features.colours])
+            added += len(features.keypoints)
+            report.progress(done, len(ordered), "stronger keypoints for photos that are left", "photos")
+    match_pairs(fresh, work, [(i - 1, j - 1) for i, j in sorted(pairs)], seed, capture.threads, report)
+    take_verified(work, target, starts)
+    for path in (fresh, work):
+        path.unlink()
+    return Strengthened(target, np.concatenate(parts), added)

@@ -1,0 +1,98 @@
+"""Whom a photo that was left may share things with: by matches, by what placed photos show, by position, by look."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from itertools import zip_longest
+
+import numpy as np
+
+from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.ladder_poses import partners_of
+from splatpipe.pipeline.sfm.layout import make_layout
+from splatpipe.pipeline.sfm.matching import look_alike
+from splatpipe.pipeline.sfm.pairs import Costs, Pair, positions_tell, spatial_costs
+from splatpipe.pipeline.sfm.structure import read_structure
+
+Ranked = dict[int, list[int]]
+"""For photos that are left, others that may show the same, the likeliest first."""
+
+LOOKED_AT = 100  # of a ranking; nobody asks for more
+
+
+def rank_partners(capture: Capture, found: Found, left: Collection[int], seed: int) -> Ranked:
+    """The likeliest of each kind of hint in turn: placed photos, or photos of another model than their own.
+
+    Args:
+        capture: Positions and descriptors.
+        found: The model and its view graph.
+        left: Photos that are not placed.
+        seed: Of the comparison of looks.
+    """
+    placed = set(found.model.reg_image_ids())
+    groups = [set(other.reg_image_ids()) for other in found.others]
+    hints = [by_matches(found, left, placed), by_model(found, left, placed)]
+    layout = make_layout(capture.photos.photos, capture.positions)
+    if positions_tell(layout):
+        hints.append(_by_costs(left, spatial_costs(layout)))
+    hints.append(_by_costs(left, look_alike(capture.features, seed)))
+    ranked: Ranked = {}
+    for photo in sorted(left):
+        own = {member for group in groups if photo in group for member in group}
+        wanted = placed.union(*groups) - own - {photo}
+        turns = zip_longest(*(hint.get(photo, []) for hint in hints))
+        ranked[photo] = list(dict.fromkeys(other for turn in turns for other in turn if other in wanted))
+    return ranked
+
+
+def by_matches(found: Found, left: Collection[int], placed: Collection[int]) -> Ranked:
+    """Those with verified matches, the most of them first."""
+    ranked = {}
+    for photo in sorted(left):
+        shared = [(-len(mine), partner) for partner, mine, _ in partners_of(found.verified, photo) if partner in placed]
+        ranked[photo] = [partner for _, partner in sorted(shared)]
+    return ranked
+
+
+def by_model(found: Found, left: Collection[int], placed: Collection[int]) -> Ranked:
+    """Those that share points with placed photos with which the photo has verified matches."""
+    tracks = read_structure(found.model).tracks
+    rows: dict[int, list[int]] = {}
+    for row, track in enumerate(tracks):
+        for member, _ in track:
+            rows.setdefault(member, []).append(row)
+    ranked = {}
+    for photo in sorted(left):
+        counts: Counter[int] = Counter()
+        for partner, _, _ in partners_of(found.verified, photo):
+            if partner in placed:
+                counts.update(member for row in rows.get(partner, []) for member, _ in tracks[row])
+        ranked[photo] = sorted(counts, key=lambda member: (-counts[member], member))[:LOOKED_AT]
+    return ranked
+
+
+def choose_pairs(ranked: Ranked, avoided: Collection[Pair], most: int) -> list[Pair]:
+    """Each photo with its likeliest partners.
+
+    Args:
+        ranked: Partners by photo.
+        avoided: (i, j), i < j, not to be chosen.
+        most: Pairs of a photo.
+    """
+    chosen: set[Pair] = set()
+    for photo, partners in ranked.items():
+        pairs = [(min(photo, partner), max(photo, partner)) for partner in partners]
+        chosen |= set([pair for pair in pairs if pair not in avoided][:most])
+    return sorted(chosen)
+
+
+def _by_costs(left: Collection[int], costs: Costs) -> Ranked:
+    """Those of least cost, where it is known."""
+    ranked = {}
+    for photo in sorted(left):
+        row = costs(photo - 1).copy()
+        row[photo - 1] = np.inf
+        order: Sequence[int] = np.argsort(row, kind="stable")[:LOOKED_AT].tolist()
+        ranked[photo] = [other + 1 for other in order if np.isfinite(row[other])]
+    return ranked
