@@ -12,13 +12,14 @@ import argparse
 import io
 import json
 from datetime import datetime, timedelta
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .cameras import Lens, Pose, flight
+from .cameras import LENSES, Lens, Pose, flight
 from .geodesy import Origin
 from .mesh import Array
 from .metadata import Position, build_exif, build_xmp, position_attributes, with_metadata
@@ -82,7 +83,8 @@ def compress(photos: list[NDArray[np.uint8]]) -> list[bytes]:
 def render_all(scene: Renderer, poses: list[Pose], lens: Lens, spp: int, work: Path) -> list[Path]:
     """Render what is not there yet; returns the files with radiance as float16."""
     work.mkdir(parents=True, exist_ok=True)
-    files = [work / f"{pose.name}.{spp}.npy" for pose in poses]
+    tag = f"{spp}" if lens == Lens() else f"{spp}.{sha256(repr(lens).encode()).hexdigest()[:8]}"
+    files = [work / f"{pose.name}.{tag}.npy" for pose in poses]
     for number, (pose, file) in enumerate(zip(poses, files, strict=True)):
         if not file.exists():
             partial = file.with_suffix(".part.npy")
@@ -92,7 +94,7 @@ def render_all(scene: Renderer, poses: list[Pose], lens: Lens, spp: int, work: P
     return files
 
 
-def _flight_attributes(pose: Pose, barometer_m: float, rng: np.random.Generator) -> dict[str, str]:
+def _flight_attributes(pose: Pose, lens: Lens, barometer_m: float, rng: np.random.Generator) -> dict[str, str]:
     """DJI's XMP about angles and height; angles to 0.1 degrees with the gimbal's own error."""
     yaw, pitch, roll = np.array([pose.yaw_deg, pose.pitch_deg, pose.roll_deg]) + rng.normal(0, 0.2, 3)
     flight_yaw = yaw + rng.normal(0, 1.0)
@@ -110,9 +112,9 @@ def _flight_attributes(pose: Pose, barometer_m: float, rng: np.random.Generator)
         "FlightPitchDegree": f"{rng.normal(0, 2):+.2f}",
         "CamReverse": "0",
         "GimbalReverse": "0",
-        "CalibratedFocalLength": f"{CALIBRATED_FOCAL_PX:.6f}",
-        "CalibratedOpticalCenterX": "600.000000",
-        "CalibratedOpticalCenterY": "450.000000",
+        "CalibratedFocalLength": f"{CALIBRATED_FOCAL_PX * lens.width / Lens.width:.6f}",
+        "CalibratedOpticalCenterX": f"{lens.width / 2:.6f}",
+        "CalibratedOpticalCenterY": f"{lens.height / 2:.6f}",
         "DewarpFlag": "0",
     }
 
@@ -140,7 +142,7 @@ def write_photos(
         )
         position = Position(*(float(x) for x in fixes[k]))
         exif = build_exif((lens.width, lens.height), taken, 2 ** exposures[k] / 640, position)
-        xmp = build_xmp(taken, {**_flight_attributes(pose, barometer[k], rng), **position_attributes(position)})
+        xmp = build_xmp(taken, {**_flight_attributes(pose, lens, barometer[k], rng), **position_attributes(position)})
         (out / "photos" / pose.name).write_bytes(with_metadata(jpeg, exif, xmp))
         entries.append(
             {
@@ -206,8 +208,10 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="folder that keeps the renders")
     parser.add_argument("--out", type=Path, required=True, help="folder of the capture")
     parser.add_argument("--spp", type=int, default=64, help="paths a pixel")
+    parser.add_argument("--lens", choices=sorted(LENSES), default="simple", help="brown: one like the DJI P1's")
+    parser.add_argument("--size", type=float, default=1.0, help="of the photos, over 1200 x 900")
     arguments = parser.parse_args()
-    lens, origin, poses = Lens(), Origin(), flight()
+    lens, origin, poses = LENSES[arguments.lens]().scaled(arguments.size), Origin(), flight()
     scene = build_scene()
     renderer = Renderer(scene)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -225,10 +229,7 @@ def main() -> None:
             "heights": "above the WGS84 ellipsoid, in the EXIF, too",
         },
         "camera": {
-            "model": "SIMPLE_RADIAL",
-            "width": lens.width,
-            "height": lens.height,
-            "params": [lens.f, lens.cx, lens.cy, lens.k],
+            **lens.colmap(),
             "pixels": "the centre of the first pixel is (0.5, 0.5)",
         },
         "sigmas": {

@@ -101,8 +101,12 @@ class Renderer:
             number = dr.opaque(mi.UInt32, sample)
             dr.make_opaque(shift)
             xd, yd = (px + shift.x - lens.cx) / lens.f, (py + shift.y - lens.cy) / lens.f
-            scale = _undistort_scale(dr.sqrt(xd * xd + yd * yd), lens.k)
-            ray = mi.Ray3f(origin, dr.normalize(rotation @ mi.Vector3f(xd * scale, yd * scale, 1.0)))
+            if lens.is_simple:
+                scale = _undistort_scale(dr.sqrt(xd * xd + yd * yd), lens.k)
+                x, y = xd * scale, yd * scale
+            else:
+                x, y = lens.undistort(xd, yd)
+            ray = mi.Ray3f(origin, dr.normalize(rotation @ mi.Vector3f(x, y, 1.0)))
             radiance = self._path(ray, index, number, dr.opaque(mi.UInt32, seed))
             total += np.array(dr.minimum(radiance, RADIANCE_CAP)).T
         return np.asarray(total.reshape(lens.height, lens.width, 3) / spp, np.float32)

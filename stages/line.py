@@ -17,13 +17,22 @@ from splatpipe.stages.options import (
 
 INGEST = Stage(
     "ingest",
-    version=1,
+    version=2,
     config=IngestConfig,
-    reads=("source.photos", "source.geo"),
-    parts={"photos": "photos", "cameras": "cameras.json", "positions": "positions.json", "left_out": "left_out.json"},
+    reads=("source.photos", "source.geo", "source.lens"),
+    parts={
+        "photos": "photos",
+        "cameras": "cameras.json",
+        "lenses": "lenses.json",
+        "positions": "positions.json",
+        "left_out": "left_out.json",
+    },
     entry="splatpipe.stages.ingest:run",
     borrows=("georef.approximate_crs",),
-    files={"positions": NamedFile("source.geo", ("geo.txt", "positions.csv"))},
+    files={
+        "positions": NamedFile("source.geo", ("geo.txt", "positions.csv")),
+        "lens": NamedFile("source.lens", ("lens.xml", "lens.txt", "lens.cam")),
+    },
 )
 FEATURES = Stage(
     "features",
@@ -53,6 +62,7 @@ SPARSE = Stage(
         "ingest.photos",
         "ingest.positions",
         "ingest.cameras",
+        "ingest.lenses",
     ),
     parts={"model": "sparse/0", "summary": "models.json"},
     entry="splatpipe.stages.sparse:run",

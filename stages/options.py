@@ -31,6 +31,10 @@ class IngestConfig(StageConfig):
     positions: str = "auto"
     """File of the photos' positions, over what these say: `geo.txt` (ODM) or a CSV with a header. `auto`: `geo.txt` or
     `positions.csv` in the photo folder or beside it; `none`: only what the photos say."""
+    lens: str = "auto"
+    """File of a calibrated lens, or several: COLMAP's `cameras.txt`, Metashape's XML, Pix4D's `.cam` or
+    `calibrated_camera_parameters.txt`. `auto`: `lens.xml`, `lens.txt` or `lens.cam` in the photo folder or beside it;
+    `none`: only what the photos say. `sparse.lens` tells whether it is refined or held."""
 
 
 class GeorefConfig(StageConfig):

@@ -38,7 +38,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         capture = _capture(inputs, Path(scratch))
         found = climb(capture, reconstruct(capture, config, report), config, report)
-        stated = stated_lenses(capture.cameras)
+        stated = stated_lenses(json.loads(inputs["ingest.lenses"].read_text(encoding="utf-8"))["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
     model = canonical(found.model, found.colours, _keypoint_counts(found.verified))

@@ -75,11 +75,20 @@ class Result:
         return decode_mask(self.photos[name], self.out / "photos")
 
 
-def ingest(folder: Path, threads: int = 2, out: str = "out", geo: Path | None = None, **options: object) -> Result:
+def ingest(
+    folder: Path,
+    threads: int = 2,
+    out: str = "out",
+    geo: Path | None = None,
+    lens: Path | None = None,
+    **options: object,
+) -> Result:
     target = folder.parent / out
     target.mkdir()
     notes = Notes()
-    inputs = Inputs({"source.geo": geo or folder.parent / "no-geo.txt"}, folder, {}, Machine(threads=threads))
+    absent = folder.parent / "no-such-file.txt"
+    sources = {"source.geo": geo or absent, "source.lens": lens or absent}
+    inputs = Inputs(sources, folder, {}, Machine(threads=threads))
     summary = run(IngestConfig(**options), inputs, target, notes)
     return Result(summary, target, folder, notes.warnings)
 
@@ -684,6 +693,50 @@ def test_dewarped_photos_are_another_camera_and_a_false_calibration_is_told(fold
     cameras = {name: photo.camera for name, photo in result.photos.items()}
     assert cameras["c.jpg"] == cameras["e.jpg"] == cameras["f.jpg"] != cameras["d.jpg"]
     assert any("calibrated focal length in f.jpg is far" in warning for warning in result.warnings)
+
+
+DEWARP = "2018-03-13;2359.78,2353.17,-7.71,45.9,-0.269478,0.115681,-0.0000875619,-0.000306177,-0.0357628"
+
+
+def test_a_dewarp_calibration_is_a_stated_lens_unless_the_drone_has_applied_it(folder: Path) -> None:
+    for name, values in {"c.jpg": {"DewarpFlag": 0}, "d.jpg": {"DewarpFlag": 1}}.items():
+        exif = drone_exif()
+        save(folder / name, 3 + (name == "d.jpg"), exif=exif, xmp=xmp_of(DewarpData=DEWARP, **values))
+    result = ingest(folder)
+    lenses = result.json("lenses.json")["lenses"]
+    photos, groups = result.photos, result.json("cameras.json")["cameras"]
+    lens, group = lenses[photos["c.jpg"].camera], groups[photos["c.jpg"].camera]
+    assert lenses[photos["a.jpg"].camera] is None and lenses[photos["d.jpg"].camera] is None
+    assert (lens["model"], lens["source"], lens["width"], lens["height"]) == ("FULL_OPENCV", "xmp-dewarp", 400, 300)
+    scale = group["focal_px"] / (0.5 * (2359.78 + 2353.17))
+    assert lens["params"][:4] == pytest.approx(
+        [scale * 2359.78, scale * 2353.17, 200 - scale * 7.71, 150 + scale * 45.9]
+    )
+    assert lens["params"][4:] == [-0.269478, 0.115681, -0.0000875619, -0.000306177, -0.0357628, 0.0, 0.0, 0.0]
+    assert (group["focal_source"], group["has_prior"], group["model"]) == ("xmp-dewarp", True, "SIMPLE_RADIAL")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "x", "2018;1,2,3", DEWARP.replace("2359.78", "nan"), DEWARP.replace("-7.71", "1e9")]
+)
+def test_a_broken_dewarp_calibration_is_none(folder: Path, text: str) -> None:
+    save(folder / "c.jpg", 3, exif=drone_exif(), xmp=xmp_of(DewarpFlag=0, DewarpData=text))
+    assert set(map(str, ingest(folder).json("lenses.json")["lenses"])) == {"None"}
+
+
+def test_a_given_lens_is_scaled_to_the_photos_and_refused_for_others(folder: Path) -> None:
+    path = folder.parent / "lens.txt"
+    path.write_text("1 OPENCV 4000 3000 3600 3600 2010 1490 -0.1 0.02 0.001 -0.002\n")
+    result = ingest(folder, lens=path)
+    lens, group = (result.json(f"{name}.json")[name][0] for name in ("lenses", "cameras"))
+    assert lens["params"] == [360.0, 360.0, 201.0, 149.0, -0.1, 0.02, 0.001, -0.002]
+    assert (group["focal_px"], group["focal_source"]) == (360.0, "lens-file")
+    path.write_text("1 OPENCV 4000 2000 3600 3600 2010 1000 -0.1 0.02 0.001 -0.002\n")
+    with pytest.raises(SplatpipeError, match=r"4000 × 2000.*400 × 300"):
+        ingest(folder, out="other", lens=path)
+    path.write_text("1 PINHOLE 400 300 360 360 200 150\n2 PINHOLE 400 300 380 380 200 150\n")
+    with pytest.raises(SplatpipeError, match="2 lenses"):
+        ingest(folder, out="two", lens=path)
 
 
 CALIBRATED = {"drone-dji:CalibratedFocalLength": "2300.0"}

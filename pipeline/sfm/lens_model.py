@@ -47,7 +47,7 @@ class StatedLens:
 
     Attributes:
         model: COLMAP's camera model.
-        width: Of the pictures that ``params`` are about, pixels.
+        width: Of the pictures that ``params`` are about, in their unit: pixels, once it is fitted to photos.
         height: Likewise.
         params: COLMAP's, pixels; the centre of the first pixel is (0.5, 0.5).
         source: ``file``, ``xmp-dewarp``.
@@ -55,8 +55,8 @@ class StatedLens:
     """
 
     model: str
-    width: int
-    height: int
+    width: int | float
+    height: int | float
     params: tuple[float, ...]
     source: str
     camera: str = ""
@@ -64,18 +64,19 @@ class StatedLens:
     def colmap(self, number: int = 1) -> pycolmap.Camera:
         """COLMAP's camera of it."""
         return pycolmap.Camera(
-            camera_id=number, model=self.model, width=self.width, height=self.height, params=list(self.params)
+            camera_id=number,
+            model=self.model,
+            width=round(self.width),
+            height=round(self.height),
+            params=list(self.params),
         )
 
 
-def stated_lenses(groups: Sequence[JSON]) -> dict[int, StatedLens]:
-    """What ``ingest.cameras`` has of stated lenses, in each group's pixels, by COLMAP's camera id."""
-    found = ((number, group.get("lens")) for number, group in enumerate(groups, start=1))
+def stated_lenses(lenses: Sequence[JSON]) -> dict[int, StatedLens]:
+    """What the part ``ingest.lenses`` has, in each camera group's pixels, by COLMAP's camera id."""
     return {
-        number: StatedLens(
-            lens["model"], lens["width"], lens["height"], tuple(lens["params"]), lens["source"], lens["camera"]
-        )
-        for number, lens in found
+        number: StatedLens(**{**lens, "params": tuple(lens["params"])})
+        for number, lens in enumerate(lenses, start=1)
         if lens is not None
     }
 

@@ -25,11 +25,13 @@ from splatpipe.pipeline.scene.photos import (
     photo_root,
     save_photo_list,
 )
+from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.stages.ingest.cameras import CameraGroup, cameras_json, group_cameras, refused_calibrations
 from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
 from splatpipe.stages.ingest.convert import convert_photo, save_png, scale_of
 from splatpipe.stages.ingest.doubts import FAR_M, median_distance_m
 from splatpipe.stages.ingest.duplicates import split_duplicates
+from splatpipe.stages.ingest.lenses import lenses_json, state_lenses
 from splatpipe.stages.ingest.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
 from splatpipe.stages.ingest.positions import (
     DATUM_STEP_M,
@@ -95,6 +97,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         _require_photos(inputs.photos_dir, scan, photos, left_out)
         _tell_left_out(left_out, report)
         groups, camera_of = group_cameras(photos)
+        groups, lenses = _lenses(inputs, groups, camera_of, photos, report)
         opacity = _convert(photos, camera_of, work)
         others = [entry.name for entry in left_out]
         masked = _mask(_MASKS, root, photos, others, opacity, work)
@@ -106,6 +109,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         _tell_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
     _write_json(out / "cameras.json", cameras_json(groups))
+    _write_json(out / "lenses.json", lenses_json(lenses))
     _write_json(out / "positions.json", positions_json(positions))
     _write_json(out / "left_out.json", {"left_out": [{"name": e.name, "reason": e.reason} for e in left_out]})
     return {
@@ -247,6 +251,23 @@ def _tell_left_out(left_out: Sequence[LeftOut], report: Reporter) -> None:
         by_reason.setdefault(entry.reason, []).append(entry.name)
     for reason, names in by_reason.items():
         report.warning(f"Left out: {_names(names)} {reason}.")
+
+
+def _lenses(
+    inputs: Inputs,
+    groups: Sequence[CameraGroup],
+    camera_of: Mapping[str, int],
+    photos: Sequence[CheckedPhoto],
+    report: Reporter,
+) -> tuple[list[CameraGroup], list[StatedLens | None]]:
+    """The groups with the lenses that are stated; a given model has its own."""
+    if colmap_model(inputs.photos_dir) is not None:
+        return list(groups), [None] * len(groups)
+    members: dict[int, list[CheckedPhoto]] = {}
+    for photo in photos:
+        members.setdefault(camera_of[photo.name], []).append(photo)
+    path = inputs["source.lens"]
+    return state_lenses(groups, members, path if path.is_file() else None, report)
 
 
 def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) -> Mapping[str, FilePlace]:

@@ -91,7 +91,7 @@ def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> 
         width: Of the stored grid, pixels.
         height: Likewise.
     """
-    scale = _resize_scale(exif, width, height)
+    scale = picture_scale(exif, width, height)
     longer = max(width, height)
     aspect = longer / min(width, height)
     if aspect < PANORAMA and scale is not None:
@@ -172,7 +172,7 @@ def _group(photos: Sequence[CheckedPhoto]) -> CameraGroup:
     )
 
 
-def _resize_scale(exif: Exif, width: int, height: int) -> float | None:
+def picture_scale(exif: Exif, width: int, height: int) -> float | None:
     """Stored pixels per pixel of the picture that the camera took; None when the picture was cropped.
 
     A turn by 90° in between does not matter. Without a size in EXIF the picture counts as the camera's own.
