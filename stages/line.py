@@ -74,6 +74,7 @@ GEOREF = Stage(
     reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
     parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
     entry="splatpipe.stages.georef:run",
+    borrows=("sparse.lens",),
     files={"control": NamedFile("source.control", ("gcp_list.txt", "control.csv"))},
 )
 UNDISTORT = Stage(

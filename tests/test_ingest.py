@@ -695,7 +695,7 @@ def test_dewarped_photos_are_another_camera_and_a_false_calibration_is_told(fold
     assert any("calibrated focal length in f.jpg is far" in warning for warning in result.warnings)
 
 
-DEWARP = "2018-03-13;2359.78,2353.17,-7.71,45.9,-0.269478,0.115681,-0.0000875619,-0.000306177,-0.0357628"
+DEWARP = "2018-03-13;2359.78,2353.17,-7.71,45.9,-0.069478,0.025681,-0.0000875619,-0.000306177,-0.0057628"
 
 
 def test_a_dewarp_calibration_is_a_stated_lens_unless_the_drone_has_applied_it(folder: Path) -> None:
@@ -712,7 +712,7 @@ def test_a_dewarp_calibration_is_a_stated_lens_unless_the_drone_has_applied_it(f
     assert lens["params"][:4] == pytest.approx(
         [scale * 2359.78, scale * 2353.17, 200 - scale * 7.71, 150 + scale * 45.9]
     )
-    assert lens["params"][4:] == [-0.269478, 0.115681, -0.0000875619, -0.000306177, -0.0357628, 0.0, 0.0, 0.0]
+    assert lens["params"][4:] == [-0.069478, 0.025681, -0.0000875619, -0.000306177, -0.0057628, 0.0, 0.0, 0.0]
     assert (group["focal_source"], group["has_prior"], group["model"]) == ("xmp-dewarp", True, "SIMPLE_RADIAL")
 
 

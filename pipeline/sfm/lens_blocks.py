@@ -57,8 +57,11 @@ def hold(problem: Any, camera: pycolmap.Camera, held: list[int]) -> list[object]
 
 
 def keep_shape(problem: Any, camera: pycolmap.Camera, principal_point: bool = False) -> list[object]:
-    """Tie a camera's focal lengths, and hold its denominator and, unless it is free, its principal point."""
-    if not problem.has_parameter_block(camera.params):
+    """Tie a camera's focal lengths, and hold its denominator and, unless it is free, its principal point.
+
+    A camera of one focal length is as COLMAP has it.
+    """
+    if len(camera.focal_length_idxs()) != 2 or not problem.has_parameter_block(camera.params):
         return []
     held = [] if principal_point else list(camera.principal_point_idxs())
     held += DENOMINATOR.get(camera.model_name, ())

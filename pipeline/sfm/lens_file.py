@@ -29,6 +29,7 @@ MAX_DEPTH = 16
 MAX_ELEMENTS = 200_000  # Metashape's cameras.xml has some ten a photo
 MAX_CHARS = 200  # of a number, or a name that is kept
 HIGHEST_TERM_PX = 0.5  # what may be lost of a lens with terms that COLMAP has not, at worst
+INNER = 0.95  # of the picture: calibrations have no marks in the outermost corners
 CHECK_PX = 1000.0  # size of the picture that a lens is tried on
 LARGEST_COEFFICIENT = 100.0  # of distortion; a long lens has large ones, as r is small
 FORMATS = "COLMAP's cameras.txt, Metashape's calibration XML, or Pix4D's .cam or calibrated_camera_parameters.txt"
@@ -120,7 +121,10 @@ def checked_lens(lens: StatedLens) -> StatedLens:
     )
     assert pixels is not None
     camera = pixels.colmap()
-    x, y = np.meshgrid(np.linspace(0.0, camera.width, GRID), np.linspace(0.0, camera.height, GRID))
+    across, down = (
+        np.linspace(0.5 - INNER / 2, 0.5 + INNER / 2, GRID) * side for side in (camera.width, camera.height)
+    )
+    x, y = np.meshgrid(across, down)
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     rays = np.asarray(camera.cam_from_img(places), np.float64)
     back = np.asarray(camera.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], axis=1)), np.float64)

@@ -48,7 +48,8 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     controlled = None
     if inputs["source.control"].is_file():
         survey = load_survey(inputs["source.control"], config, photos, model, report)
-        capture = Capture(model, positions, photos, _focal_priors(inputs["ingest.cameras"], model, photos))
+        priors = _focal_priors(inputs["ingest.cameras"], model, photos)
+        capture = Capture(model, positions, photos, priors, inputs.settings.get("sparse.lens") == "held")
         try:
             controlled = place_by_control(survey, capture, None if isinstance(frame, str) else frame, config, report)
         except NoPlaceError as error:

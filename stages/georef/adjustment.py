@@ -22,6 +22,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
+from splatpipe.pipeline.sfm.lens_blocks import hold, keep_shape
 from splatpipe.stages.georef.place import Stations
 
 LEAST_SIGMA_PX = 1.0  # of features: they err together, in one photo, by lens and shutter; control should not
@@ -88,6 +89,7 @@ def adjust(
     targets: Sequence[Target],
     stations: tuple[Stations, Float64[np.ndarray, "n 3"], Sequence[int]],
     focal_priors: Mapping[int, float],
+    lenses_held: bool = False,
 ) -> Adjusted:
     """Adjust a model to control.
 
@@ -97,6 +99,7 @@ def adjust(
         targets: Control points.
         stations: The photos' positions, in the world, and COLMAP's ids of these photos.
         focal_priors: Focal lengths in the model's pixels by camera id, where the metadata know them.
+        lenses_held: Leave the lenses as they are.
     """
     model = pycolmap.Reconstruction(reconstruction)
     model.transform(
@@ -112,7 +115,11 @@ def adjust(
     for place, target in zip(places, targets, strict=True):
         blocks.add_target(model, place, target)
     offsets = _add_stations(blocks, model, stations)
-    _add_lens(blocks, model, focal_priors)
+    if lenses_held:
+        focal_priors = {}
+        blocks.kept += [hold(problem, camera, [*range(len(camera.params))]) for camera in _seen(problem, model)]
+    else:
+        _add_lens(blocks, model, focal_priors)
     solved = pyceres.SolverSummary()
     pyceres.solve(solver_options(len(model.reg_image_ids())), problem, solved)
     focal_sigmas = posterior_focal_sigmas(model, problem)
@@ -234,6 +241,11 @@ def _add_stations(
     return offsets
 
 
+def _seen(problem: Any, model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
+    """The cameras that a problem is about, by id."""
+    return [camera for _, camera in sorted(model.cameras.items()) if problem.has_parameter_block(camera.params)]
+
+
 def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Mapping[int, float]) -> None:
     """What the metadata and SfM know of lenses, so that what neither photos nor control tell stays there."""
     for number, camera in sorted(model.cameras.items()):
@@ -248,6 +260,7 @@ def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Map
         for index in camera.extra_params_idxs():
             sigmas[index] = DISTORTION_SIGMA
         blocks.add_prior(params, mean, sigmas)
+        blocks.kept += keep_shape(blocks.problem, camera)
 
 
 def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> float:

@@ -52,12 +52,14 @@ class Capture:
         positions: What the photos state.
         photos: All photos of the capture by name.
         focal_priors: What the metadata say, in the model's pixels, by COLMAP's camera id.
+        lenses_held: Whether the lenses stay as they are.
     """
 
     model: SparseModel
     positions: Positions
     photos: Mapping[str, Photo]
     focal_priors: Mapping[int, float]
+    lenses_held: bool = False
 
 
 @dataclass(frozen=True)
@@ -284,4 +286,5 @@ def _adjust(
         targets.append(Target(site.targets.enu[k], factor * site.targets.sigmas[k], place, marks, np.array(sigmas)))
     numbers = [model.image_ids[index] for index in site.stations.indices]
     stations = (site.stations, site.station_enu, numbers)
-    return adjust(model.reconstruction, result.placed.world_from_model, targets, stations, capture.focal_priors)
+    start = result.placed.world_from_model
+    return adjust(model.reconstruction, start, targets, stations, capture.focal_priors, capture.lenses_held)
