@@ -121,7 +121,8 @@ def write_capture(folder: Path, pictures: dict[str, np.ndarray], masks: dict[str
     (folder / "cameras.json").write_text(json.dumps({"cameras": [group]}))
     (folder / "positions.json").write_text(json.dumps({"positions": []}))
     parts = {"ingest.photos": part, "ingest.cameras": folder / "cameras.json"}
-    parts["ingest.positions"] = folder / "positions.json"
+    (folder / "lenses.json").write_text(json.dumps({"lenses": [None]}))
+    parts |= {name: folder / f"{name.split('.')[1]}.json" for name in ("ingest.positions", "ingest.lenses")}
     return Inputs(parts, photos_dir)
 
 
