@@ -38,8 +38,10 @@ class IngestConfig(StageConfig):
 
 
 class GeorefConfig(StageConfig):
-    max_position_error_m: PositiveFloat = 10.0
-    """Photo positions further than this from the robust fit are named and left out of it."""
+    max_position_error_m: Literal["auto"] | PositiveFloat = "auto"
+    """Photo positions further than this from the robust fit are named and left out of it. Auto: the positions' noise is
+    told from the residuals, and those that are off by far more are left out; poor positions place the model poorly, and
+    how poorly is told."""
     control: str = "auto"
     """File of control and check points: `gcp_list.txt` (ODM) or a CSV with a header. `auto`: `gcp_list.txt` or
     `control.csv` in the photo folder or beside it; `none`: no control."""

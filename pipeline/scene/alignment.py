@@ -9,8 +9,26 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from splatpipe.pipeline.scene.correspondences import LEAST_NOISE_FACTOR, Correspondences, DirectionPrior, Shared
-from splatpipe.pipeline.scene.similarity import Similarity, cross_matrix, fit_similarity, rotation_from_vector
+from splatpipe.pipeline.scene.correspondences import (
+    LEAST_NOISE_FACTOR,
+    REDUNDANT,
+    Correspondences,
+    DirectionPrior,
+    Limit,
+    Shared,
+    normed,
+)
+from splatpipe.pipeline.scene.similarity import (
+    FREE,
+    SIMILARITY,
+    Similarity,
+    cross_matrix,
+    fit_similarity,
+    moved_similarity,
+    rotation_from_vector,
+    similarity_jacobian,
+    solve_step,
+)
 
 __all__ = [
     "Correspondences",
@@ -28,13 +46,13 @@ LOCAL_ROUNDS = 5
 WEAK_ROTATION_RAD = math.radians(5.0)  # a rotation known less well takes a prior, where there is one
 IRLS_ROUNDS = 50
 IRLS_TOLERANCE = 1e-13  # of a step, in radians and relative to the extent
-FREE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: its direction is not determined
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
 OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors never are so large
+LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be found
+CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at some 1 in 10,000
 OUTLIER_SIGMAS = 3.0  # and an error within what the position states is none
 LEAST_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
-REDUNDANT = 8  # points from which on the residuals tell the noise better than the stated sigmas do
 MOST_GROUPS = 20  # whose triples are tried: one good group is enough
 
 
@@ -64,7 +82,9 @@ class SimilarityFit:
     offsets: Float64[np.ndarray, "g 3"]
 
 
-def robust_similarity(points: Correspondences, max_error: float, prior: DirectionPrior | None = None) -> SimilarityFit:
+def robust_similarity(
+    points: Correspondences, max_error: float | None, prior: DirectionPrior | None = None
+) -> SimilarityFit:
     """Fit a similarity to points of which some may be wrong.
 
     Triples give hypotheses (every triple of a small set, else 1000 from a fixed seed), scored by squared residuals cut
@@ -75,7 +95,8 @@ def robust_similarity(points: Correspondences, max_error: float, prior: Directio
 
     Args:
         points: At least 3, not all in one place.
-        max_error: Points further than this from the fit, in the target's units, are left out of it.
+        max_error: Points further than this from the fit, in the target's units, are left out of it. None: those that
+            are off by far more than the noise of at least half of the points, which is found.
         prior: Directions that take part where the points leave a rotation free by more than 5° (points on a line).
 
     Raises:
@@ -85,14 +106,18 @@ def robust_similarity(points: Correspondences, max_error: float, prior: Directio
         raise ValueError("a similarity needs at least 3 points")
     if not np.ptp(points.source, axis=0).any():
         raise ValueError("all points of the source coincide")
-    start = _consensus(points, max_error)
-    fit = _refine(start, points, max_error, None)
+    hypotheses = _hypotheses(points)
+    if max_error is None:
+        fit, limit = _at_own_noise(points, hypotheses)
+    else:
+        limit = Limit(max_error)
+        fit = _refine(_consensus(points, limit, hypotheses), points, limit, None)
     if prior is None or fit.sigma_rotation_rad <= WEAK_ROTATION_RAD:
         return fit
     chosen = points.only(fit.inliers) if fit.inliers.sum() >= 3 else points
     _, axis = _weakest_rotation(_information(_Problem(chosen, fit.similarity), _sigma_weights(chosen), None))
     start = turn_about_axis(fit.similarity, axis, chosen.target.mean(axis=0), prior)
-    return _refine(start, points, max_error, prior)
+    return _refine(start, points, limit, prior)
 
 
 def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: int) -> Float64[np.ndarray, "g 3"]:
@@ -146,67 +171,86 @@ class _Problem:
 
     def jacobian(self) -> Float64[np.ndarray, "n 3 7"]:
         """Of the transformed points."""
-        arms = self.arms
-        jacobian = np.zeros((len(arms), 3, 7))
-        jacobian[:, :, :3] = -cross_matrix(arms)
-        jacobian[:, :, 3] = arms
-        jacobian[:, :, 4:] = np.eye(3)
-        return jacobian
+        return similarity_jacobian(self.similarity, self.points.source)
 
     def moved(self, step: Float64[np.ndarray, " 7"]) -> Similarity:
         """The similarity after a step of the unknowns."""
-        mean = self.points.source.mean(axis=0)
-        centre = self.similarity.apply(mean[None])[0] + step[4:]
-        rotation = rotation_from_vector(step[:3]) @ self.similarity.rotation
-        scale = self.similarity.scale * math.exp(float(np.clip(step[3], -1.0, 1.0)))
-        return Similarity(scale, rotation, centre - scale * (rotation @ mean))
+        return moved_similarity(self.similarity, self.points.source, step)
 
 
-def _consensus(points: Correspondences, max_error: float) -> Similarity:
-    """The best hypothesis from triples; accurate points count more."""
-    importance = np.median(points.sigmas) / points.sigmas
-    weights = importance.mean(axis=1) ** 2
+def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tuple[SimilarityFit, Limit]:
+    """The fit of the least limit that does not cut into the noise which it shows, with half of the points or more.
+
+    A limit below the noise leaves points within it, spread up to it; their spread, counted by the degrees of freedom
+    that the fit leaves, says so. From some times the noise on, what is outside is no noise.
+    """
+    limit = Limit(OUTLIER_SIGMAS, of_sigmas=True)
+    while True:
+        fit = _refine(_consensus(points, limit, hypotheses), points, limit, None)
+        used = int(fit.inliers.sum())
+        degrees = max(1, 3 * used - SIMILARITY)
+        spread = math.sqrt(3.0 * float((normed(fit.residuals, points)[fit.inliers] ** 2).sum()) / degrees)
+        settled = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
+        if settled or used == len(points):
+            return fit, limit
+        limit = Limit(LIMIT_STEP * limit.most, of_sigmas=True)
+
+
+def _hypotheses(points: Correspondences) -> list[Similarity]:
+    """Similarities of triples, and of all points; accurate points count more."""
+    weights = (np.median(points.sigmas) / points.sigmas).mean(axis=1) ** 2
     triples = _triples(points)
     found = fit_similarity(points.source[triples], points.target[triples], weights[triples])
     hypotheses = [Similarity(float(scale), r, t) for scale, r, t in zip(*found, strict=True) if scale > 0.0]
-    hypotheses.append(_closed_form(points, weights))
+    return [*hypotheses, _closed_form(points, weights)]
 
-    def cost(hypothesis: Similarity) -> float:
-        settled = points.without(_median_offsets(hypothesis, points))
-        squares = ((_residuals(hypothesis, settled) * importance) ** 2).sum(axis=1)
-        return float(np.minimum(squares, max_error**2).sum())
 
-    costs = [cost(hypothesis) for hypothesis in hypotheses]
+def _consensus(points: Correspondences, limit: Limit, hypotheses: list[Similarity]) -> Similarity:
+    """The best hypothesis, refined."""
+    weights = (np.median(points.sigmas) / points.sigmas).mean(axis=1) ** 2
+    costs = _costs(points, limit, hypotheses)
     best_cost, best = math.inf, hypotheses[-1]
     for index in np.argsort(costs, kind="stable")[:REFINED_HYPOTHESES]:
-        candidate = hypotheses[int(index)]
+        candidate, cost = hypotheses[int(index)], float(costs[index])
         for _ in range(LOCAL_ROUNDS):
-            if cost(candidate) < best_cost:
-                best_cost, best = cost(candidate), candidate
+            if cost < best_cost:
+                best_cost, best = cost, candidate
             settled = points.without(_median_offsets(candidate, points))
-            near = np.linalg.norm(_residuals(candidate, settled), axis=1) <= max_error
+            near = limit.near(_residuals(candidate, settled), points)
             if near.sum() < 3:
                 break
             candidate = _closed_form(settled.only(near), weights[near])
+            cost = float(_costs(points, limit, [candidate])[0])
     return best
 
 
-def _refine(
-    start: Similarity, points: Correspondences, max_error: float, prior: DirectionPrior | None
-) -> SimilarityFit:
+def _costs(points: Correspondences, limit: Limit, hypotheses: list[Similarity]) -> Float64[np.ndarray, " h"]:
+    """The squares of the residuals, cut off at the limit; what groups share is taken off as their medians."""
+    turned = np.stack([hypothesis.scale * hypothesis.rotation for hypothesis in hypotheses])
+    residuals = np.einsum("hij,nj->hni", turned, points.source) - points.target
+    residuals += np.stack([hypothesis.translation for hypothesis in hypotheses])[:, None]
+    for group in range(0 if points.shared is None else len(points.shared.sigmas)):
+        assert points.shared is not None
+        members = points.shared.group == group
+        if members.any():
+            residuals[:, members] -= np.median(residuals[:, members], axis=1, keepdims=True)
+    return np.asarray(np.minimum(limit.squares(residuals, points), limit.most**2).sum(axis=1))
+
+
+def _refine(start: Similarity, points: Correspondences, limit: Limit, prior: DirectionPrior | None) -> SimilarityFit:
     """Reweighted least squares on the points near the fit, until these stay the same."""
     similarity = start
     settled = points.without(_median_offsets(start, points))
-    inliers = np.linalg.norm(_residuals(start, settled), axis=1) <= max_error
+    inliers = limit.near(_residuals(start, settled), points)
     if inliers.sum() < 3:
         inliers = np.ones(len(points), dtype=bool)
     near, noise, offsets = inliers, 1.0, np.zeros((0, 3))
     for _ in range(LOCAL_ROUNDS):
         similarity, noise, offsets = _reweighted(similarity, points.only(inliers), prior)
         residuals = _residuals(similarity, points.without(offsets))
-        normed = _normed(residuals, points)
-        near = np.linalg.norm(residuals, axis=1) <= max_error
-        near &= normed <= max(OUTLIER_SIGMAS, OUTLIER_NOISES * noise)
+        off = normed(residuals, points)
+        near = limit.near(residuals, points)
+        near &= off <= max(OUTLIER_SIGMAS, OUTLIER_NOISES * noise)
         if near.sum() < 3 or (near == inliers).all():
             break
         inliers = near
@@ -234,9 +278,9 @@ def _reweighted(
     offsets = _median_offsets(similarity, points)
     stated = points
     for _ in range(IRLS_ROUNDS):
-        normed = _normed(_residuals(similarity, points.without(offsets)), points)
-        noise = max(float(np.median(normed)) / MEDIAN_OF_CHI3, LEAST_NOISE)
-        weights = _sigma_weights(points) / (1.0 + (normed / (CAUCHY * noise)) ** 2)[:, None]
+        off = normed(_residuals(similarity, points.without(offsets)), points)
+        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, LEAST_NOISE)
+        weights = _sigma_weights(points) / (1.0 + (off / (CAUCHY * noise)) ** 2)[:, None]
         points = stated.at_noise(noise)
         problem = _Problem(points, similarity)
         offsets = _offsets(similarity, points, weights)
@@ -245,7 +289,7 @@ def _reweighted(
         if prior is not None:
             turned = prior.source @ similarity.rotation.T
             gradient[:3] += np.cross(turned, turned - prior.target).sum(axis=0) / prior.sigma_rad**2
-        step = -_solve(_information(problem, weights, prior), gradient)
+        step = -solve_step(_information(problem, weights, prior), gradient)
         similarity = problem.moved(step)
         extent = float(np.abs(problem.arms).max())
         if np.abs(step[:4]).max() < IRLS_TOLERANCE and np.abs(step[4:]).max() < IRLS_TOLERANCE * extent:
@@ -268,13 +312,6 @@ def _information(
         turned = cross_matrix(prior.source @ problem.similarity.rotation.T)
         information[:3, :3] += (np.swapaxes(turned, 1, 2) @ turned).sum(axis=0) / prior.sigma_rad**2
     return np.asarray(information)
-
-
-def _solve(information: Float64[np.ndarray, "7 7"], gradient: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, " 7"]:
-    """The step; none along a direction that nothing determines. Unknowns are brought to one size first."""
-    sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled = information / np.outer(sizes, sizes)
-    return np.asarray(np.linalg.pinv(scaled, rcond=FREE, hermitian=True) @ (gradient / sizes) / sizes)
 
 
 def _weakest_rotation(information: Float64[np.ndarray, "7 7"]) -> tuple[float, Float64[np.ndarray, " 3"]]:
@@ -344,11 +381,6 @@ def _offsets(
     membership = points.shared.membership()
     sums = membership @ (-weights * _residuals(similarity, points))
     return np.asarray(sums / (membership @ weights + 1.0 / points.shared.sigmas**2))
-
-
-def _normed(residuals: Float64[np.ndarray, "n 3"], points: Correspondences) -> Float64[np.ndarray, " n"]:
-    """Residuals over their sigmas, root mean square of the three coordinates."""
-    return np.asarray(np.sqrt(((residuals / points.sigmas) ** 2).mean(axis=1)))
 
 
 def _sigma_weights(points: Correspondences) -> Float64[np.ndarray, "n 3"]:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 LEAST_NOISE_FACTOR = 0.3  # GNSS errors change slowly: residuals of one flight look better than the positions are
+REDUNDANT = 8  # points from which on the residuals tell the noise better than the stated sigmas do
 
 
 @dataclass(frozen=True)
@@ -77,3 +78,33 @@ class DirectionPrior:
     source: Float64[np.ndarray, "k 3"]
     target: Float64[np.ndarray, "k 3"]
     sigma_rad: float
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How far points may be from a fit that they agree with.
+
+    Attributes:
+        most: In the target's units, or times the stated sigmas.
+        of_sigmas: Whether it is the latter (root mean square of the three coordinates).
+    """
+
+    most: float
+    of_sigmas: bool = False
+
+    def squares(self, residuals: Float64[np.ndarray, "h n 3"], points: Correspondences) -> Float64[np.ndarray, "h n"]:
+        """What hypotheses are scored by; accurate points count more."""
+        if self.of_sigmas:
+            return np.asarray(((residuals / points.sigmas) ** 2).mean(axis=2))
+        importance = np.median(points.sigmas) / points.sigmas
+        return np.asarray(((residuals * importance) ** 2).sum(axis=2))
+
+    def near(self, residuals: Float64[np.ndarray, "n 3"], points: Correspondences) -> Bool[np.ndarray, " n"]:
+        """Which points agree."""
+        far = normed(residuals, points) if self.of_sigmas else np.linalg.norm(residuals, axis=1)
+        return np.asarray(far <= self.most)
+
+
+def normed(residuals: Float64[np.ndarray, "n 3"], points: Correspondences) -> Float64[np.ndarray, " n"]:
+    """Residuals over their sigmas, root mean square of the three coordinates."""
+    return np.asarray(np.sqrt(((residuals / points.sigmas) ** 2).mean(axis=1)))

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+SIMILARITY = 7  # unknowns of a small change: a rotation vector, the scale's logarithm, the place of the points' mean
+FREE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: its direction is not determined
+
 
 @dataclass(frozen=True)
 class Similarity:
@@ -110,6 +113,22 @@ def rotation_from_vector(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarra
     return np.asarray(np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k))
 
 
+def turn_between(have: Float64[np.ndarray, "k 3"], want: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, " 3"]:
+    """Rotation vector of the turn that brings unit vectors to others best, the least one where they leave a choice."""
+    if len(have) == 1:
+        axis = np.cross(have[0], want[0])
+        sine, cosine = float(np.linalg.norm(axis)), float(have[0] @ want[0])
+        if sine < 1e-12:
+            return np.zeros(3) if cosine > 0.0 else np.array([math.pi, 0.0, 0.0])
+        return np.asarray(axis / sine * math.atan2(sine, cosine))
+    u, _, vt = np.linalg.svd(want.T @ have)
+    rotation = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
+    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    twice_sine = float(np.linalg.norm(axis))
+    angle = math.atan2(twice_sine, float(np.trace(rotation)) - 1.0)
+    return np.asarray(axis / max(twice_sine, 1e-300) * angle)
+
+
 def cross_matrix(vectors: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
     """``cross_matrix(a) @ b == cross(a, b)``."""
     matrix = np.zeros((*vectors.shape[:-1], 3, 3))
@@ -117,3 +136,39 @@ def cross_matrix(vectors: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray
     matrix[..., 1, 0], matrix[..., 1, 2] = vectors[..., 2], -vectors[..., 0]
     matrix[..., 2, 0], matrix[..., 2, 1] = -vectors[..., 1], vectors[..., 0]
     return matrix
+
+
+def similarity_jacobian(
+    similarity: Similarity, source: Float64[np.ndarray, "n 3"], about: Float64[np.ndarray, " 3"] | None = None
+) -> Float64[np.ndarray, "n 3 7"]:
+    """Derivative of the transformed points by a rotation vector, the scale's logarithm and a translation.
+
+    Turned and stretched about a place of the source, else the points' mean, which keeps the unknowns apart.
+    """
+    middle = source.mean(axis=0) if about is None else about
+    arms = similarity.scale * ((source - middle) @ similarity.rotation.T)
+    jacobian = np.zeros((len(arms), 3, SIMILARITY))
+    jacobian[:, :, :3] = -cross_matrix(arms)
+    jacobian[:, :, 3] = arms
+    jacobian[:, :, 4:] = np.eye(3)
+    return jacobian
+
+
+def moved_similarity(
+    similarity: Similarity, source: Float64[np.ndarray, "n 3"], step: Float64[np.ndarray, " 7"]
+) -> Similarity:
+    """The similarity after a step of these unknowns."""
+    mean = source.mean(axis=0)
+    centre = similarity.apply(mean[None])[0] + step[4:]
+    rotation = rotation_from_vector(step[:3]) @ similarity.rotation
+    scale = similarity.scale * math.exp(float(np.clip(step[3], -1.0, 1.0)))
+    return Similarity(scale, rotation, centre - scale * (rotation @ mean))
+
+
+def solve_step(
+    information: Float64[np.ndarray, "p p"], gradient: Float64[np.ndarray, " p"]
+) -> Float64[np.ndarray, " p"]:
+    """The step; none along a direction that nothing determines. Unknowns are brought to one size first."""
+    sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(sizes, sizes)
+    return np.asarray(np.linalg.pinv(scaled, rcond=FREE, hermitian=True) @ (gradient / sizes) / sizes)

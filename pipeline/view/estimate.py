@@ -20,7 +20,7 @@ from splatpipe.pipeline.scene.similarity import Similarity
 from splatpipe.pipeline.view.job import Job
 from splatpipe.stages.georef.accuracy import Placed, accuracy_json
 from splatpipe.stages.georef.blunders import name_blunders, require_near
-from splatpipe.stages.georef.gps import NoPlaceError
+from splatpipe.stages.georef.fitting import NoPlaceError
 from splatpipe.stages.georef.model import SparseModel
 from splatpipe.stages.georef.place import (
     Site,

@@ -17,7 +17,8 @@ from splatpipe.pipeline.scene.frames import Frame
 from splatpipe.pipeline.scene.names import NameFinder
 from splatpipe.pipeline.scene.photos import Photo, load_photo_list
 from splatpipe.pipeline.view.opened import Run
-from splatpipe.stages.georef.gps import NoPlaceError, georeference, read_positions
+from splatpipe.stages.georef.fitting import NoPlaceError
+from splatpipe.stages.georef.gps import georeference, read_positions
 from splatpipe.stages.georef.level import Positions
 from splatpipe.stages.georef.model import SparseModel, read_model
 from splatpipe.stages.line import GEOREF, LINE
@@ -89,7 +90,7 @@ def open_job(run: Run, points_file: Path | None) -> Job:
     positions = read_positions(opened.parts["ingest.positions"].path)
     command = _command(run, text.path, config.georef.control, source.named.get(CONTROL))
     places = (source.folder, opened.parts["ingest.photos"].path)
-    frame = _frame(model, positions, config.georef)
+    frame = _frame(model, positions, config.georef, photos)
     return Job(points, crs, photos, *places, model, positions, frame, config.georef, text, command)
 
 
@@ -101,9 +102,9 @@ def _without_missing_control(config: LineConfig) -> LineConfig:
     return config.model_copy(update={"georef": config.georef.model_copy(update={"control": NONE})})
 
 
-def _frame(model: SparseModel, positions: Positions, config: GeorefConfig) -> Frame | None:
+def _frame(model: SparseModel, positions: Positions, config: GeorefConfig, photos: Mapping[str, Photo]) -> Frame | None:
     try:
-        return georeference(model, positions, config.max_position_error_m)[0]
+        return georeference(model, positions, config.max_position_error_m, photos)[0]
     except NoPlaceError:
         return None
 

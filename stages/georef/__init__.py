@@ -21,7 +21,8 @@ from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.stages.georef.accuracy import Placed, accuracy_json, control_json, no_control
 from splatpipe.stages.georef.blunders import gsd_m
 from splatpipe.stages.georef.control import ByControl, Capture, place_by_control
-from splatpipe.stages.georef.gps import NoPlaceError, georeference, read_positions, tell
+from splatpipe.stages.georef.fitting import NoPlaceError
+from splatpipe.stages.georef.gps import georeference, read_positions, tell
 from splatpipe.stages.georef.level import Positions, arbitrary_frame
 from splatpipe.stages.georef.model import SparseModel, copy_model, read_model
 from splatpipe.stages.georef.place import Site, Targets, stations_of
@@ -43,7 +44,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     model = read_model(source, photos)
     positions = read_positions(inputs["ingest.positions"])
     report.progress(1, 3, "fitting the positions", "steps")
-    frame = _by_positions(config, model, positions, report)
+    frame = _by_positions(config, model, positions, photos, report)
     report.progress(2, 3, "fitting the control", "steps")
     controlled = None
     if inputs["source.control"].is_file():
@@ -73,10 +74,12 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     return _summary(frame, controlled, accuracy)
 
 
-def _by_positions(config: GeorefConfig, model: SparseModel, positions: Positions, report: Reporter) -> Frame | str:
+def _by_positions(
+    config: GeorefConfig, model: SparseModel, positions: Positions, photos: Mapping[str, Photo], report: Reporter
+) -> Frame | str:
     """The frame that the positions give, or why they give none."""
     try:
-        frame, fit = georeference(model, positions, config.max_position_error_m)
+        frame, fit = georeference(model, positions, config.max_position_error_m, photos)
     except NoPlaceError as error:
         return str(error)
     tell(frame, fit, model, positions, report)
@@ -148,7 +151,8 @@ def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Fram
     nothing = Targets(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
     site = Site(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))
     placed = replace(placed, offsets=_stated_offsets(frame, stations.flights))
-    return accuracy_json(None, site, placed, model.gsd(frame.world_from_model.scale))
+    gsd = model.gsd(frame.world_from_model.scale)
+    return accuracy_json(None, site, placed, gsd, frame.residuals["uncertainty"])
 
 
 def _stated_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:

@@ -73,8 +73,18 @@ def control_json(survey: Survey, site: Site, placed: Placed, photos: Mapping[str
     }
 
 
-def accuracy_json(survey: Survey | None, site: Site | None, placed: Placed, gsd: float | None) -> JSON:
-    """What ``accuracy.json`` holds: the errors of positions, control and check points apart; absent groups are null."""
+def accuracy_json(
+    survey: Survey | None, site: Site | None, placed: Placed, gsd: float | None, uncertainty: JSON = None
+) -> JSON:
+    """What ``accuracy.json`` holds: the errors of positions, control and check points apart; absent groups are null.
+
+    Args:
+        survey: The surveyed points.
+        site: The world.
+        placed: The model in it.
+        gsd: Ground sampling distance.
+        uncertainty: How well positions alone place the model; null where control does.
+    """
     tables: dict[str, JSON] = {"gps": None, "control": None, "check": None}
     if site is not None and len(site.stations):
         stations = site.stations
@@ -97,7 +107,7 @@ def accuracy_json(survey: Survey | None, site: Site | None, placed: Placed, gsd:
                 if point.role == role and point.found is not None
             ]
             tables[role] = accuracy_table(np.array(errors, dtype=np.float64).reshape(-1, 3))
-    return {"gsd_m": gsd, "tables": tables}
+    return {"gsd_m": gsd, "tables": tables, "uncertainty": uncertainty}
 
 
 def _listed(values: Float64[np.ndarray, " 3"], known: Sequence[bool] | np.ndarray) -> list[float | None]:

@@ -142,6 +142,7 @@ def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, confi
     if not heights:
         note += " Heights are the positions'." if len(site.stations) else " Heights count from the control points."
     residuals = dict(frame.residuals) if frame is not None else {}
+    residuals.pop("uncertainty", None)  # the positions' alone
     left_out = frame.left_out if frame is not None else ()
     return Frame("enu", fit.similarity, site.origin, vertical, residuals, left_out, note)
 

@@ -94,14 +94,14 @@ def bound(points: Correspondences, fit: SimilarityFit) -> Correspondences:
 
 
 def flights_json(
-    records: Sequence[Mapping[str, Any]], points: Correspondences, fit: SimilarityFit
+    records: Sequence[Mapping[str, Any]], points: Correspondences, offsets: Float64[np.ndarray, "g 3"]
 ) -> list[dict[str, JSON]]:
     """Of each flight with an offset of its own: number, photos, offset (metres), and whether it is apart in the
     horizontal and in height."""
     if points.shared is None:
         return []
     flights = []
-    for index, (offset, sigma) in enumerate(zip(fit.offsets, points.shared.sigmas, strict=True)):
+    for index, (offset, sigma) in enumerate(zip(offsets, points.shared.sigmas, strict=True)):
         members = [record for record, group in zip(records, points.shared.group, strict=True) if group == index]
         flights.append(
             {

@@ -22,10 +22,11 @@ from splatpipe.pipeline.scene.upright import (
     rotation_to_up,
     up_from_cameras,
 )
+from splatpipe.stages.georef.fitting import Directions
 from splatpipe.stages.georef.model import SparseModel
 
 MIN_ANGLES = 3
-GIMBAL_SIGMA_RAD = math.radians(3.0)  # its compass errs by some degrees
+GIMBAL_SIGMA_RAD = math.radians(3.0 * math.sqrt(2.0))  # of each of three axes: 3° of the rotation about any
 GIMBAL_SPREAD_RAD = math.radians(15.0)  # angles that agree less with the model are in another convention
 UP_SIGMA_RAD = math.radians(5.0)
 
@@ -56,13 +57,14 @@ def arbitrary_frame(model: SparseModel, positions: Positions, reason: str) -> Fr
     return Frame("arbitrary", similarity, note=f"Arbitrary scale: {reason}. Up is from {source}.")
 
 
-def direction_prior(model: SparseModel, positions: Positions) -> tuple[DirectionPrior, str]:
-    """What tells the rotation where positions leave it free, and its name for messages."""
+def known_directions(model: SparseModel, positions: Positions) -> Directions:
+    """What tells the rotation where positions tell it worse, or not at all."""
     gimbal = gimbal_rotation(model, positions)
     if gimbal is not None:
-        return DirectionPrior(gimbal, np.eye(3), GIMBAL_SIGMA_RAD), "the gimbal's angles"
+        return Directions(DirectionPrior(gimbal, np.eye(3), GIMBAL_SIGMA_RAD), "the gimbal's angles", of_gimbal=True)
     upright = upright_cameras(model, positions)
-    return DirectionPrior(upright.up[None], np.array([[0.0, 0.0, 1.0]]), UP_SIGMA_RAD), upright.source
+    prior = DirectionPrior(upright.up[None], np.array([[0.0, 0.0, 1.0]]), UP_SIGMA_RAD)
+    return Directions(prior, upright.source, of_gimbal=False)
 
 
 def gimbal_rotation(model: SparseModel, positions: Positions) -> Float64[np.ndarray, "3 3"] | None:

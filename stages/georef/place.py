@@ -16,7 +16,8 @@ from splatpipe.pipeline.scene.geodesy import Origin
 from splatpipe.pipeline.scene.joint_fit import JointFit, Observed, Priors
 from splatpipe.pipeline.scene.similarity import Similarity
 from splatpipe.pipeline.scene.upright import rotation_to_up
-from splatpipe.stages.georef.gps import MIN_POSITIONS, ORIGIN_DIGITS, NoPlaceError
+from splatpipe.stages.georef.fitting import MIN_POSITIONS, NoPlaceError
+from splatpipe.stages.georef.gps import ORIGIN_DIGITS
 from splatpipe.stages.georef.level import UP_SIGMA_RAD, Positions, upright_cameras
 from splatpipe.stages.georef.model import SparseModel
 from splatpipe.stages.georef.survey import Survey
@@ -103,16 +104,29 @@ def stations_of(model: SparseModel, positions: Positions, frame: Frame | None) -
         if frame is not None and record is not None and record["altitude_m"] is not None and name not in left_out:
             rows.append((name, index, record))
     flights = sorted({int(record.get("flight", 0)) for _, _, record in rows})
+    worse = np.ones(2) if frame is None else _worse_than_stated(frame)
     geodetic = [[r["latitude"], r["longitude"], r["altitude_m"]] for _, _, r in rows]
     sigmas = [[r["sigma_horizontal_m"]] * 2 + [r["sigma_vertical_m"]] for _, _, r in rows]
     return Stations(
         tuple(name for name, _, _ in rows),
         np.array([index for _, index, _ in rows], dtype=np.int64),
         np.array(geodetic, dtype=np.float64).reshape(-1, 3),
-        np.array(sigmas, dtype=np.float64).reshape(-1, 3),
+        np.array(sigmas, dtype=np.float64).reshape(-1, 3) * worse[[0, 0, 1]],
         np.array([flights.index(int(r.get("flight", 0))) for _, _, r in rows], dtype=np.int64),
         tuple(flights),
     )
+
+
+def _worse_than_stated(frame: Frame) -> Float64[np.ndarray, " 2"]:
+    """How many times worse than stated the positions count, horizontally and in height; never better than that.
+
+    Of errors that each position carries on from the one before, many are worth as few: their mean errs as that of
+    independent ones does that are larger by the root of (1 + r) / (1 - r).
+    """
+    told = frame.residuals.get("uncertainty", {})
+    factors = np.array(told.get("noise_over_stated", [1.0, 1.0]), dtype=np.float64)
+    correlations = np.array(told.get("noise_correlation", [0.0, 0.0]), dtype=np.float64)
+    return np.asarray(np.maximum(1.0, factors * np.sqrt((1.0 + correlations) / (1.0 - correlations))))
 
 
 def locate_survey(survey: Survey, config: GeorefConfig) -> Float64[np.ndarray, "n 3"]:
