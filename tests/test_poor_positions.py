@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 
 from splatpipe.demo import CAPTURE
+from splatpipe.pipeline.scene.alignment import robust_similarity
 from splatpipe.pipeline.scene.correspondences import Correspondences, Shared
 from splatpipe.pipeline.scene.frames import Frame
 from splatpipe.pipeline.scene.geodesy import Origin
@@ -154,6 +155,14 @@ def test_noise_that_leaves_scale_unknown_is_refused_with_its_size() -> None:
     with pytest.raises(NoPlaceError, match="agree with the model: they are off by") as told:
         placed(cameras(), CENTRES + 90.0 * rng.normal(size=CENTRES.shape))
     assert "%" in str(told.value)
+
+
+def test_errors_of_all_sizes_are_not_searched_for_ever() -> None:
+    generator = np.random.default_rng(38)
+    places = generator.normal(size=(9, 3)) * [50.0, 50.0, 1.0]
+    errors = generator.normal(size=(9, 3)) * np.exp(generator.uniform(0.0, 20.0, (9, 1)))
+    points = Correspondences(MODEL_FROM_WORLD.apply(places), places + errors, np.full((9, 3), 3.0))
+    assert 3 <= np.count_nonzero(robust_similarity(points, None).inliers) < 9
 
 
 def test_five_positions_keep_their_stated_accuracy() -> None:

@@ -185,13 +185,15 @@ def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tupl
     that the fit leaves, says so. From some times the noise on, what is outside is no noise.
     """
     limit = Limit(OUTLIER_SIGMAS, of_sigmas=True)
+    # Errors of all sizes have no noise that half of them share; a limit as wide as the target tells nothing.
+    widest = float(normed(points.target - points.target.mean(axis=0), points).max())
     while True:
         fit = _refine(_consensus(points, limit, hypotheses), points, limit, None)
         used = int(fit.inliers.sum())
         degrees = max(1, 3 * used - SIMILARITY)
         spread = math.sqrt(3.0 * float((normed(fit.residuals, points)[fit.inliers] ** 2).sum()) / degrees)
         settled = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
-        if settled or used == len(points):
+        if settled or used == len(points) or limit.most > widest:
             return fit, limit
         limit = Limit(LIMIT_STEP * limit.most, of_sigmas=True)
 
