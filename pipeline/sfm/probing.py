@@ -20,7 +20,7 @@ from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs, tried
 from splatpipe.pipeline.sfm.verified import Verified, read_verified
 
 PROBES = 24  # pairs: a few seconds' work, and enough for a share of them to mean something
-PROVEN = (3, 0.25)  # contradicting probes, and their share of those that hold: more than look-alikes give
+PROVEN = (3, 0.1)  # contradicting probes, and their share of those that hold: more than look-alikes give, 0 to 0.05
 THIN = 8.0  # verified pairs a photo; drone captures with overlap have 15 and more, chains and trees 2 to 5
 FILL = 6  # pairs a photo that a thin graph gets
 

@@ -205,7 +205,8 @@ def _with_held_focal(work: Reconstructor, answer: Answer) -> Answer:
 
     If they cannot, the one that is held explains the matches just as well.
     """
-    if not answer.models or not _focal_unobserved(answer.models[0], work.verified.cameras):
+    enough = answer.placed >= ENOUGH_SHARE * len(work.verified.names)  # a small model tells nothing about the lens
+    if not enough or not _focal_unobserved(answer.models[0], work.verified.cameras):
         return answer
     relaxed = answer.options.relaxed
     held = work.map(answer.mapper, f"{answer.how}, focal length held", hold_focal=True, relaxed=relaxed)
