@@ -22,6 +22,7 @@ from splatpipe.pipeline.sfm.ladder import climb
 from splatpipe.pipeline.sfm.lens_model import stated_lenses
 from splatpipe.pipeline.sfm.lenses import calibrate, tell_lenses
 from splatpipe.pipeline.sfm.options import SparseConfig
+from splatpipe.pipeline.sfm.outside import outside_reasons
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.pipeline.sfm.verified import Verified
@@ -43,7 +44,8 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         found = replace(found, model=model)
     model = canonical(found.model, found.colours, _keypoint_counts(found.verified))
     write_model(model, out / "sparse" / "0")
-    verdict = judge(model, found.verified, capture.cameras)
+    outside = outside_reasons(model, found.verified, capture.cameras, capture.positions)
+    verdict = judge(model, found.verified, capture.cameras).joined(outside)
     summary = {**_summary(model, found), "lenses": list(lenses), "verdict": verdict.as_json()}
     text = json.dumps(_without_times(summary), ensure_ascii=False, indent=1) + "\n"
     (out / "models.json").write_text(text, encoding="utf-8")

@@ -9,6 +9,7 @@ import pytest
 
 from splatpipe.pipeline.sfm.agreement import compare, epipolar_errors
 from splatpipe.pipeline.sfm.judging import contradicting, judge
+from splatpipe.pipeline.sfm.outside import disagreement
 from splatpipe.pipeline.sfm.splits import find_split
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -87,6 +88,17 @@ def test_the_distance_from_an_epipolar_line_is_that_of_the_noise() -> None:
     assert np.median(epipolar_errors(*noisy, one, two, 1e-3)) == pytest.approx(0.6745e-3, rel=0.1)
     behind = np.column_stack([turn_up(3.0), [1.0, -0.2, -0.1]])  # the other way along the same line: points behind
     assert np.isinf(epipolar_errors(*exact, one, behind, 1e-3)).mean() > 0.95
+
+
+def test_positions_tell_a_bend_from_noise(ring: Ring) -> None:
+    rng = np.random.default_rng(5)
+    true = 10.0 * np.array([ring.centre(number) for number in range(1, 25)])  # metres; the ring's radius is 200
+    noisy = disagreement(true + rng.normal(0.0, 3.0, true.shape), true)
+    assert noisy.median_m < 8.0 and noisy.smooth > 0.8
+    half = moved(ring, range(13, 25), ring.centre(13), turn_up(25.0), 1.2)
+    bent = np.array([-pose[:, :3].T @ pose[:, 3] for pose in {**ring.poses, **half}.values()])
+    off = disagreement(bent, true + rng.normal(0.0, 1.0, true.shape))
+    assert off.median_m > 0.04 * off.size_m and off.smooth < 0.5
 
 
 def test_matches_that_are_the_models_own_observations_are_told_from_those_held_out(ring: Ring) -> None:

@@ -9,7 +9,7 @@ model they are many, as strong as what holds, or they stand between two groups o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -47,7 +47,7 @@ class Reason:
         level: How heavily.
         text: What, in plain words, a whole sentence.
         hint: What to do about it, or nothing.
-        kind: For programs: ``placed``, ``focal``, ``bent``, ``unexplained``.
+        kind: For programs: ``placed``, ``focal``, ``bent``, ``unexplained``, ``lens``, ``positions``.
     """
 
     level: Level
@@ -79,6 +79,11 @@ class Judgement:
     contradicted: int
     pairs: int
 
+    def joined(self, more: Sequence[Reason]) -> Judgement:
+        """The same with more reasons."""
+        reasons = _worst_first([*self.reasons, *more])
+        return replace(self, level=reasons[0].level if reasons else "good", reasons=reasons)
+
     def as_json(self) -> JSON:
         """For ``models.json``."""
         told = [{"level": it.level, "kind": it.kind, "text": it.text, "hint": it.hint} for it in self.reasons]
@@ -106,16 +111,19 @@ def judge(
         *_unexplained(agreement),
         *_bent(agreement, contradicts, verified),
     ]
-    reasons.sort(key=lambda reason: -LEVELS.index(reason.level))
     return Judgement(
-        level=reasons[0].level if reasons else "good",
-        reasons=tuple(reasons),
+        level="good",
+        reasons=(),
         score=_score(agreement),
         explained=_share(agreement.explained, agreement.matches),
         held_out=_share(agreement.held_out_explained[placed], agreement.held_out[placed]),
         contradicted=int(contradicts.sum()),
         pairs=int(placed.sum()),
-    )
+    ).joined(reasons)
+
+
+def _worst_first(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
+    return tuple(sorted(reasons, key=lambda reason: -LEVELS.index(reason.level)))
 
 
 def contradicting(agreement: Agreement) -> Bool[np.ndarray, " n"]:
