@@ -79,6 +79,7 @@ def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapt
         "other_models": models.get("other_models", []),
         "cameras": [_calibrated(camera) for camera in sparse.get("cameras", [])],
         "tried": [_tried(row) for row in sparse.get("tried", [])],
+        "rungs": [_rung(row) for row in sparse.get("ladder", [])],
     }
     if geometry is not None:
         chapter |= _registration_charts(holdings, geometry)
@@ -184,6 +185,18 @@ def _tried(row: Mapping[str, Any]) -> dict[str, str]:
         "cpu": number(row.get("cpu_s"), 1),
         "taken": "taken" if row.get("chosen") else "",
         "why": str(row.get("why", "")),
+    }
+
+
+def _rung(row: Mapping[str, Any]) -> dict[str, str]:
+    """A rung of the ladder for photos that were left."""
+    return {
+        "rung": str(row.get("rung", "")).replace("_", " "),
+        "left": count(row.get("left")),
+        "placed": count(row.get("placed")),
+        "pairs": count(row.get("verified_pairs_added")),
+        "keypoints": count(row.get("keypoints_added")),
+        "cpu": number(row.get("cpu_s"), 1),
     }
 
 

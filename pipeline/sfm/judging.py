@@ -168,7 +168,9 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: Verified, cameras: 
         ratio = focal / max(camera.width, camera.height)
         stray = max(focal / prior, prior / focal) - 1.0
         doubt, bad = FOCAL_TRUSTED if is_trusted(group) else FOCAL_STATED
-        hint = "Heights and scale are off with it. Add oblique photos, or photos from a second height."
+        hint = (
+            "Heights and scale may be off: compare a known one. Oblique photos or a second height tell the lens better."
+        )
         if not FOCAL_LONGER[0] <= ratio <= FOCAL_LONGER[1]:
             text = f"{which} came out as {focal:.0f} pixels, {ratio:.2g} times the photo's longer side: no such lens."
             found.append(Reason("bad", text, hint, "focal"))

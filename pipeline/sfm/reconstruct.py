@@ -176,7 +176,8 @@ def _with_new_pairs(work: Reconstructor, answer: Answer) -> Answer:
         answer = _judged_again(work, answer)
         if not (thin or found.prove_a_bend):
             break
-        best = _better(answer, _with_held_focal(work, work.map(answer.mapper, f"{answer.mapper}, with more pairs")))
+        again = _with_held_focal(work, work.map(answer.mapper, f"{answer.mapper}, with more pairs"))
+        best = _better(again, answer)  # of two that are as good the one that more is known of
         if best.judgement is not None and best.judgement.level == "bad" and answer.mapper == "incremental":
             best = _better(best, _with_held_focal(work, work.map("global", "global, with more pairs")))
         if best is answer:
