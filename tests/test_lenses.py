@@ -51,15 +51,16 @@ def test_a_simple_lens_stays_simple_to_the_bit(seed: int) -> None:
     assert rows[0]["freed"] == [] and rows[0]["model"] == "SIMPLE_RADIAL"
 
 
-def test_flat_ground_from_one_height_keeps_focal_length_and_principal_point() -> None:
-    rng = np.random.default_rng(1)
-    scene = make_scene([make_lens("FULL_OPENCV", BROWN)], strips(24, rng), 1, flat=True)
-    focal = scene.model.cameras[1].mean_focal_length()
+def test_flat_ground_from_one_height_keeps_its_lens_unless_one_is_stated() -> None:
+    """There a longer lens from higher up makes the same photos, and a false distortion a dome of the ground."""
+    scene = make_scene([make_lens("FULL_OPENCV", BROWN)], strips(24, np.random.default_rng(1)), 1, flat=True)
     found, rows = calibrate(scene.model, scene.verified, {}, "auto")
-    assert not rows[0]["focal_told"]
-    assert "cx cy" not in rows[0]["freed"]
-    assert found.cameras[1].mean_focal_length() == focal
-    assert (found.cameras[1].principal_point_x, found.cameras[1].principal_point_y) == (WIDTH / 2, HEIGHT / 2)
+    assert found is scene.model and rows[0]["freed"] == [] and not rows[0]["focal_told"]
+    stated = {1: StatedLens("FULL_OPENCV", WIDTH, HEIGHT, BROWN, "xmp-dewarp")}
+    found, rows = calibrate(scene.model, scene.verified, stated, "auto")
+    assert (rows[0]["focal_told"], rows[0]["stated"]) == (False, "xmp-dewarp")
+    assert tuple(found.cameras[1].params) == BROWN
+    assert found.compute_mean_reprojection_error() < scene.model.compute_mean_reprojection_error()
 
 
 def test_each_camera_of_a_mixed_capture_gets_its_own() -> None:

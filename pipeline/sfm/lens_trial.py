@@ -101,9 +101,9 @@ class Trial:
             camera = lens.colmap(number)
             widen(camera)
             set_lens(model.cameras[number], camera.model_name, named_params(camera))
-            names = () if held else (*BASE, *sum(STEPS[camera.model_name], ()))
-            freedom = LensFreedom(names, stated_prior(camera))
             state = self.states[number]
+            names = (*BASE, *sum(STEPS[camera.model_name], ())) if state.focal_told and not held else ()
+            freedom = LensFreedom(names, stated_prior(camera))
             wanted[number] = replace(state, freedom=freedom, changed=True, stated=lens.source, freed=("stated",))
         solved, errors = self._solve(model, wanted)
         kept = {}
@@ -143,8 +143,7 @@ class Trial:
             if state.stated or not state.freedom.free or camera.model_name != WIDE or not _is_wide(camera):
                 continue
             _as_fisheye(camera)
-            base = len(BASE) if state.focal_told else 1
-            free = (*state.freedom.free[:base], *sum(STEPS[WIDE_FISHEYE], ()))
+            free = (*BASE, *sum(STEPS[WIDE_FISHEYE], ()))
             freedom = replace(state.freedom, free=free, prior=weak_prior(camera))
             wanted[number] = replace(state, freedom=freedom, changed=True, freed=("fisheye",))
         if not wanted:
@@ -199,7 +198,7 @@ class Trial:
         noise = max(self._typical(number), 1.0)
         sigma = noise * corner_sigma_px(camera, names, covariance, state.freedom.free)
         focal = noise * math.sqrt(max(float(covariance[0, 0]), 0.0)) / now["fx"]
-        return effect, sigma, focal if state.focal_told else 0.0
+        return effect, sigma, focal
 
     def _open(self, number: int, step: int) -> tuple[str, ...]:
         """A camera's group of a step, unless it is free or nothing was freed since it was tried; none then."""
@@ -212,9 +211,8 @@ class Trial:
         return names if " ".join(names) not in state.freed and any(row["kept"] for row in since) else ()
 
     def _steps(self, number: int) -> tuple[tuple[str, ...], ...]:
-        """The groups of a camera; where not even the focal length is told, the principal point is not either."""
-        steps = STEPS[self.model.cameras[number].model_name]
-        return steps if self.states[number].focal_told else tuple(step for step in steps if step != ("cx", "cy"))
+        """The groups of a camera."""
+        return STEPS[self.model.cameras[number].model_name]
 
     def _with(self, number: int, names: tuple[str, ...]) -> LensState:
         state = self.states[number]

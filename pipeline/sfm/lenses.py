@@ -67,16 +67,16 @@ def calibrate(
     within = _only(model, set(deciding.tolist()))
     states = _states(within, model)
     if not usable and not any(state.freedom.free for state in states.values()):
-        return model, ()
+        return model, _rows(model, model, states)
     tracks = of_photos(tracks_of(model, np.sort(held_out)), set(within.reg_image_ids()))
     trial = Trial(within, tracks, states, seed)
     trial.take_stated(usable, held=how == "held")
     trial.free_steps()
     trial.try_fisheye()
     if not any(state.changed for state in trial.states.values()):
-        return model, _rows(model, model, trial)
+        return model, _rows(model, model, trial.states)
     result = _finished(model, verified, trial, seed)
-    return result, _rows(model, result, trial, usable)
+    return result, _rows(model, result, trial.states, usable)
 
 
 def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
@@ -100,8 +100,8 @@ def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " 
 def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> dict[int, LensState]:
     """What is free of the cameras as mapping leaves them.
 
-    Those of few photos are held; focal lengths that the photos do not tell stay where mapping, which knows the
-    metadata, left them.
+    Those of few photos are held, and those whose focal length the photos do not tell: there, over flat ground from one
+    height, distortion is as free to bend the ground, and held-out tracks, which bend with it, do not tell.
     """
     counts = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     fewer = math.sqrt(within.compute_num_observations() / max(model.compute_num_observations(), 1))
@@ -109,8 +109,7 @@ def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> 
     states = {}
     for number, camera in sorted(within.cameras.items()):
         told = fewer * sigmas.get(number, math.inf) <= UNOBSERVED
-        base = BASE if told else BASE[-1:]
-        free = base if counts[number] >= LEAST_PHOTOS and is_known(camera.model_name) else ()
+        free = BASE if told and counts[number] >= LEAST_PHOTOS and is_known(camera.model_name) else ()
         states[number] = LensState(LensFreedom(free, weak_prior(camera)), told)
     return states
 
@@ -158,11 +157,11 @@ def _finished(model: pycolmap.Reconstruction, verified: Verified, trial: Trial, 
 def _rows(
     before: pycolmap.Reconstruction,
     after: pycolmap.Reconstruction,
-    trial: Trial,
+    states: Mapping[int, LensState],
     stated: Mapping[int, StatedLens] = MappingProxyType({}),
 ) -> tuple[JSON, ...]:
     rows = []
-    for number, state in sorted(trial.states.items()):
+    for number, state in sorted(states.items()):
         camera = after.cameras[number]
         row = {
             "camera": number,
