@@ -22,8 +22,9 @@ from PIL import Image
 from pyproj import Transformer
 
 from splatpipe.demo import CAPTURE, capture_path
-from splatpipe.demo.cameras import Lens, flight
+from splatpipe.demo.cameras import Lens, brown_lens, flight
 from splatpipe.demo.metadata import read_dji, write_rtk_variant
+from splatpipe.pipeline.sfm.lens_model import apart_px, simplest
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from rays import first_hits
@@ -187,6 +188,27 @@ def test_truth_is_the_generators_flight() -> None:
         assert np.allclose(pose.cam_from_world, cam_from_world()[pose.name], atol=1e-9)
         points = np.array([0, 0, 3]) + rng.normal(0, 3, (20, 3))
         assert np.allclose(lens.project(pose.to_camera(points)), project(pose.name, points), atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", [Lens(), brown_lens(), brown_lens().scaled(0.25)])
+def test_the_generators_lenses_are_colmaps_and_undone(lens: Lens) -> None:
+    """What a pixel's ray is rendered by is the inverse of what COLMAP sees it at; truth.json names COLMAP's model."""
+    camera = pycolmap.Camera(**lens.colmap())
+    x, y = np.meshgrid(np.linspace(0.0, lens.width, 13), np.linspace(0.0, lens.height, 10))
+    rays = lens.undistort((x.ravel() - lens.cx) / lens.f, (y.ravel() - lens.cy) / lens.f)
+    points = 7.0 * np.stack([*rays, np.ones(x.size)], axis=1)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    assert np.allclose(lens.project(points), pixels, atol=1e-6)
+    assert np.allclose(camera.img_from_cam(points), pixels, atol=1e-6)
+
+
+def test_the_brown_lens_is_as_far_from_simple_as_the_p1s() -> None:
+    lens = brown_lens()
+    assert np.hypot(lens.cx - 600.0, lens.cy - 450.0) == pytest.approx(20.0)
+    true = pycolmap.Camera(camera_id=1, **lens.colmap())
+    model, params = simplest(true)
+    near = pycolmap.Camera(camera_id=1, model=model, width=lens.width, height=lens.height, params=list(params))
+    assert 3.0 < np.sqrt(np.mean(apart_px(near, true, turn=True) ** 2)) < 4.5
 
 
 def test_points_are_on_ground_walls_and_roof_and_each_seen_four_times() -> None:
