@@ -72,12 +72,13 @@ def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapt
     if not sparse:  # the stage failed or was never reached
         facts = [fact for fact in facts if "–" not in fact[1] and fact[1]]
     unregistered = [str(name) for name in models.get("unregistered", [])]
+    lenses = {row["camera"]: row for row in models.get("lenses", [])}
     chapter: Chapter = {
         "facts": facts,
         "unregistered": unregistered[:MOST_LISTED],
         "unregistered_more": max(0, len(unregistered) - MOST_LISTED),
         "other_models": models.get("other_models", []),
-        "cameras": [_calibrated(camera) for camera in sparse.get("cameras", [])],
+        "cameras": [_calibrated(camera, lenses.get(camera.get("id"), {})) for camera in sparse.get("cameras", [])],
         "tried": [_tried(row) for row in sparse.get("tried", [])],
         "rungs": [_rung(row) for row in sparse.get("ladder", [])],
     }
@@ -162,12 +163,16 @@ def _camera(camera: Mapping[str, Any]) -> dict[str, str]:
     return {"name": name, "photos": count(camera.get("photos")), "size": size, "focal": focal}
 
 
-def _calibrated(camera: Mapping[str, Any]) -> dict[str, str]:
+def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str, str]:
+    """A camera's lens as it was found, and what of it was freed."""
     prior, focal = camera.get("prior_focal_px"), camera.get("focal_px")
     change = (focal / prior - 1.0) if camera.get("has_prior") and prior and focal else math.nan
     told = f"{change:+.2%}".replace("%", " %") if math.isfinite(change) else "–"
     stated = f"{number(prior, 1)} px" if camera.get("has_prior") else "not stated"
-    return {"model": str(camera.get("model", "")), "prior": stated, "focal": f"{number(focal, 1)} px", "change": told}
+    model = str(camera.get("model", ""))
+    if lens.get("freed"):
+        model += f" ({', '.join(str(name) for name in lens['freed'])})"
+    return {"model": model, "prior": stated, "focal": f"{number(focal, 1)} px", "change": told}
 
 
 def _tried(row: Mapping[str, Any]) -> dict[str, str]:
