@@ -138,16 +138,19 @@ def _tied(
     return Ties(rows, seen[:, :2], points, poses_, places_, pixels_, limits_, cells_[0])
 
 
-def fit_ties(ties: Ties, chosen: Bool[np.ndarray, " k"], seed: int) -> tuple[Similarity, Bool[np.ndarray, " k"]] | None:
+def fit_ties(
+    ties: Ties, chosen: Bool[np.ndarray, " k"], seed: int, least: int = LEAST_INLIERS
+) -> tuple[Similarity, Bool[np.ndarray, " k"]] | None:
     """The similarity from there to here that most of the chosen ties agree with, and which of all ties do.
 
     Args:
         ties: All.
         chosen: Those to fit to.
         seed: Of the lots.
+        least: Ties that have to agree.
     """
     rows = np.flatnonzero(chosen)
-    if len(rows) < LEAST_INLIERS:
+    if len(rows) < least:
         return None
     generator = np.random.default_rng(seed)
     draws = np.stack([generator.permutation(len(rows))[:3] for _ in range(TRIALS)])
@@ -165,7 +168,7 @@ def fit_ties(ties: Ties, chosen: Bool[np.ndarray, " k"], seed: int) -> tuple[Sim
         if similarity is None:
             return None
         inliers = agree(ties, similarity) & chosen
-        if np.count_nonzero(inliers) < LEAST_INLIERS:
+        if np.count_nonzero(inliers) < least:
             return None
         scale, rotation, translation = fit_similarity(
             ties.points[1][inliers], ties.points[0][inliers], np.ones(int(inliers.sum()))
@@ -205,7 +208,7 @@ def _foretells(ties: Ties, seed: int) -> bool:
     _, order = np.unique(ties.rows[:, 0], return_inverse=True)
     for odd in (0, 1):
         mine = order % 2 == odd
-        fitted = fit_ties(ties, mine, seed)
+        fitted = fit_ties(ties, mine, seed, LEAST_INLIERS // 2)
         if fitted is None:
             return False
         own, others = fitted[1][mine].mean(), fitted[1][~mine].mean()

@@ -53,11 +53,11 @@ def texture(seed: int) -> np.ndarray:
     return np.clip(128 + 34 * total, 0, 255).astype(np.float32)
 
 
-def poses(count: int) -> list[np.ndarray]:
+def poses(count: int, step_deg: float = 9.0) -> list[np.ndarray]:
     """4x4 cam_from_world of cameras on an arc that look into the corner at the origin; z is up."""
     found = []
     for number in range(count):
-        angle = math.radians(20 + 9.0 * number)
+        angle = math.radians(20 + step_deg * number)
         centre = np.array([4.2 * math.cos(angle), 4.2 * math.sin(angle), 1.2 + 0.25 * (number % 3)])
         forward = np.array([0.6, 0.6, 0.7]) - centre
         forward /= np.linalg.norm(forward)
@@ -132,6 +132,6 @@ def with_parts(inputs: Inputs, threads: int = 1, **parts: Path) -> Inputs:
     return Inputs({**inputs.parts, **more}, inputs.photos_dir, machine=Machine(threads=threads))
 
 
-def room(names: Sequence[str], seed: int = 0) -> dict[str, np.ndarray]:
+def room(names: Sequence[str], seed: int = 0, step_deg: float = 9.0) -> dict[str, np.ndarray]:
     """A photo for each name, along the arc."""
-    return {name: render(pose, seed) for name, pose in zip(names, poses(len(names)), strict=True)}
+    return {name: render(pose, seed) for name, pose in zip(names, poses(len(names), step_deg), strict=True)}

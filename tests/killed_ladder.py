@@ -1,0 +1,34 @@
+"""Runs the line of lines/leftovers.py, and kills itself once a stage tells of something; a program for
+test_ladder_kills.py.
+
+Arguments: photos, out, what has to be told ("" to live), threads.
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+from splatpipe.pipeline.engine.config import resolve
+from splatpipe.pipeline.engine.events import Event
+from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.stage import Machine
+
+sys.path.insert(0, str(Path(__file__).parent / "lines"))
+import leftovers
+
+
+def main(photos: str, out: str, told: str, threads: str) -> None:
+    def die(event: Event) -> None:
+        if told and event.kind == "progress" and told in str(event.data["what"]):
+            os.killpg(os.getpgid(0), signal.SIGKILL)
+
+    config = resolve(leftovers.LineConfig, [{"sparse": {"mapper": "incremental", "lens": "simple"}}])
+    with open_session(
+        Request(leftovers.LINE, config, Path(photos), Path(out), Machine("cpu", int(threads))), die
+    ) as run:
+        run.walk()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
