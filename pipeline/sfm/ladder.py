@@ -39,7 +39,7 @@ Model: TypeAlias = pycolmap.Reconstruction
 
 PAIRS_A_PHOTO = 20  # as many as `matches` tries for each
 ROUNDS = 4  # of registration: photos that were just placed bring points for the next
-PARTNERS = 5  # placed photos that get stronger keypoints, too, for each that is left
+PARTNERS = 3  # placed photos that get stronger keypoints, too, for each that is left
 MOST_STRONGER = 12  # photos looked at again, or a share of all: no more than mapping costs
 MOST_STRONGER_SHARE = 0.125
 WEAK_SHARE = 0.5  # of the placed photos' median keypoints; fewer are worth another look

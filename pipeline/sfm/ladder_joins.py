@@ -30,6 +30,7 @@ from splatpipe.pipeline.sfm.verified import Verified
 
 SLACK = 3.0  # times a pose's tolerance: both models err, and neither was adjusted to the other
 TRIALS = 2000  # finds three right pairs with 99.9 % while a sixth of all are right
+SCORED = 1000  # ties that a trial is held against: enough to tell the best, whatever the models' size
 REFITS = 5  # rounds of fitting to the inliers
 LEAST_LINKS = 2  # pairs of photos between the models; one alone may show a twin
 
@@ -59,6 +60,13 @@ class Ties:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def only(self, chosen: Int64[np.ndarray, " n"]) -> Ties:
+        """Some of them."""
+        both = (self.points, self.poses, self.places, self.pixels, self.limits)
+        points, poses, places, pixels, limits = ((one[chosen], two[chosen]) for one, two in both)
+        cells = self.cells[chosen]
+        return Ties(self.rows[chosen], self.links[chosen], points, poses, places, pixels, limits, cells)
 
 
 def join(
@@ -156,11 +164,12 @@ def fit_ties(
     draws = np.stack([generator.permutation(len(rows))[:3] for _ in range(TRIALS)])
     there, here = ties.points[1][rows[draws]], ties.points[0][rows[draws]]
     scales, rotations, translations = fit_similarity(there, here, np.ones(draws.shape))
+    scored = ties.only(np.sort(generator.permutation(rows)[:SCORED]))
     best: tuple[int, Similarity | None] = (0, None)
     for scale, rotation, translation in zip(scales, rotations, translations, strict=True):
         if np.isfinite(scale) and scale > 0.0:
             trial = Similarity(float(scale), rotation, translation)
-            held = int(np.count_nonzero(agree(ties, trial)[rows]))
+            held = int(np.count_nonzero(agree(scored, trial)))
             if held > best[0]:
                 best = held, trial
     similarity = best[1]
