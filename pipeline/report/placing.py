@@ -73,6 +73,9 @@ def _frame_facts(
         ("Vertical datum", _vertical(str(frame.get("vertical_datum", "unknown")), named=named)),
         ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel"),
     ]
+    told = (report.get("uncertainty") or {}).get("sentence")
+    if told:
+        facts.append(("By the positions alone", str(told)))
     if control.get("file"):
         told = f"{control['file']}, in {control.get('crs')}; marks taken to be good to {control.get('sigma_pixel')} px"
         facts.append(("Control file", told))

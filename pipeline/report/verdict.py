@@ -163,8 +163,10 @@ def _focal(holdings: Holdings) -> Finding | None:
 def _place(holdings: Holdings) -> Finding | None:
     if "georef" not in holdings.artifacts:
         return None
-    if holdings.read("georef.frame").get("kind") != "enu":
-        text = "The model has neither scale nor place: no photo has a usable position, and there is no control."
+    frame = holdings.read("georef.frame")
+    if frame.get("kind") != "enu":
+        why = str(frame.get("note", "")).removeprefix("Arbitrary scale: ").partition(". Up is from")[0].rstrip(".")
+        text = f"The model has neither scale nor place: {why or 'nothing tells them'}, and no control places it."
         return Finding("doubt", "Georeferencing", f"{text} Nothing in it can be measured in metres.")
     report = holdings.read("georef.accuracy")
     tables, gsd = report["tables"], report.get("gsd_m")
@@ -179,7 +181,9 @@ def _place(holdings: Holdings) -> Finding | None:
     off = (
         f"they scatter by {length(gps.get('rmse_horizontal_m'))} horizontally, {length(gps.get('rmse_up_m'))} in height"
     )
-    text = f"Placed by the photos' own positions alone ({off}): no control or check point proves the accuracy."
+    told = (report.get("uncertainty") or {}).get("sentence")
+    worth = f", {told}" if told else ""
+    text = f"Placed by the photos' own positions alone ({off}){worth}: no control or check point proves it."
     return Finding("doubt", "Accuracy", text)
 
 
