@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -16,6 +16,7 @@ import pycolmap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.scene.dataset import some
 from splatpipe.pipeline.scene.photos import load_photo_list
+from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.judging import judge
 from splatpipe.pipeline.sfm.ladder import climb
@@ -39,6 +40,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         capture = _capture(inputs, Path(scratch))
         found = climb(capture, reconstruct(capture, config, report), config, report)
+        hold_few(found.model, found.verified, capture.cameras)
         stated = stated_lenses(json.loads(inputs["ingest.lenses"].read_text(encoding="utf-8"))["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
@@ -46,10 +48,11 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     write_model(model, out / "sparse" / "0")
     outside = outside_reasons(model, found.verified, capture.cameras, capture.positions)
     verdict = judge(model, found.verified, capture.cameras).joined(outside)
-    summary = {**_summary(model, found), "lenses": list(lenses), "verdict": verdict.as_json()}
+    summary = {**_summary(model, found, capture.cameras), "lenses": list(lenses), "verdict": verdict.as_json()}
     text = json.dumps(_without_times(summary), ensure_ascii=False, indent=1) + "\n"
     (out / "models.json").write_text(text, encoding="utf-8")
     _warn(summary, report)
+    tell_cameras(summary["cameras"], report)
     tell_lenses(summary, report)
     return {**summary, "unregistered": len(summary["unregistered"]), "other_models": len(summary["other_models"])}
 
@@ -114,9 +117,9 @@ def canonical(model: Model, colours: npt.NDArray[np.uint8], counts: npt.NDArray[
     return result
 
 
-def _summary(model: Model, found: Found) -> dict[str, JSON]:
+def _summary(model: Model, found: Found, cameras: Sequence[JSON]) -> dict[str, JSON]:
     registered = set(model.reg_image_ids())
-    names, priors = found.verified.names, found.verified.cameras
+    names = found.verified.names
     return {
         "photos": len(names),
         "registered": len(registered),
@@ -125,16 +128,7 @@ def _summary(model: Model, found: Found) -> dict[str, JSON]:
         "mean_track_length": round(model.compute_mean_track_length(), 3),
         "tried": list(found.tried),
         "ladder": list(found.rungs),
-        "cameras": [
-            {
-                "id": number,
-                "model": camera.model_name,
-                "focal_px": round(camera.mean_focal_length(), 2),
-                "prior_focal_px": round(priors[number].mean_focal_length(), 2),
-                "has_prior": priors[number].has_prior_focal_length,
-            }
-            for number, camera in sorted(model.cameras.items())
-        ],
+        "cameras": camera_rows(model, found.verified, cameras),
         "unregistered": [name for number, name in sorted(names.items()) if number not in registered],
         "other_models": [
             sorted(other.images[number].name for number in other.reg_image_ids()) for other in found.others

@@ -38,9 +38,10 @@ def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: boo
         ("Masks", _masks(summary)),
     ]
     cameras = holdings.read("ingest.cameras").get("cameras", [])
+    told = summary.get("camera_groups") or [{}] * len(cameras)
     chapter: Chapter = {
         "facts": [fact for fact in facts if fact[1]],
-        "cameras": [_camera(camera) for camera in cameras],
+        "cameras": [_camera(camera, row) for camera, row in zip(cameras, told, strict=False)],
         "left_out": left_out[:MOST_LISTED],
         "left_out_more": max(0, len(left_out) - MOST_LISTED),
     }
@@ -154,12 +155,16 @@ def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
     return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
 
 
-def _camera(camera: Mapping[str, Any]) -> dict[str, str]:
+def _camera(camera: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, str]:
     make, model = str(camera.get("make") or ""), str(camera.get("model_name") or "")
     name = (model if model.casefold().startswith(make.casefold()) else f"{make} {model}").strip() or "unknown camera"
     known = str(camera.get("focal_source", "")).replace("-", " ")
     focal = f"{number(camera.get('focal_px'), 1)} px" + (f" ({known})" if known else "")
     size = f"{count(camera.get('width'))} × {count(camera.get('height'))}"
+    if told.get("exif_size"):
+        size += " ({} from {} × {})".format(
+            "cropped" if told.get("cropped") else "reduced", *map(count, told["exif_size"])
+        )
     return {"name": name, "photos": count(camera.get("photos")), "size": size, "focal": focal}
 
 
@@ -172,7 +177,17 @@ def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str,
     model = str(camera.get("model", ""))
     if lens.get("freed"):
         model += f" ({', '.join(str(name) for name in lens['freed'])})"
-    return {"model": model, "prior": stated, "focal": f"{number(focal, 1)} px", "change": told}
+    source = str(camera.get("focal_source") or "").replace("-", " ") if camera.get("has_prior") else ""
+    photos = f"{count(camera.get('placed'))} of {count(camera.get('photos'))}"
+    return {
+        "name": str(camera.get("name") or "unknown camera"),
+        "photos": photos,
+        "model": model,
+        "prior": stated + (f" ({source})" if source else ""),
+        "focal": f"{number(focal, 1)} px",
+        "change": told,
+        "error": f"{number(camera.get('error_px'), 2)} px",
+    }
 
 
 def _tried(row: Mapping[str, Any]) -> dict[str, str]:

@@ -26,7 +26,14 @@ from splatpipe.pipeline.scene.photos import (
     save_photo_list,
 )
 from splatpipe.pipeline.sfm.lens_model import StatedLens
-from splatpipe.stages.ingest.cameras import CameraGroup, cameras_json, group_cameras, refused_calibrations
+from splatpipe.stages.ingest.cameras import (
+    CameraGroup,
+    cameras_json,
+    describe_cameras,
+    group_cameras,
+    refused_calibrations,
+    tell_cameras,
+)
 from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
 from splatpipe.stages.ingest.convert import convert_photo, save_png, scale_of
 from splatpipe.stages.ingest.doubts import FAR_M, median_distance_m
@@ -105,6 +112,8 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places)
     _tell_positions(positions, report)
+    described = describe_cameras(photos, groups, camera_of)
+    tell_cameras(described, report)
     if colmap_model(inputs.photos_dir) is None:  # a given model has its calibration
         _tell_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
@@ -116,6 +125,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "photos": len(photos),
         "left_out": len(left_out),
         "cameras": len(groups),
+        "camera_groups": described,
         "focal_sources": sorted({group.focal_source for group in groups}),
         **_accuracy(positions),
         "masks": len(masked),

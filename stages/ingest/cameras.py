@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.scene.exif import Exif
 from splatpipe.pipeline.scene.sensors import sensor_size_mm
 from splatpipe.pipeline.scene.xmp import xmp_number
@@ -23,6 +23,9 @@ SHAPE_TOLERANCE = 0.03  # between a sensor's specified shape and that of the pic
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 WIDEST_SENSOR = 1.51  # width over height; wider pictures are cut from a sensor of 4:3
 PANORAMA = 2.5  # wider still, no sensor's shape
+CAMERAS_TOLD = 10  # on the console; the report has them all
+EQUIVALENT_TOLERANCE = 0.05  # of the 35 mm equivalent, which is rounded; what differs by more is digital zoom
+ZOOM_TOLERANCE = 0.01  # of the focal length: within it photos share a lens, as focus and heat move it by as much
 CALIBRATION_STRAY = 0.15  # from the sensor's focal length: more is another unit, or another mode of the camera
 
 
@@ -127,7 +130,10 @@ def refused_calibrations(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 
 def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], dict[str, int]]:
-    """Group photos by make, model, size, focal length, and whether the drone has taken their distortion out.
+    """Group photos by body (make, model, serial number), size, zoom, and whether the drone took their distortion out.
+
+    Photos held upright have the grid of the others where EXIF turns them, and are of the same group; where their pixels
+    were turned, they are of another with the same focal length to begin with.
 
     Args:
         photos: Those that take part, sorted by name.
@@ -135,16 +141,100 @@ def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], di
     Returns:
         The groups in the order of their first photos, and each photo's group by its name.
     """
-    members: dict[tuple[object, ...], list[CheckedPhoto]] = {}
+    alike: dict[tuple[object, ...], list[CheckedPhoto]] = {}
     for photo in photos:
         exif = photo.exif
-        focal_mm = round(exif.focal_mm, 2) if exif.focal_mm is not None else None
         dewarped = photo.xmp.get("drone-dji:DewarpFlag") == "1"
-        key = (exif.make, exif.model, photo.width, photo.height, focal_mm, exif.focal_35mm, dewarped)
-        members.setdefault(key, []).append(photo)
-    groups = [_group(list(group)) for group in members.values()]
-    index = {photo.name: number for number, group in enumerate(members.values()) for photo in group}
+        key = (exif.make, exif.model, exif.serial, photo.width, photo.height, dewarped)
+        alike.setdefault(key, []).append(photo)
+    members = [zoom for group in alike.values() for zoom in _by_zoom(group)]
+    order = {photo.name: number for number, photo in enumerate(photos)}
+    members.sort(key=lambda group: order[group[0].name])
+    groups = [_group(group) for group in members]
+    index = {photo.name: number for number, group in enumerate(members) for photo in group}
     return groups, index
+
+
+def _by_zoom(photos: list[CheckedPhoto]) -> list[list[CheckedPhoto]]:
+    """Photos of one body by the zoom: around the focal length that most of them have, then around that of most others.
+
+    A zoom states every step of its motor. A camera a step would be one a photo, which no photo can calibrate.
+    """
+    left, groups = list(photos), []
+    while left:
+        counts = Counter((photo.exif.focal_mm, photo.exif.focal_35mm) for photo in left)
+        most = min(counts, key=lambda zoom: (-counts[zoom], zoom[0] or 0.0, zoom[1] or 0.0))
+        near = [_same_zoom((photo.exif.focal_mm, photo.exif.focal_35mm), most) for photo in left]
+        groups.append([photo for photo, is_near in zip(left, near, strict=True) if is_near])
+        left = [photo for photo, is_near in zip(left, near, strict=True) if not is_near]
+    return groups
+
+
+def _same_zoom(zoom: tuple[float | None, float | None], other: tuple[float | None, float | None]) -> bool:
+    """By focal length in millimetres and as 35 mm equivalent; the latter alone tells of digital zoom."""
+    return all(
+        mine is theirs if mine is None or theirs is None else abs(mine - theirs) <= tolerance * theirs
+        for mine, theirs, tolerance in zip(zoom, other, (ZOOM_TOLERANCE, EQUIVALENT_TOLERANCE), strict=True)
+    )
+
+
+def describe_cameras(
+    photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int]
+) -> list[JSON]:
+    """A row a camera for people: its name, photos, pixels, focal length with its source, and what size EXIF speaks of.
+
+    ``exif_size`` is None where that is the photos' size, or not stated; ``cropped`` tells that it has another shape.
+    """
+    first = {camera_of[photo.name]: photo for photo in reversed(photos)}
+    rows = []
+    for number, group in enumerate(groups):
+        exif = first[number].exif
+        taken = (exif.width, exif.height)
+        differs = None not in taken and sorted(map(str, taken)) != sorted(map(str, (group.width, group.height)))
+        rows.append(
+            {
+                "name": camera_name(group.make, group.model_name),
+                "focal_mm": exif.focal_mm,
+                "photos": group.photos,
+                "size": [group.width, group.height],
+                "focal_px": round(group.focal_px, 2),
+                "focal_source": group.focal_source,
+                "exif_size": list(taken) if differs else None,
+                "cropped": picture_scale(exif, group.width, group.height) is None,
+            }
+        )
+    return rows
+
+
+def camera_name(make: str, model: str) -> str:
+    """What people call a camera."""
+    told = model if model.casefold().startswith(make.casefold()) else f"{make} {model}"
+    return told.strip() or "unknown camera"
+
+
+def tell_cameras(rows: Sequence[JSON], report: Reporter) -> None:
+    """Name the cameras where there are several, and what was made of EXIF that speaks of another picture size."""
+    if len(rows) > 1:
+        for row in rows[:CAMERAS_TOLD]:
+            zoom = f", {row['focal_mm']:g} mm" if row["focal_mm"] else ""
+            width, height = row["size"]
+            focal = f"{row['focal_px']:.0f} px ({row['focal_source'].replace('-', ' ')})"
+            report.note(f"{row['name']}{zoom}: {row['photos']} photos of {width} × {height}, focal length {focal}.")
+        if len(rows) > CAMERAS_TOLD:
+            report.note(f"And {len(rows) - CAMERAS_TOLD} more cameras.")
+    for row in rows[:CAMERAS_TOLD]:
+        if row["exif_size"] is None:
+            continue
+        (width, height), (taken_width, taken_height) = row["size"], row["exif_size"]
+        sizes = (
+            f"{row['photos']} photos of the {row['name']} have {width} × {height} pixels, where their EXIF speaks of"
+        )
+        sizes += f" {taken_width} × {taken_height}"
+        if row["cropped"]:
+            report.note(f"{sizes}: another shape, so they were cropped, and EXIF does not tell their focal length.")
+        else:
+            factor = max(width, height) / max(taken_width, taken_height)
+            report.note(f"{sizes}: they count as reduced, and its focal length is scaled by {factor:.3g}.")
 
 
 def cameras_json(groups: Sequence[CameraGroup]) -> JSON:

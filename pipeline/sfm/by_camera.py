@@ -1,0 +1,129 @@
+"""Captures of several cameras: what became of each, and those of so few photos that they cannot be calibrated."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pycolmap
+
+from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.sfm.focal import adjust_within
+from splatpipe.pipeline.sfm.verified import Verified
+
+CAMERAS_TOLD = 10  # on the console; the report has them all
+FEW_PHOTOS = 3  # of a camera: fewer trade its focal length for their distance
+WELL_KNOWN = ("xmp-dewarp", "xmp-calibrated", "sensor-table", "focal-plane-resolution")  # a 35 mm equivalent is not
+STATED_STRAY = 0.05  # of such a focal length: what lenses stray from it by
+KIN_STRAY = 0.02  # of one that other photos of the same body and zoom have been calibrated to
+
+
+def hold_few(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[int]:
+    """Bring the focal lengths of cameras of one or two photos back to what is known of them, and adjust, in place.
+
+    A single photo, far from others or of a flat thing, leaves its focal length free, and mapping lets it run away. What
+    is known is what other photos of the same body and zoom were calibrated to (in another size, or turned), else what
+    the metadata state. A model whose cameras are all sound is left as it is, to the bit.
+
+    Args:
+        model: As mapping left it.
+        verified: Its view graph, with the cameras as they were before mapping.
+        cameras: The camera groups of ``ingest.cameras``; COLMAP's ids count them from 1.
+
+    Returns:
+        COLMAP's ids of the cameras that were brought back.
+    """
+    placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
+    few = [number for number, count in sorted(placed.items()) if count < FEW_PHOTOS]
+    if 2 * sum(placed[number] for number in few) > model.num_reg_images():
+        return []  # a collection of many people's photos: its cameras hold each other
+    strayed = {}
+    for number in few:
+        known = _known(number, model, verified, cameras, placed)
+        if known is not None and abs(model.cameras[number].mean_focal_length() / known[0] - 1.0) > known[1]:
+            strayed[number] = known[0]
+    if strayed:
+        adjust_within(model, strayed, KIN_STRAY)
+    return list(strayed)
+
+
+def _known(
+    number: int,
+    model: pycolmap.Reconstruction,
+    verified: Verified,
+    cameras: Sequence[JSON],
+    placed: Mapping[int, int],
+) -> tuple[float, float] | None:
+    """A camera's focal length in pixels as far as anything but its photos tells, and by how much it may be off."""
+    own, body = verified.cameras[number].mean_focal_length(), _body(cameras, number)
+    changes = [
+        model.cameras[other].mean_focal_length() / verified.cameras[other].mean_focal_length()
+        for other, count in sorted(placed.items())
+        if count >= FEW_PHOTOS and body[1] and _body(cameras, other) == body
+    ]
+    if changes:
+        return own * float(np.median(changes)), KIN_STRAY
+    return (own, STATED_STRAY) if body[2] in WELL_KNOWN else None
+
+
+def _body(cameras: Sequence[JSON], number: int) -> tuple[str, str, str, float]:
+    """Make and model, where the focal length is from, and what it is over the longer side (the zoom)."""
+    group = cameras[number - 1] if number <= len(cameras) else {}
+    longer = max(group.get("width", 1), group.get("height", 1))
+    zoom = round(float(group.get("focal_px", 0.0)) / longer, 2)
+    return str(group.get("make", "")), str(group.get("model_name", "")), str(group.get("focal_source", "")), zoom
+
+
+def camera_rows(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[JSON]:
+    """A row a camera that has photos in the model: what it is, photos, how many were placed, focal lengths, error."""
+    placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
+    photos = Counter(verified.camera_of.values())
+    errors = _errors_px(model)
+    rows = []
+    for number, camera in sorted(model.cameras.items()):
+        group = cameras[number - 1] if number <= len(cameras) else {}
+        prior = verified.cameras[number]
+        rows.append(
+            {
+                "id": number,
+                "name": f"{group.get('make', '')} {group.get('model_name', '')}".strip(),
+                "photos": photos[number],
+                "placed": placed[number],
+                "model": camera.model_name,
+                "focal_px": round(camera.mean_focal_length(), 2),
+                "prior_focal_px": round(prior.mean_focal_length(), 2),
+                "has_prior": prior.has_prior_focal_length,
+                "focal_source": str(group.get("focal_source", "")),
+                "error_px": errors.get(number),
+            }
+        )
+    return rows
+
+
+def tell_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None:
+    """Say what became of each camera, where there are several."""
+    for row in rows[:CAMERAS_TOLD] if len(rows) > 1 else ():
+        focal = f"{row['focal_px']:.0f} px ({row['focal_source'] or 'stated'}: {row['prior_focal_px']:.0f})"
+        placed = f"{row['placed']} of {row['photos']} photos"
+        error = "" if row["error_px"] is None else f", error {row['error_px']:.2f} px"
+        report.note(f"Camera {row['id']}, {row['name'] or 'unknown'}: {placed}, focal length {focal}{error}.")
+
+
+def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
+    """Mean reprojection error of each camera's observations."""
+    result = {}
+    for number in sorted(model.cameras):
+        camera, total, count = model.cameras[number], 0.0, 0
+        for image in (model.images[i] for i in sorted(model.reg_image_ids())):
+            seen = [point for point in image.points2D if point.has_point3D()] if image.camera_id == number else []
+            if seen:
+                pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+                places = np.array([model.points3D[point.point3D_id].xyz for point in seen])
+                shown = np.asarray(camera.img_from_cam(places @ pose[:, :3].T + pose[:, 3]), np.float64)
+                off = np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1)
+                total, count = total + float(off[np.isfinite(off)].sum()), count + int(np.isfinite(off).sum())
+        if count and math.isfinite(total):
+            result[number] = round(total / count, 4)
+    return result
