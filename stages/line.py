@@ -17,7 +17,7 @@ from splatpipe.stages.options import (
 
 INGEST = Stage(
     "ingest",
-    version=2,
+    version=3,
     config=IngestConfig,
     reads=("source.photos", "source.geo", "source.lens"),
     parts={
