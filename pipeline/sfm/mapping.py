@@ -23,9 +23,9 @@ Tell: TypeAlias = Callable[[int, int, str], None]
 """Told a few times a second: photos placed, of how many, and what is being done."""
 
 
-BEST_KEYPOINTS = 700  # a photo; 400 placed as many photos of ochota and copr, yet plain COLMAP begins with 100 a pair
+BEST_KEYPOINTS = 400  # a photo; 700 placed no more photos of any capture, and took up to twice the time
 WORTH_IT = 0.9  # of the matches; where more are left after choosing, choosing saves nothing
-GROWTH = 1.4  # of photos or points between adjustments over everything; COLMAP's 1.1 makes three times as many
+GROWTH = 1.5  # of photos or points between adjustments over everything; COLMAP's 1.1 makes four times as many
 GOOD_ENOUGH = 1e-4  # relative change of the cost at which these adjustments end
 ONE_THREAD = 1  # with several, COLMAP's and Ceres' sums depend on which ends first
 

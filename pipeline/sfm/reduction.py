@@ -16,7 +16,7 @@ from jaxtyping import Bool, Int64
 from splatpipe.pipeline.sfm.verified import Verified
 
 GRID = 8  # cells along either side of a photo; its keypoints are taken cell by cell
-WEAK_PAIR = 60  # verified matches; of pairs with no more, all are kept: COLMAP wants 15, and 100 to begin with
+PAIR_FLOOR = 60  # matches that every pair keeps if it has them: twice what COLMAP places a photo by
 
 
 def best_keypoints(verified: Verified, wanted: int) -> dict[int, Bool[np.ndarray, " n"]]:
@@ -36,31 +36,43 @@ def best_keypoints(verified: Verified, wanted: int) -> dict[int, Bool[np.ndarray
     numbers = sorted(verified.keypoints)
     counts = np.array([len(verified.keypoints[number]) for number in numbers], np.int64)
     starts = dict(zip(numbers, (np.cumsum(counts) - counts).tolist(), strict=True))
-    first, second, weak = _edges(verified, starts)
+    first, second, pair = _edges(verified, starts)
     degree = np.bincount(np.concatenate([first, second]), minlength=int(counts.sum()))
     chosen = np.zeros(int(counts.sum()), bool)
-    chosen[first[weak]] = chosen[second[weak]] = True
     partners, offsets = _neighbours(first, second, len(chosen))
     for number in numbers:
         begin, end = starts[number], starts[number] + len(verified.keypoints[number])
         new = begin + _spread_best(verified.keypoints[number], degree[begin:end], chosen[begin:end], wanted)
         chosen[new] = True
         chosen[_gather(partners, offsets, new)] = True
+    more = _up_to_floor(pair, chosen[first] & chosen[second], degree[first] + degree[second])
+    chosen[first[more]] = chosen[second[more]] = True
     return {number: chosen[starts[number] : starts[number] + len(verified.keypoints[number])] for number in numbers}
 
 
 def _edges(
     verified: Verified, starts: dict[int, int]
-) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Both ends of each verified match among all keypoints, photo after photo, and whether its pair has few."""
+) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
+    """Both ends of each verified match among all keypoints, photo after photo, and the number of its pair."""
     pairs = sorted(verified.matches)
     if not pairs:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool)
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
     rows = [verified.matches[pair].astype(np.int64) for pair in pairs]
     first = np.concatenate([starts[i] + matches[:, 0] for (i, _), matches in zip(pairs, rows, strict=True)])
     second = np.concatenate([starts[j] + matches[:, 1] for (_, j), matches in zip(pairs, rows, strict=True)])
-    weak = np.concatenate([np.full(len(matches), len(matches) <= WEAK_PAIR) for matches in rows])
-    return first, second, weak
+    return first, second, np.repeat(np.arange(len(pairs)), [len(matches) for matches in rows])
+
+
+def _up_to_floor(
+    pair: Int64[np.ndarray, " m"], kept: Bool[np.ndarray, " m"], degree: Int64[np.ndarray, " m"]
+) -> Int64[np.ndarray, " _"]:
+    """Matches to add so that each pair keeps its floor: those whose ends are verified most often."""
+    missing = PAIR_FLOOR - np.bincount(pair[kept], minlength=int(pair.max(initial=-1)) + 1)
+    left = np.flatnonzero(~kept & (missing[pair] > 0))
+    order = left[np.lexsort((left, -degree[left], pair[left]))]
+    sizes = np.bincount(pair[order], minlength=len(missing))
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.asarray(order[rank < missing[pair[order]]])
 
 
 def _neighbours(

@@ -1,0 +1,250 @@
+"""A flight whose cameras are known, as a database that matching might have left: grid strips and oblique ones.
+
+The ground is rough (houses and trees stand on it), keypoints err, a fifth of each pair's verified matches are wrong and
+lie along the epipolar line, as wrong ones do that a check of two views lets through, and the focal length that the
+database states is off. Pairs are chosen by the line's own rules from positions that err.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.sfm.footprints import Views
+from splatpipe.pipeline.sfm.pairs import Layout, Pair, select_pairs
+
+WIDTH, HEIGHT, FOCAL_PX, RADIAL = 2000, 1500, 1500.0, -0.04
+FLYING_M = 60.0
+GSD_M = FLYING_M / FOCAL_PX
+ROUGH_M = 8.0  # the ground's heights, from the lowest to the highest
+FORWARD_M, SIDE_M = 15.0, 26.0  # between photos of a strip and between strips: three quarters and two thirds overlap
+OBLIQUE = 5  # every so many strips one looks to the side, 35° off the vertical
+OBLIQUE_DEG = 35.0
+LONGEST_TRACK = 12
+OBSERVATIONS = 1700  # a photo; what is at the rim has fewer
+DETECTED = 0.75  # of the points in a photo have a keypoint there
+MATCHED = 0.8  # of the keypoints that two photos share
+NOISE_PX = 0.7
+WRONG = 0.2  # of the verified matches
+EPIPOLAR_PX = 4.0  # from the line, which COLMAP's check of two views lets pass
+FOCAL_OFF = 1.03
+POSITION_NOISE_M = 2.0
+LEAST_MATCHES = 15
+
+
+@dataclass(frozen=True)
+class Flight:
+    """The truth; photo i has COLMAP's number i + 1.
+
+    Attributes:
+        centres_m: East, north, up.
+        cam_from_enu: Rotations; camera x right, y down, z forward.
+        points_m: On the ground and on what stands there.
+        photo: Of each observation, photo after photo.
+        point: Of each observation.
+        places: Of each observation with its noise, pixels.
+    """
+
+    centres_m: Float64[np.ndarray, "n 3"]
+    cam_from_enu: Float64[np.ndarray, "n 3 3"]
+    points_m: Float64[np.ndarray, "p 3"]
+    photo: Int64[np.ndarray, " m"]
+    point: Int64[np.ndarray, " m"]
+    places: Float64[np.ndarray, "m 2"]
+
+    def rows(self, photo: int) -> slice:
+        """Its observations; keypoint k of a photo is the k-th of them."""
+        first, last = np.searchsorted(self.photo, [photo, photo + 1])
+        return slice(int(first), int(last))
+
+
+def lens(off: float = 1.0) -> pycolmap.Camera:
+    """The true camera; its focal length off by a factor and then without distortion, where one is given."""
+    parameters = [FOCAL_PX * off, WIDTH / 2, HEIGHT / 2, RADIAL if off == 1.0 else 0.0]
+    return pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=parameters)
+
+
+def make_flight(count: int, seed: int, observations: int = OBSERVATIONS) -> Flight:
+    """Fly so many photos over ground without end, and see about so many points in each."""
+    rng = np.random.default_rng(seed)
+    centres, rotations = _poses(count, rng)
+    low, high = centres[:, :2].min(axis=0) - FLYING_M, centres[:, :2].max(axis=0) + FLYING_M
+    visible = (WIDTH / FOCAL_PX) * (HEIGHT / FOCAL_PX) * FLYING_M**2
+    points = np.empty((int(np.prod(high - low) * observations / DETECTED / visible), 3))
+    points[:, :2] = rng.uniform(low, high, (len(points), 2))
+    points[:, 2] = _heights(points[:, :2], rng)
+    seen = [_see(points, centres[i], rotations[i], rng) for i in range(count)]
+    photo = np.repeat(np.arange(count), [len(found) for found, _ in seen])
+    point = np.concatenate([found for found, _ in seen])
+    places = np.concatenate([where for _, where in seen])
+    kept = _capped(point, rng)
+    return Flight(centres, rotations, points, photo[kept], point[kept], places[kept])
+
+
+def _poses(count: int, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3 3"]]:
+    """Strips to and fro over a square, with a drone's tremble."""
+    across = max(1, round(np.sqrt(count * FORWARD_M / SIDE_M)))
+    along = -(-count // across)
+    centres, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
+    for number in range(count):
+        strip, step = divmod(number, along)
+        north = step if strip % 2 == 0 else along - 1 - step
+        centres[number] = [strip * SIDE_M, north * FORWARD_M, FLYING_M]
+        heading = 0.0 if strip % 2 == 0 else np.pi
+        tilt = np.radians(OBLIQUE_DEG) if strip % OBLIQUE == OBLIQUE - 1 else 0.0
+        rotations[number] = _tremble(rng) @ _turn(1, tilt) @ np.diag([1.0, -1.0, -1.0]) @ _turn(2, heading)
+    return centres + rng.normal(0.0, [0.8, 0.8, 0.5], (count, 3)), rotations
+
+
+def _turn(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
+    first, second = [other for other in range(3) if other != axis]
+    turn = np.eye(3)
+    turn[first, first] = turn[second, second] = np.cos(angle)
+    turn[first, second], turn[second, first] = -np.sin(angle), np.sin(angle)
+    return turn
+
+
+def _tremble(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:
+    angles = rng.normal(0.0, np.radians(1.5), 3)
+    return _turn(0, angles[0]) @ _turn(1, angles[1]) @ _turn(2, angles[2])
+
+
+def _heights(places: Float64[np.ndarray, "p 2"], rng: np.random.Generator) -> Float64[np.ndarray, " p"]:
+    """Rolling ground with boxes on it."""
+    rolling = np.sin(places[:, 0] / 37.0) * np.cos(places[:, 1] / 51.0)
+    block = np.floor(places / 14.0).astype(np.int64)
+    houses = rng.uniform(-1.0, 1.0, 4096)[(block[:, 0] * 61 + block[:, 1] * 17) % 4096]
+    return np.asarray(ROUGH_M / 4.0 * rolling + ROUGH_M / 2.0 * np.maximum(houses, 0.0))
+
+
+def _see(
+    points: Float64[np.ndarray, "p 3"],
+    centre: Float64[np.ndarray, " 3"],
+    rotation: Float64[np.ndarray, "3 3"],
+    rng: np.random.Generator,
+) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
+    """Points that a photo shows, and where, with noise."""
+    near = np.flatnonzero((np.abs(points[:, :2] - centre[:2]) < 2.5 * FLYING_M).all(axis=1))
+    local = (points[near] - centre) @ rotation.T
+    near, local = near[local[:, 2] > 1.0], local[local[:, 2] > 1.0]
+    inside = (np.abs(local[:, :2] / local[:, 2:]) < 1.0).all(axis=1)  # far outside the polynomial turns back
+    near, local = near[inside], local[inside]
+    places = np.asarray(lens().img_from_cam(local)) + rng.normal(0.0, NOISE_PX, (len(local), 2))
+    shown = (places > 0.0).all(axis=1) & (places < [WIDTH, HEIGHT]).all(axis=1) & (rng.random(len(local)) < DETECTED)
+    order = rng.permutation(np.flatnonzero(shown))  # keypoints have no order that mapping could use
+    return near[order], places[order]
+
+
+def _capped(point: Int64[np.ndarray, " m"], rng: np.random.Generator) -> np.ndarray:
+    """(m,) whether an observation stays when no point has more than the longest track."""
+    order = np.lexsort((rng.random(len(point)), point))
+    counts = np.bincount(point)
+    rank = np.arange(len(point)) - np.repeat(np.cumsum(counts) - counts, counts)
+    kept = np.empty(len(point), bool)
+    kept[order] = rank < LONGEST_TRACK
+    return kept
+
+
+def choose_pairs(flight: Flight, seed: int, neighbours: int = 20) -> list[Pair]:
+    """The line's own choice, from positions that err and angles of the gimbal."""
+    rng = np.random.default_rng(seed)
+    count = len(flight.centres_m)
+    centres = flight.centres_m + rng.normal(0.0, POSITION_NOISE_M, (count, 3))
+    enu_from_camera = np.swapaxes(flight.cam_from_enu, 1, 2)
+    half = np.tile([WIDTH / FOCAL_PX / 2.0, HEIGHT / FOCAL_PX / 2.0], (count, 1))
+    views = Views(centres, enu_from_camera, half, np.zeros(count), POSITION_NOISE_M)
+    names = [f"{number:05d}.jpg" for number in range(count)]
+    sigmas = np.full(count, POSITION_NOISE_M)
+    layout = Layout(names, np.arange(count, dtype=np.float64), centres, sigmas, views.axes, views)
+
+    def nothing() -> None:
+        raise AssertionError("all photos have positions")
+
+    return select_pairs(layout, "spatial", neighbours, nothing)  # type: ignore[arg-type]
+
+
+def matches(
+    flight: Flight, pairs: list[Pair], seed: int
+) -> Iterator[tuple[Pair, Int64[np.ndarray, "_ 2"], np.ndarray]]:
+    """Verified matches of the pairs that have enough, a fifth of them wrong, with the true fundamental matrix."""
+    rng = np.random.default_rng(seed)
+    pinhole = lens().calibration_matrix()
+    for i, j in pairs:
+        rows = flight.rows(i), flight.rows(j)
+        _, first, second = np.intersect1d(flight.point[rows[0]], flight.point[rows[1]], return_indices=True)
+        drawn = np.flatnonzero(rng.random(len(first)) < MATCHED)
+        true = np.stack([first[drawn], second[drawn]], axis=1)
+        fundamental = _fundamental(flight, i, j, pinhole)
+        wrong = _wrong(flight, rows, true, fundamental, round(len(true) * WRONG / (1.0 - WRONG)), rng)
+        found = np.concatenate([true, wrong])
+        if len(found) >= LEAST_MATCHES:
+            yield (i, j), found[np.lexsort((found[:, 1], found[:, 0]))], fundamental
+
+
+def _fundamental(flight: Flight, i: int, j: int, pinhole: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    rotation = flight.cam_from_enu[j] @ flight.cam_from_enu[i].T
+    x, y, z = flight.cam_from_enu[j] @ (flight.centres_m[i] - flight.centres_m[j])
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    inverse = np.linalg.inv(pinhole)
+    return np.asarray(inverse.T @ cross @ rotation @ inverse)
+
+
+def _wrong(
+    flight: Flight,
+    rows: tuple[slice, slice],
+    true: Int64[np.ndarray, "t 2"],
+    fundamental: Float64[np.ndarray, "3 3"],
+    wanted: int,
+    rng: np.random.Generator,
+) -> Int64[np.ndarray, "_ 2"]:
+    """Matches of keypoints that have no true one, close to the epipolar line, each keypoint once."""
+    places = flight.places[rows[0]], flight.places[rows[1]]
+    free = [np.delete(np.arange(len(places[side])), true[:, side]) for side in (0, 1)]
+    tried = rng.permutation(free[0])[: 2 * wanted]
+    lines = np.column_stack([places[0][tried], np.ones(len(tried))]) @ fundamental.T
+    lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    other = places[1][free[1]]
+    off = np.abs(lines[:, :1] * other[:, 0] + lines[:, 1:2] * other[:, 1] + lines[:, 2:])
+    lots = np.where(off <= EPIPOLAR_PX, rng.random(off.shape, np.float32), np.float32(2.0))
+    if not lots.size:
+        return np.zeros((0, 2), np.int64)
+    pick = lots.argmin(axis=1)
+    near = np.flatnonzero(lots[np.arange(len(tried)), pick] <= 1.0)
+    near = near[np.unique(pick[near], return_index=True)[1]]
+    near = rng.permutation(near)[:wanted]
+    return np.column_stack([tried[near], free[1][pick[near]]])
+
+
+def write_database(flight: Flight, path: Path, seed: int) -> int:
+    """Write what matching would leave; returns how many pairs have matches."""
+    prior = lens(FOCAL_OFF)
+    prior.has_prior_focal_length = True
+    pinhole = prior.calibration_matrix()
+    written = 0
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        database.write_camera(prior, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(prior.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+        for number in range(1, len(flight.centres_m) + 1):
+            image = pycolmap.Image(name=f"{number - 1:05d}.jpg", camera_id=1, image_id=number)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=number, rig_id=1)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            places = flight.places[flight.rows(number - 1)]
+            affine = np.tile([1.0, 0.0, 0.0, 1.0], (len(places), 1))
+            database.write_keypoints(number, np.hstack([places, affine]).astype(np.float32))
+        for (i, j), found, fundamental in matches(flight, choose_pairs(flight, seed), seed):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.F, geometry.E = fundamental, pinhole.T @ fundamental @ pinhole
+            geometry.inlier_matches = found.astype(np.uint32)
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
+            written += 1
+    return written
