@@ -69,6 +69,13 @@ def test_auto_takes_the_other_mapper_where_the_first_one_fails(weak: tuple[Ring,
     assert "doubtful" in first["why"] and first["placed"] < 12
 
 
+def test_photos_from_one_spot_are_not_placed_without_points(tmp_path: Path) -> None:
+    ring = make_ring(count=16, reach=3, points=3000, most=120, one_spot=True)
+    with pytest.raises(SplatpipeError, match="None of 16 photos could be placed") as refused:
+        reconstruct(capture_of(ring, tmp_path / "spot"), SparseConfig(mapper="global"), corner_photos.Recorder())
+    assert "from different places" in refused.value.hint
+
+
 def test_a_mapper_that_was_asked_for_is_not_replaced(weak: tuple[Ring, Capture]) -> None:
     found = reconstruct(weak[1], SparseConfig(mapper="global"), corner_photos.Recorder())
     assert [row["how"] for row in found.tried] == ["global"]

@@ -25,7 +25,7 @@ Level = Literal["good", "doubt", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubt", "bad")
 
 PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # share of the photos; Pix4D's quality report asks for 95 %
-TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "lens-file")
+TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "lens-file", "xmp-dewarp")
 # A trusted focal length errs by a few per cent (a Phantom's by 0.5, sensor tables by up to 5); a 35 mm equivalent was
 # seen 26 % off on a phone, and a resized file's can be anything within reason.
 FOCAL_TRUSTED = (0.10, 0.30)  # stray from which on it is a doubt, and bad

@@ -128,7 +128,7 @@ def checked_lens(lens: StatedLens) -> StatedLens:
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     rays = np.asarray(camera.cam_from_img(places), np.float64)
     back = np.asarray(camera.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], axis=1)), np.float64)
-    if not np.isfinite(rays).all() or float(np.abs(back - places).max()) > 0.1:
+    if not np.isfinite(rays).all() or not float(np.abs(back - places).max()) <= 0.1:
         raise ValueError("its distortion folds the picture over before the corners")
     return lens
 

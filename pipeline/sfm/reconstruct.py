@@ -24,6 +24,7 @@ Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]
 
 LEAST_SHARE = 0.1  # of the photos; a model of fewer is an accident
+LEAST_SEEN = 15  # points a photo, on average; COLMAP's least of a pair
 ENOUGH_SHARE = 0.5  # below it an attempt with lower demands is worth its time
 MOST_SHARE = 0.85  # below it the other mapper may do better; above it the ladder places what is left for less
 STRAY_UNOBSERVED = 0.03  # which a focal length may have where the photos cannot tell it
@@ -76,7 +77,7 @@ class Reconstructor:
         def tell(placed: int, total: int, what: str) -> None:
             self.report.progress(placed, total, what, "photos")
 
-        models = work(self.database, self.capture.scratch, chosen, tell)
+        models = [model for model in work(self.database, self.capture.scratch, chosen, tell) if _has_points(model)]
         tell(len(self.verified.names), len(self.verified.names), "placing photos")
         judgement = judge(models[0], self.verified, self.capture.cameras) if models else None
         answer = Answer(how, mapper, chosen, models, judgement, time.process_time() - began)
@@ -243,6 +244,11 @@ def _row(answer: Answer) -> dict[str, JSON]:
         "score": round(told.score, 4),
         "level": told.level,
     }
+
+
+def _has_points(model: Model) -> bool:
+    """Whether a model's photos see points; those taken from one spot are placed without any."""
+    return bool(model.compute_num_observations() >= LEAST_SEEN * model.num_reg_images())
 
 
 def _check_enough(count: int, config: SparseConfig, total: int) -> None:

@@ -20,6 +20,7 @@ SMALLEST_GROUP = 2  # photos; one by itself is a wrong photo, not a bend
 SMALLEST_SHARE = 0.02  # of the photos
 DENSE = 600  # photos up to which all eigenvectors are computed
 STEPS = 300  # of the power iteration above
+DIGITS = 8  # of the eigenvector that count: the last ones are another with every number of threads
 LEAST_MATCHES_APART = 1.0  # what holds a group that nothing holds counts as
 
 
@@ -84,7 +85,10 @@ def _eigenvector(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray,
         for _ in range(STEPS):
             vector = vector + signed @ vector
             vector /= np.linalg.norm(vector)
-    return np.asarray(vector / np.sqrt(degree))
+    vector = vector / np.sqrt(degree)
+    largest = np.abs(vector).max()
+    vector = np.round(vector / largest, DIGITS)
+    return np.asarray(vector * np.sign(vector[np.argmax(np.abs(vector))]))
 
 
 def _detached(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray, "m m"]) -> list[np.ndarray]:

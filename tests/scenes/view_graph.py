@@ -39,8 +39,13 @@ class Ring:
         return np.asarray(-pose[:, :3].T @ pose[:, 3])
 
 
-def make_ring(count: int = 24, reach: int = 5, points: int = 400, most: int = 60, prior: bool = True) -> Ring:
-    """Photos that have matches with those up to ``reach`` places further on, ``most`` with each."""
+def make_ring(
+    count: int = 24, reach: int = 5, points: int = 400, most: int = 60, prior: bool = True, one_spot: bool = False
+) -> Ring:
+    """Photos that have matches with those up to ``reach`` places further on, ``most`` with each.
+
+    They look inwards, or all outwards from one spot, past which nothing tells how far away things are.
+    """
     rng = np.random.default_rng(7)
     places = rng.uniform(-1.0, 1.0, (points, 3)) * [6.0, 6.0, 3.0]
     lens = make_lens("SIMPLE_RADIAL", [FOCAL, WIDTH / 2, HEIGHT / 2, 0.0])
@@ -50,6 +55,8 @@ def make_ring(count: int = 24, reach: int = 5, points: int = 400, most: int = 60
         angle = 2.0 * np.pi * number / count
         centre = np.array([20.0 * np.cos(angle), 20.0 * np.sin(angle), 6.0 + 2.0 * (number % 3)])
         pose = look_from(centre, rng.normal(0.0, 0.5, 3), 0.0)
+        if one_spot:
+            pose = look_from(np.zeros(3), centre * [1.0, 1.0, 0.1], 0.0)
         in_camera = places @ pose[:, :3].T + pose[:, 3]
         shown = np.asarray(lens.img_from_cam(in_camera))
         inside = (shown > 0.0).all(axis=1) & (shown < [WIDTH, HEIGHT]).all(axis=1)
