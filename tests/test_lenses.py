@@ -106,6 +106,17 @@ def test_a_stated_lens_is_refined_held_or_refused(scene: LensScene) -> None:
     assert rms(apart_px(mended.cameras[1], scene.lenses[1], turn=True)) < 2.0
 
 
+def test_a_stated_lens_is_taken_where_nothing_can_speak_against_it() -> None:
+    scene = make_scene([make_lens("FULL_OPENCV", BROWN)], orbit(3, np.random.default_rng(4)), 4)
+    for number in [number for number, point in scene.model.points3D.items() if point.track.length() > 2]:
+        scene.model.delete_point3D(number)
+    stated = {1: StatedLens("FULL_OPENCV", WIDTH, HEIGHT, tuple(BROWN), "file")}
+    for how in ("auto", "held"):
+        found, rows = calibrate(scene.model, scene.verified, stated, how)
+        assert tuple(found.cameras[1].params) == tuple(BROWN)
+        assert found.num_reg_images() == 3 and rows[0]["stated"] == "file"
+
+
 def test_the_answer_has_the_same_bits_again(scene: LensScene, calibrated: Calibrated) -> None:
     first, rows = calibrated
     second, again = calibrate(scene.model, scene.verified, {}, "auto")

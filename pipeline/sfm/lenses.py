@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -63,6 +64,8 @@ def calibrate(
     chosen = _deciding(model, seed)
     if how == "simple" or (len(chosen) < LEAST_TRACKS and not usable):
         return model, ()
+    if len(chosen) < LEAST_TRACKS:
+        return _with_held(model, verified, usable, seed)
     held_out, deciding = np.split(chosen, [round(HELD_OUT * len(chosen))])
     within = _only(model, set(deciding.tolist()))
     states = _states(within, model)
@@ -75,8 +78,25 @@ def calibrate(
     trial.try_fisheye()
     if not any(state.changed for state in trial.states.values()):
         return model, _rows(model, model, trial.states)
-    result = _finished(model, verified, trial, seed)
+    result = _finished(model, verified, trial.model, trial.states, seed)
     return result, _rows(model, result, trial.states, usable)
+
+
+def _with_held(
+    model: pycolmap.Reconstruction, verified: Verified, stated: Mapping[int, StatedLens], seed: int
+) -> tuple[pycolmap.Reconstruction, tuple[JSON, ...]]:
+    """The model with its stated lenses as they are, where there are too few tracks to hold any against them."""
+    lensed = _only(model, set(model.points3D))
+    states = {}
+    for number, camera in lensed.cameras.items():
+        states[number] = LensState(LensFreedom((), weak_prior(camera)), focal_told=False)
+        if number in stated:
+            lens = stated[number].colmap(number)
+            widen(lens)
+            set_lens(camera, lens.model_name, named_params(lens))
+            states[number] = replace(states[number], changed=True, stated=stated[number].source, freed=("stated",))
+    result = _finished(model, verified, lensed, states, seed)
+    return result, _rows(model, result, states, stated)
 
 
 def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
@@ -131,18 +151,24 @@ def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstr
     return copy
 
 
-def _finished(model: pycolmap.Reconstruction, verified: Verified, trial: Trial, seed: int) -> pycolmap.Reconstruction:
+def _finished(
+    model: pycolmap.Reconstruction,
+    verified: Verified,
+    lensed: pycolmap.Reconstruction,
+    states: Mapping[int, LensState],
+    seed: int,
+) -> pycolmap.Reconstruction:
     """The whole model with the lenses that were found: adjusted, completed, and adjusted to the end."""
     result = pycolmap.Reconstruction(model)
     for number, camera in result.cameras.items():
-        lens = trial.model.cameras[number]
+        lens = lensed.cameras[number]
         if is_known(lens.model_name):
             set_lens(camera, lens.model_name, named_params(lens))
     for number in sorted(result.reg_image_ids()):
-        image, found = result.images[number], trial.model.images[number]
+        image, found = result.images[number], lensed.images[number]
         if found.has_pose:
             image.frame.set_cam_from_world(image.camera_id, found.cam_from_world())
-    freedoms = {number: state.freedom for number, state in trial.states.items()}
+    freedoms = {number: state.freedom for number, state in states.items()}
     adjust_lenses(result, freedoms)
     retriangulate(result, verified, seed)
     adjust_lenses(result, freedoms)
