@@ -1,6 +1,7 @@
 """Judging a model by verified matches: right ones are good, each way of being wrong is called bad, with its reason."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,24 @@ def test_a_focal_length_that_ran_away_is_bad(ring: Ring, cameras: list[dict[str,
     found = judge(model_of(ring, focal=2.4 * FOCAL), ring.verified, cameras)
     assert found.level == "bad"
     assert any(reason.kind == "focal" and "2400 pixels, +140 %" in reason.text for reason in found.reasons)
+
+
+@pytest.mark.parametrize(("photos", "level"), [(2, "doubt"), (6, "bad")])
+def test_a_focal_length_of_few_photos_does_not_condemn_the_others(ring: Ring, photos: int, level: str) -> None:
+    stated = ring.verified.cameras[1]
+    second = pycolmap.Camera(stated.todict())
+    second.camera_id = 2
+    camera_of = {number: 2 if number <= photos else 1 for number in ring.poses}
+    model = pycolmap.Reconstruction()
+    for camera in (stated, second):
+        model.add_camera_with_trivial_rig(pycolmap.Camera(camera.todict()))
+    for number, pose in ring.poses.items():
+        places = ring.verified.keypoints[number].astype(np.float64)
+        image = pycolmap.Image(ring.verified.names[number], places, camera_of[number], number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    second.params = [0.3 * FOCAL, *second.params[1:]]  # what the metadata state of it is another lens
+    graph = replace(ring.verified, camera_of=camera_of, cameras={1: stated, 2: second})
+    assert judge(model, graph, [TRUSTED[0], ROUGH[0]]).level == level
 
 
 def test_only_a_trusted_focal_length_is_held_against_a_model(ring: Ring) -> None:

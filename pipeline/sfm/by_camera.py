@@ -11,12 +11,12 @@ import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.focal import adjust_within
+from splatpipe.pipeline.sfm.judging import TRUSTED_SOURCES
 from splatpipe.pipeline.sfm.verified import Verified
 
 CAMERAS_TOLD = 10  # on the console; the report has them all
 FEW_PHOTOS = 3  # of a camera: fewer trade its focal length for their distance
-WELL_KNOWN = ("xmp-dewarp", "xmp-calibrated", "sensor-table", "focal-plane-resolution")  # a 35 mm equivalent is not
-STATED_STRAY = 0.05  # of such a focal length: what lenses stray from it by
+STATED_STRAY = 0.05  # of a trusted focal length: what lenses stray from it by
 KIN_STRAY = 0.02  # of one that other photos of the same body and zoom have been calibrated to
 
 
@@ -65,7 +65,7 @@ def _known(
     ]
     if changes:
         return own * float(np.median(changes)), KIN_STRAY
-    return (own, STATED_STRAY) if body[2] in WELL_KNOWN else None
+    return (own, STATED_STRAY) if body[2] in TRUSTED_SOURCES else None
 
 
 def _body(cameras: Sequence[JSON], number: int) -> tuple[str, str, str, float]:

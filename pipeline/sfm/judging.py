@@ -8,6 +8,7 @@ model they are many, as strong as what holds, or they stand between two groups o
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -31,6 +32,7 @@ TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "
 FOCAL_TRUSTED = (0.10, 0.30)  # stray from which on it is a doubt, and bad
 FOCAL_STATED = (0.35, 1.0)  # the same of a stated one that does not deserve trust, as a ratio less one
 FOCAL_LONGER = (0.25, 6.0)  # of the longer side: the lenses of cameras that people map with, 127 to 10 degrees
+FEW_SHARE = 0.1  # of the photos: what is wrong with the lens of fewer says nothing of the others
 EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed photos; sound models have 0.93 and more
 CONTRADICTED_DOUBT, CONTRADICTED_BAD = 0.04, 0.10  # of the pairs among placed photos; sound models have 0 to 0.03
 STRONG_BAD = 0.02  # the same, of pairs with more matches than half of those that hold
@@ -159,8 +161,9 @@ def _placed(model: pycolmap.Reconstruction, total: int) -> list[Reason]:
 
 
 def _focal_lengths(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[Reason]:
-    found = []
-    used = sorted({model.images[number].camera_id for number in model.reg_image_ids()})
+    found, ran_away = [], 0
+    photos = Counter(model.images[number].camera_id for number in model.reg_image_ids())
+    used = sorted(photos)
     for number in used:
         camera, before, group = model.cameras[number], verified.cameras[number], cameras[number - 1]
         focal, prior = camera.mean_focal_length(), before.mean_focal_length()
@@ -174,11 +177,15 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: Verified, cameras: 
         if not FOCAL_LONGER[0] <= ratio <= FOCAL_LONGER[1]:
             text = f"{which} came out as {focal:.0f} pixels, {ratio:.2g} times the photo's longer side: no such lens."
             found.append(Reason("bad", text, hint, "focal"))
+            ran_away += photos[number]
         elif before.has_prior_focal_length and stray > doubt:
             text = f"{which} went from {prior:.0f} to {focal:.0f} pixels, {100 * (focal / prior - 1):+.0f} %."
             if not is_trusted(group):
                 text += " What the metadata say of it is rough."
             found.append(Reason("bad" if stray > bad else "doubt", text, hint, "focal"))
+            ran_away += photos[number] if stray > bad else 0
+    if ran_away < FEW_SHARE * photos.total():
+        found = [replace(reason, level="doubt") for reason in found]
     return found
 
 
