@@ -739,6 +739,18 @@ def test_a_given_lens_is_scaled_to_the_photos_and_refused_for_others(folder: Pat
         ingest(folder, out="two", lens=path)
 
 
+def test_a_given_lens_is_not_that_of_another_camera_of_the_same_shape(folder: Path) -> None:
+    for seed, name in enumerate(("c.jpg", "d.jpg")):
+        save(folder / name, 7 + seed, exif=drone_exif())
+    path = folder.parent / "lens.txt"
+    path.write_text("1 OPENCV 4000 3000 9000 9000 2010 1490 -0.1 0.02 0.001 -0.002\n")
+    result = ingest(folder, lens=path)
+    lenses, groups = result.json("lenses.json")["lenses"], result.json("cameras.json")["cameras"]
+    drone, other = (result.photos[name].camera for name in ("c.jpg", "a.jpg"))
+    assert lenses[drone] is None and groups[drone]["focal_source"] != "lens-file"
+    assert lenses[other] is not None and groups[other]["focal_px"] == 900.0
+
+
 CALIBRATED = {"drone-dji:CalibratedFocalLength": "2300.0"}
 DRONE = Exif(make="DJI", model="FC330", focal_mm=3.61, focal_35mm=20.0, width=4000, height=3000)
 

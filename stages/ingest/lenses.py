@@ -18,6 +18,7 @@ from splatpipe.stages.ingest.check import CheckedPhoto
 FILE, DEWARP = "lens-file", "xmp-dewarp"
 SHAPE_TOLERANCE = 0.005  # between a lens's pictures and the photos: a pixel lost by reducing them
 MAX_DEWARP_CHARS = 600
+LENS_STRAY = 0.35  # of a focal length from what metadata say: a rough 35 mm equivalent was seen 26 % off
 SIZES_SHOWN = 4
 
 
@@ -72,42 +73,44 @@ def _of_file(
     found: Sequence[FileLens], groups: Sequence[CameraGroup], members: Mapping[int, Sequence[CheckedPhoto]], name: str
 ) -> list[StatedLens | None]:
     result: list[StatedLens | None] = []
+    finders = [NameFinder([photo.name for photo in members[number]]) for number in range(len(groups))]
+    named = [[sum(find(photo) is not None for photo in each.photos) for find in finders] for each in found]
     for number, group in enumerate(groups):
         near = [
-            (each, lens)
-            for each in found
+            (each, lens, counts[number])
+            for each, counts in zip(found, named, strict=True)
             if (lens := fitted(each.lens, group.width, group.height, SHAPE_TOLERANCE)) is not None
+            and (counts[number] or (not any(counts) and _is_likely(lens, group)))
         ]
-        result.append(_chosen(near, group, members[number], name))
+        result.append(_chosen(near, group, name))
     if not any(result):
         ours = sorted({f"{group.width} × {group.height}" for group in groups})[:SIZES_SHOWN]
         theirs = sorted({f"{each.lens.width:g} × {each.lens.height:g}" for each in found})[:SIZES_SHOWN]
         raise SplatpipeError(
-            f"The lens in {name} is of pictures of {', '.join(theirs)}, the photos have {', '.join(ours)} pixels.",
-            hint="Its width over height has to be the photos'. Name another with --set ingest.lens=PATH, or =none.",
+            f"The lens in {name} is not these photos': it is of pictures of {', '.join(theirs)}, they have"
+            f" {', '.join(ours)} pixels.",
+            hint="Its width over height, and its focal length, have to be the photos'. Name another with"
+            " --set ingest.lens=PATH, or =none.",
         )
     return [None if lens is None else replace(lens, source=FILE) for lens in result]
 
 
-def _chosen(
-    near: Sequence[tuple[FileLens, StatedLens]], group: CameraGroup, photos: Sequence[CheckedPhoto], name: str
-) -> StatedLens | None:
+def _is_likely(lens: StatedLens, group: CameraGroup) -> bool:
+    """Whether a lens can be a camera's, as far as its own metadata tell: another camera's of the same shape is not."""
+    named = named_params(lens.colmap())
+    return not group.has_prior or abs(0.5 * (named["fx"] + named["fy"]) / group.focal_px - 1.0) <= LENS_STRAY
+
+
+def _chosen(near: Sequence[tuple[FileLens, StatedLens, int]], group: CameraGroup, name: str) -> StatedLens | None:
     """The one lens of a group: by the photos that it names, by the camera's name, or because there is no other."""
     if not near:
         return None
-    counts: Counter[int] = Counter()
-    for k, (each, _) in enumerate(near):
-        find = NameFinder([photo.name for photo in photos])
-        counts[k] = sum(find(shown) is not None for shown in each.photos)
-    if any(counts.values()):
-        return near[counts.most_common(1)[0][0]][1]
-    if any(each.photos for each, _ in near):
-        named = [entry for entry in near if not entry[0].photos]
-        if not named and len(near) > 1:
-            return None
-    of_camera = [lens for _, lens in near if group.model_name and group.model_name.lower() in lens.camera.lower()]
-    same_size = [lens for each, lens in near if (each.lens.width, each.lens.height) == (group.width, group.height)]
-    for some in (of_camera, same_size, [lens for _, lens in near]):
+    most = max(near, key=lambda entry: entry[2])
+    if most[2]:
+        return most[1]
+    of_camera = [lens for _, lens, _ in near if group.model_name and group.model_name.lower() in lens.camera.lower()]
+    same_size = [lens for each, lens, _ in near if (each.lens.width, each.lens.height) == (group.width, group.height)]
+    for some in (of_camera, same_size, [lens for _, lens, _ in near]):
         if len({(lens.model, lens.params) for lens in some}) == 1:
             return some[0]
     raise SplatpipeError(
