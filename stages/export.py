@@ -71,7 +71,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
     box = scene_box(frame.world_from_model.apply(points.xyz), centres)
     placed = georeference(frame, box)
-    _write_json(out / "georef.json", placed)
+    _write_json(out / "georef.json", {**placed, "uncertainty": frame.residuals.get("uncertainty")})
     if frame.origin is not None:
         report.note(told_in_a_line(placed))
     report.progress(2, 4, "collecting the figures", "files")

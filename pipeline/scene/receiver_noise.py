@@ -78,6 +78,9 @@ def fit_with_noise(
     before: Int64[np.ndarray, " n"],
     start: Similarity,
     prior: DirectionPrior | None = None,
+    *,
+    correlated: bool = True,
+    held: bool = False,
 ) -> NoisyFit:
     """Fit a similarity and the noise of its points together, from a similarity near it.
 
@@ -90,6 +93,8 @@ def fit_with_noise(
         before: Of each point, an earlier one whose error it carries on, -1 for none.
         start: Near the answer.
         prior: Directions that take part.
+        correlated: Whether errors may be carried on.
+        held: Leave the similarity as it is, and tell the noise about it.
     """
     similarity = start
     offsets = np.zeros((0 if points.shared is None else len(points.shared.sigmas), 3))
@@ -97,7 +102,11 @@ def fit_with_noise(
     for done in range(ROUNDS):
         rows = _rows(points, before, similarity, offsets)
         extra, pull = _held(points, similarity, prior), _pull(points, similarity, offsets, prior)
-        noise = _reml(rows, extra, noise, _tried(noise, len(points), done))
+        noise = _reml(rows, extra, noise, _tried(noise, len(points) if correlated else 0, done))
+        if held and done < SEARCHED_ROUNDS:
+            continue
+        if held:
+            break
         whitened = _whitened(rows, noise)
         weighted = whitened * np.sqrt(_cauchy(whitened))[:, None]
         normal = weighted.T @ weighted

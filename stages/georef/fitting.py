@@ -29,6 +29,7 @@ SLOW = 0.5  # of a correlation, from which on what is said of the accuracy rests
 OUTLIER_NOISES = 6.0  # times the noise of all
 OUTLIER_SIGMAS = 3.0  # an error within what the position states is none
 ROUNDS = 4
+COLLAPSE = math.log(1.5)  # of the scale from the robust fit's, which noise of half of that cannot make
 
 
 class NoPlaceError(Exception):
@@ -149,7 +150,10 @@ def _fitted(
     """The fit of some positions: by themselves if they can, else with the directions."""
     chosen = points.only(inliers)
     before = _before(flights[inliers])
-    alone = fit_with_noise(chosen, before, start)
+    correlated, alone = True, fit_with_noise(chosen, before, start)
+    if abs(math.log(alone.similarity.scale / start.scale)) > COLLAPSE:
+        # A walk is as smooth as slow errors are: with a scale of nothing, all of it would be error.
+        correlated, alone = False, fit_with_noise(chosen, before, start, correlated=False)
     covariance = alone.covariance[:3, :3]
     weakest = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
     off, ratio = _contradiction(alone, directions)
@@ -166,8 +170,11 @@ def _fitted(
         prior = replace(directions.prior, sigma_rad=directions.prior.sigma_rad / doubt)
         _, axes = np.linalg.eigh(covariance)
         turned = turn_about_axis(alone.similarity, axes[:, -1], alone.centre, prior)
-        noisy = fit_with_noise(chosen, before, turned, prior)
+        noisy = fit_with_noise(chosen, before, turned, prior, correlated=correlated)
         noisy = replace(noisy, covariance=doubt**2 * noisy.covariance)
+    if abs(math.log(noisy.similarity.scale / start.scale)) > COLLAPSE:
+        noisy = fit_with_noise(chosen, before, start, correlated=False, held=True)
+        with_prior = contradicted = False
     stated = np.median(chosen.sigmas, axis=0)[[0, 2]] if points.shared is None else np.zeros(2)
     residuals = noisy.similarity.apply(points.source) - points.without(noisy.offsets).target
     told = uncertainty_of(noisy, chosen.source, places, stated)
