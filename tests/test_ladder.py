@@ -91,6 +91,8 @@ def test_pairs_that_show_the_same_thing_are_proposed_and_hold(
     missing = {(2, 3), (4, 6)}
     sparse = thinned(room, lambda i, j: (i, j) not in missing, "proposals")
     proposed = propose_pairs(model, read_verified(sparse.database), 10)
+    avoided = propose_pairs(model, read_verified(sparse.database), 10, {proposed[0]})
+    assert proposed[0] not in avoided and set(proposed[1:]) <= set(avoided)
     assert set(proposed) == missing
     grown = read_verified(match_more(sparse, sparse.database, proposed, 0, corner_photos.Recorder()))
     assert grown.matches.keys() == verified.matches.keys()

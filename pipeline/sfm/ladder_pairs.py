@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,9 @@ LEAST_SHARE = 0.2  # of a photo's points in the other picture
 NEAREST = 60  # photos that are looked at for each, by what they look at: the cost grows like the photos
 
 
-def propose_pairs(model: pycolmap.Reconstruction, verified: Verified, count: int) -> list[Pair]:
+def propose_pairs(
+    model: pycolmap.Reconstruction, verified: Verified, count: int, avoided: Collection[Pair] = ()
+) -> list[Pair]:
     """Pairs of placed photos that, by the model, show the same thing and yet have no verified matches.
 
     Those that close a loop come first: no third photo has matches with both. They are spread over the photos.
@@ -38,6 +40,7 @@ def propose_pairs(model: pycolmap.Reconstruction, verified: Verified, count: int
         model: With points.
         verified: Its view graph.
         count: Most pairs wanted.
+        avoided: (i, j), i < j, that are not asked for: matching tried them in vain.
 
     Returns:
         (i, j), i < j, COLMAP's numbers; the most telling first.
@@ -51,7 +54,11 @@ def propose_pairs(model: pycolmap.Reconstruction, verified: Verified, count: int
         if i in place and j in place:
             joined[place[i], place[j]] = joined[place[j], place[i]] = True
     common = (joined.astype(np.float32) @ joined.astype(np.float32)) > 0.0
-    first, second = np.nonzero(np.triu((shares >= LEAST_SHARE) & ~joined, 1))
+    open_ = (shares >= LEAST_SHARE) & ~joined
+    for i, j in avoided:
+        if i in place and j in place:
+            open_[place[i], place[j]] = False
+    first, second = np.nonzero(np.triu(open_, 1))
     ranked = sorted(
         (bool(common[i, j]), -float(shares[i, j]), int(i), int(j)) for i, j in zip(first, second, strict=True)
     )

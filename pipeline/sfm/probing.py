@@ -75,8 +75,7 @@ def probe(
         report: Told of the progress.
     """
     database, verified = graph
-    failed = (capture.tried | tried_pairs(database)) - set(verified.matches)
-    pairs = [pair for pair in propose_pairs(model, verified, count + len(failed)) if pair not in failed][:count]
+    pairs = propose_pairs(model, verified, count, capture.tried | tried_pairs(database))
     if not pairs:
         return Probes(database, verified, 0, 0, 0)
     grown = match_more(capture, database, pairs, seed, report)
