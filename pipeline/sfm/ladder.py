@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.sfm.agreement import compare
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.completion import complete
 from splatpipe.pipeline.sfm.ladder_growth import LEAST_OBSERVATIONS, Growth, mean_error_px, observations
@@ -22,7 +23,7 @@ from splatpipe.pipeline.sfm.ladder_joins import join
 from splatpipe.pipeline.sfm.ladder_keypoints import strengthen
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, tried_pairs
 from splatpipe.pipeline.sfm.ladder_partners import Ranked, choose_pairs, rank_partners
-from splatpipe.pipeline.sfm.ladder_poses import LEAST_SHARE, Placement, explained_share, place, sightings
+from splatpipe.pipeline.sfm.ladder_poses import LARGE_SHARE, LEAST_PARTNERS, Placement, place, sightings
 from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.pairs import Pair
@@ -186,17 +187,18 @@ def _on(found: Found, wider: Found) -> Found:
 
 def _registered(work: Work, found: Found) -> Found:
     """Add photos whose pose is sure, round after round, then adjust; all or nothing of what is still sure then."""
-    model, added = found.model, dict[int, Placement]()
+    model, added = found.model, set[int]()
     for _ in range(ROUNDS):
         left = [number for number in unplaced(found) if number not in added]
         placements = _placements(work, found.verified, model, left)
-        if not placements:
-            break
-        added |= placements
-        model = _extended(model, found.verified, placements)
+        model = _extended(model, found.verified, placements) if placements else pycolmap.Reconstruction(model)
         growth = Growth(found.database, model, work.options)
         growth.triangulate(sorted(placements))
+        fresh = sorted(placements) or growth.place_by_pairs(left)
         growth.end()
+        if not fresh:
+            break
+        added.update(fresh)
     if not added:
         return found
     work.tell(len(added), len(unplaced(found)), "adjusting with photos that were placed")
@@ -290,23 +292,22 @@ def _adjusted(work: Work, found: Found, model: Model, added: Collection[int]) ->
 
 def _not_held(verified: Verified, model: Model, photos: Collection[int]) -> set[int]:
     """Which of the photos lost their points in the adjustment, or are where their matches do not agree."""
-    structure = read_structure(model)
-    rows = structure.rows({number: len(verified.keypoints[number]) for number in model.reg_image_ids()})
+    placed = set(model.reg_image_ids())
+    agreement = compare(model, verified)
+    matches, explained = dict.fromkeys(photos, 0), dict.fromkeys(photos, 0)
+    partners, pairs = dict.fromkeys(photos, 0), dict.fromkeys(photos, 0)
+    for row in np.flatnonzero(agreement.placed).tolist():
+        for number in agreement.pairs[row].tolist():
+            if number in matches:
+                pairs[number] += 1
+                matches[number] += int(agreement.matches[row])
+                explained[number] += int(agreement.explained[row])
+                partners[number] += bool(agreement.explained[row] >= LARGE_SHARE * agreement.matches[row])
     bad = set()
     for number in photos:
-        if number not in rows:
-            bad.add(number)
-            continue
-        others = {other: found for other, found in rows.items() if other != number}
-        image = model.images[number]
-        share = explained_share(
-            sightings(verified, others, number),
-            verified.keypoints[number],
-            structure.points,
-            model.cameras[image.camera_id],
-            image.cam_from_world(),
-        )
-        if share < LEAST_SHARE or image.num_points3D < LEAST_OBSERVATIONS:
+        few = number not in placed or model.images[number].num_points3D < LEAST_OBSERVATIONS
+        alone = partners[number] < min(LEAST_PARTNERS, pairs[number])
+        if few or alone or explained[number] < LARGE_SHARE * matches[number]:
             bad.add(number)
     return bad
 

@@ -28,12 +28,30 @@ class Growth:
             self._cache = pycolmap.DatabaseCache.create(opened, cache_options)
         self._mapper = pycolmap.IncrementalMapper(self._cache)
         self._mapper.begin_reconstruction(model)
+        self._model = model
 
     def triangulate(self, photos: Sequence[int]) -> None:
         """Make points of what placed photos' keypoints match, and lengthen tracks by them."""
         for number in photos:
             self._mapper.triangulate_image(self._triangulation, number)
         self._mapper.complete_and_merge_tracks(self._triangulation)
+
+    def place_by_pairs(self, photos: Sequence[int]) -> list[int]:
+        """Place photos by matches with placed ones that have no points yet, and make points of them.
+
+        COLMAP's structure-less registration: the pose that most matches' rays agree with, over several placed photos.
+
+        Returns:
+            Those that were placed, to be held against what their matches say.
+        """
+        mapping, placed = self._options.get_mapper(), []
+        for number in photos:
+            known = self._model.exists_image(number)  # one without matches is not
+            if known and self._mapper.register_next_structure_less_image(mapping, number):
+                self._mapper.triangulate_image(self._triangulation, number)
+                placed.append(number)
+        self._mapper.complete_and_merge_tracks(self._triangulation)
+        return placed
 
     def end(self) -> None:
         """Take leave of the model, which is left whole."""

@@ -132,22 +132,6 @@ def place(
     return Placement(pose, camera, observations, share)
 
 
-def explained_share(
-    seen: Sightings,
-    keypoints: Float32[np.ndarray, "n 2"],
-    points: Float64[np.ndarray, "m 3"],
-    camera: pycolmap.Camera,
-    pose: pycolmap.Rigid3d,
-) -> float:
-    """Share of the keypoints that lead to points which a pose puts where one of these is; 0 where there are none."""
-    if len(seen) == 0:
-        return 0.0
-    limit = max(LEAST_ERROR_PX, ERROR * max(camera.width, camera.height))
-    places = keypoints[seen.keypoints].astype(np.float64)
-    explained = _explained(places, points[seen.rows], camera, pose, limit)
-    return len(np.unique(seen.keypoints[explained])) / len(np.unique(seen.keypoints))
-
-
 def _enough(held: int, share: float) -> bool:
     return (held >= MANY_INLIERS and share >= LEAST_SHARE) or (held >= LEAST_INLIERS and share >= LARGE_SHARE)
 
