@@ -38,6 +38,19 @@ def test_a_few_pairs_that_only_look_alike_do_not_make_a_true_model_bad(ring: Rin
     assert (found.level, found.contradicted) == ("good", 4)
 
 
+def test_large_photos_whose_keypoints_were_found_in_reduced_ones_are_judged_alike(ring: Ring) -> None:
+    """Seven times the size, seven times the noise: 3.5 pixels are what half a pixel is in a photo of 1,200."""
+    model = model_of(ring)
+    lens = pycolmap.Camera(model.cameras[1].todict())
+    for camera in (model.cameras[1], lens):
+        camera.rescale(7.0)
+    keypoints = {number: places * np.float32(7.0) for number, places in ring.verified.keypoints.items()}
+    large = judge(model, replace(ring.verified, cameras={1: lens}, keypoints=keypoints), TRUSTED)
+    small = judge(model_of(ring), ring.verified, TRUSTED)
+    assert (large.level, large.contradicted) == (small.level, small.contradicted) == ("good", 0)
+    assert large.explained > small.explained - 0.02
+
+
 def test_a_model_whose_halves_disagree_is_bad(ring: Ring) -> None:
     half = range(13, 25)  # turned and grown about the first of its cameras, as an incremental mapper's joint does
     bent = model_of(ring, moved(ring, half, ring.centre(13), turn_up(8.0), 1.15))

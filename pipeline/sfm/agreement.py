@@ -12,9 +12,10 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
+from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.verified import Verified
 
-EXPLAINED_PX = 4.0  # the distance from the epipolar line that verification itself allows
+EXPLAINED_PX = 4.0  # the distance from the epipolar line that verification itself allows; more in large photos
 LEAST_PARALLAX = 2.0  # of a match, times EXPLAINED_PX, for its depth to have a sign worth asking for
 
 Rays = Float64[np.ndarray, "n 2"]
@@ -61,10 +62,12 @@ def compare(model: pycolmap.Reconstruction, verified: Verified) -> Agreement:
         rows[row, 0] = rows[row, 2] = len(found)
         if not both[row]:
             continue
-        focal = (model.images[i].camera.mean_focal_length() + model.images[j].camera.mean_focal_length()) / 2.0
-        errors = epipolar_errors(rays[i][found[:, 0]], rays[j][found[:, 1]], poses[i], poses[j], EXPLAINED_PX / focal)
-        good = errors * focal <= EXPLAINED_PX
-        closeness[row] = np.maximum(1.0 - errors * focal / EXPLAINED_PX, 0.0).sum()
+        cameras = model.images[i].camera, model.images[j].camera
+        focal = (cameras[0].mean_focal_length() + cameras[1].mean_focal_length()) / 2.0
+        bound = EXPLAINED_PX * coarseness(cameras) / focal
+        errors = epipolar_errors(rays[i][found[:, 0]], rays[j][found[:, 1]], poses[i], poses[j], bound)
+        good = errors <= bound
+        closeness[row] = np.maximum(1.0 - errors / bound, 0.0).sum()
         own = (points[i][found[:, 0]] == points[j][found[:, 1]]) & (points[i][found[:, 0]] >= 0)
         rows[row, 1:] = good.sum(), (~own).sum(), (good & ~own).sum()
         median[row] = float(np.sort(errors)[len(errors) // 2]) * focal  # half of them may be infinite

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pycolmap
 
+from splatpipe.pipeline.sfm.coarseness import coarseness
+
 LEAST_MATCHES = 15  # verified ones of a pair; COLMAP's own bound
 STRICT_PX = 2.0  # observations that were thrown out come back only within it, or they would come and go for ever
 SETTLED = 2e-3  # of the observations: thrown out after a robust adjustment, so few had hardly pulled
@@ -51,7 +53,7 @@ def complete(
         _place_left(mapper, mapping, triangulation)
     _adjust(mapper, options, stop, rough=True)
     mapper.filter_points(mapping)
-    triangulation.complete_max_reproj_error = STRICT_PX
+    triangulation.complete_max_reproj_error = STRICT_PX * coarseness(model.cameras.values())
     for _ in range(MOST_ROUNDS):
         mapper.complete_and_merge_tracks(triangulation)
         _adjust(mapper, options, stop, rough=False)
@@ -92,6 +94,6 @@ def _adjust(
     solver.max_num_iterations = ROUGH_ITERATIONS if rough else FINE_ITERATIONS
     if not rough:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        adjustment.ceres.loss_function_scale = ROBUST_PX
+        adjustment.ceres.loss_function_scale = ROBUST_PX * coarseness(mapper.reconstruction.cameras.values())
     mapper.observation_manager.filter_observations_with_negative_depth()
     pycolmap.bundle_adjustment(mapper.reconstruction, adjustment, stop)

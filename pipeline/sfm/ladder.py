@@ -17,6 +17,7 @@ import pycolmap
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.agreement import compare
 from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.completion import complete
 from splatpipe.pipeline.sfm.ladder_growth import LEAST_OBSERVATIONS, Growth, mean_error_px, observations
 from splatpipe.pipeline.sfm.ladder_joins import join
@@ -75,7 +76,9 @@ def climb(capture: Capture, found: Found, config: SparseConfig, report: Reporter
         The same where nothing is left or nothing helped; else a larger model, perhaps on a view graph that has grown.
     """
     held = any(row.get("focal_held") for row in found.tried if row.get("chosen"))
-    work = Work(capture, MappingOptions(config.seed, config.min_model_size, hold_focal=bool(held)), report)
+    wide = coarseness(found.verified.cameras.values())
+    options = MappingOptions(config.seed, config.min_model_size, hold_focal=bool(held), coarseness=wide)
+    work = Work(capture, options, report)
     if not config.ladder:
         return found
     rungs: list[tuple[str, Callable[[Work, Found], Found]]] = [

@@ -39,12 +39,14 @@ class MappingOptions:
         min_model_size: Models of fewer photos are dropped.
         relaxed: Accept fewer and worse inliers for a photo's pose (incremental only).
         hold_focal: Keep focal lengths at what the database says.
+        coarseness: Times by which bounds in pixels are wider than usual (incremental only).
     """
 
     seed: int = 0
     min_model_size: int = 3
     relaxed: bool = False
     hold_focal: bool = False
+    coarseness: float = 1.0
 
 
 def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
@@ -137,6 +139,10 @@ def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipeline
     result.ba_global_max_num_iterations = 20
     result.ba_global_function_tolerance = result.ba_local_function_tolerance = GOOD_ENOUGH
     result.mapper.ba_global_ignore_redundant_points3D = True
+    result.mapper.init_max_error *= options.coarseness
+    result.mapper.filter_max_reproj_error *= options.coarseness
+    result.triangulation.complete_max_reproj_error *= options.coarseness
+    result.triangulation.merge_max_reproj_error *= options.coarseness
     if options.relaxed:
         result.mapper.init_min_num_inliers = 50
         result.mapper.init_min_tri_angle = 6.0

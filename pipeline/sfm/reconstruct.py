@@ -13,6 +13,7 @@ import pycolmap
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.sfm.judging import Judgement, judge
 from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
@@ -71,7 +72,8 @@ class Reconstructor:
     def map(self, mapper: Mapper, how: str, **options: bool) -> Answer:
         """Map one way, and judge."""
         began = time.process_time()
-        chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size), **options)
+        wide = coarseness(self.verified.cameras.values())
+        chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size, coarseness=wide), **options)
         work = map_incremental if mapper == "incremental" else map_global
 
         def tell(placed: int, total: int, what: str) -> None:
