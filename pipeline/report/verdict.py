@@ -156,8 +156,9 @@ def _focal(holdings: Holdings) -> Finding | None:
     ]
     if not off:
         return None
-    level: Level = "good" if max(off) <= FOCAL_GOOD else "doubt"
-    return Finding(level, "Focal length", f"Calibrated within {share(max(off), 1)} of what the photos state.")
+    if max(off) <= FOCAL_GOOD:
+        return Finding("good", "Focal length", f"Calibrated within {share(max(off), 1)} of what the photos state.")
+    return Finding("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from what the photos state.")
 
 
 def _place(holdings: Holdings) -> Finding | None:
