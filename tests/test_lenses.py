@@ -82,6 +82,16 @@ def test_a_fisheye_is_recognised_by_what_the_simple_lens_leaves() -> None:
     assert rms(apart_px(found.cameras[1], scene.lenses[1], turn=True)) < 0.5
 
 
+def test_a_photo_with_hardly_any_points_stays_where_it_is(scene: LensScene) -> None:
+    poor = pycolmap.Reconstruction(scene.model)
+    for keypoint in list(poor.images[5].get_observation_point2D_idxs())[10:]:
+        poor.delete_observation(5, keypoint)
+    found, rows = calibrate(poor, scene.verified, {}, "auto")
+    assert found.num_reg_images() == poor.num_reg_images()
+    assert rms(apart_px(found.cameras[1], scene.lenses[1], turn=True)) < 0.3
+    assert rows[0]["freed"]
+
+
 def test_few_photos_stay_simple() -> None:
     scene = make_scene([make_lens("FULL_OPENCV", BROWN)], orbit(6, np.random.default_rng(4)), 4)
     found, _ = calibrate(scene.model, scene.verified, {}, "auto")

@@ -36,6 +36,7 @@ def focal_sigmas(model: pycolmap.Reconstruction) -> dict[int, float]:
         By COLMAP's camera id; without those that nothing determines.
     """
     copy = pycolmap.Reconstruction(model)
+    copy.tear_down()  # of photos that are not placed: COLMAP's covariance asks for every photo's pose
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     config = pycolmap.BundleAdjustmentConfig()

@@ -145,6 +145,10 @@ def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstr
     for number in sorted(copy.reg_image_ids()):
         if seen[number] < LEAST_A_PHOTO:
             observations.deregister_frame(copy.images[number].frame_id)
+    copy.tear_down()  # COLMAP's covariance asks for the pose of every photo that is there
+    for number, camera in sorted(model.cameras.items()):
+        if not copy.exists_camera(number):
+            copy.add_camera_with_trivial_rig(camera)
     for camera in copy.cameras.values():
         if is_known(camera.model_name):
             widen(camera)
@@ -165,9 +169,9 @@ def _finished(
         if is_known(lens.model_name):
             set_lens(camera, lens.model_name, named_params(lens))
     for number in sorted(result.reg_image_ids()):
-        image, found = result.images[number], lensed.images[number]
-        if found.has_pose:
-            image.frame.set_cam_from_world(image.camera_id, found.cam_from_world())
+        image = result.images[number]
+        if lensed.exists_image(number):
+            image.frame.set_cam_from_world(image.camera_id, lensed.images[number].cam_from_world())
     freedoms = {number: state.freedom for number, state in states.items()}
     adjust_lenses(result, freedoms)
     retriangulate(result, verified, seed)
