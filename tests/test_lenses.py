@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
@@ -10,7 +13,9 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.sfm.focal import focal_sigmas
 from splatpipe.pipeline.sfm.lens_model import StatedLens, apart_px, named_params, narrow, simplest, widen
 from splatpipe.pipeline.sfm.lenses import calibrate
-from tests.scenes.lens_scene import HEIGHT, WIDTH, LensScene, make_lens, make_scene, orbit, strips
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from lens_scene import HEIGHT, WIDTH, LensScene, make_lens, make_scene, orbit, strips
 
 SIMPLE = (850.0, WIDTH / 2, HEIGHT / 2, -0.05)
 # The P1's distortion (its profile in Pix4D's database) on this wider lens, doubled; the principal point 20 pixels off.
@@ -125,6 +130,16 @@ def test_a_stated_lens_is_taken_where_nothing_can_speak_against_it() -> None:
         found, rows = calibrate(scene.model, scene.verified, stated, how)
         assert tuple(found.cameras[1].params) == tuple(BROWN)
         assert found.num_reg_images() == 3 and rows[0]["stated"] == "file"
+
+
+def test_a_photo_of_few_points_takes_no_part_in_deciding_and_keeps_its_place(scene: LensScene) -> None:
+    model = pycolmap.Reconstruction(scene.model)
+    seen = [point.point3D_id for point in model.images[5].points2D if point.has_point3D()]
+    for number in seen[12:]:
+        model.delete_point3D(number)
+    found, _ = calibrate(model, scene.verified, {}, "auto")
+    assert found.num_reg_images() == model.num_reg_images()
+    assert rms(apart_px(found.cameras[1], scene.lenses[1], turn=True)) < 0.3
 
 
 def test_the_answer_has_the_same_bits_again(scene: LensScene, calibrated: Calibrated) -> None:

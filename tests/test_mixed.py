@@ -1,5 +1,6 @@
 """Several cameras, zooms, sizes and ways of holding them in one capture."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ from splatpipe.pipeline.sfm.verified import Verified
 from splatpipe.stages.ingest import cameras as ingest_cameras
 from splatpipe.stages.ingest.cameras import CameraGroup, describe_cameras, group_cameras
 from splatpipe.stages.ingest.check import CheckedPhoto
-from splatpipe.tests.scenes.surveyed import HEIGHT, LENS, TRUTH, WIDTH, true_model
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from surveyed import HEIGHT, LENS, TRUTH, WIDTH, true_model
 
 
 class Notes:

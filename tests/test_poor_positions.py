@@ -2,6 +2,8 @@
 
 import json
 import math
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +23,9 @@ from splatpipe.stages.georef.gps import georeference, tell
 from splatpipe.stages.georef.level import Positions
 from splatpipe.stages.georef.model import SparseModel
 from splatpipe.stages.georef.place import stations_of
-from splatpipe.tests.test_georef import Notes
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import corner_photos
 
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
 PLACE = Origin(**TRUTH["frame"]["origin"])
@@ -145,7 +149,7 @@ def test_altitude_that_drifts_does_not_tilt_the_model() -> None:
     errors, bounds = errors_of(frame, model), stated_of(frame, "95")
     assert errors["up"] < 8.0
     assert all(abs(errors[name]) <= bounds[name] for name in errors)
-    notes = Notes()
+    notes = corner_photos.Recorder()
     tell(frame, fit, model, stated(model, places), notes)
     assert any("positions are poor" in warning for warning in notes.warnings)
 
