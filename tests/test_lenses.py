@@ -132,16 +132,6 @@ def test_a_stated_lens_is_taken_where_nothing_can_speak_against_it() -> None:
         assert found.num_reg_images() == 3 and rows[0]["stated"] == "file"
 
 
-def test_a_photo_of_few_points_takes_no_part_in_deciding_and_keeps_its_place(scene: LensScene) -> None:
-    model = pycolmap.Reconstruction(scene.model)
-    seen = [point.point3D_id for point in model.images[5].points2D if point.has_point3D()]
-    for number in seen[12:]:
-        model.delete_point3D(number)
-    found, _ = calibrate(model, scene.verified, {}, "auto")
-    assert found.num_reg_images() == model.num_reg_images()
-    assert rms(apart_px(found.cameras[1], scene.lenses[1], turn=True)) < 0.3
-
-
 def test_the_answer_has_the_same_bits_again(scene: LensScene, calibrated: Calibrated) -> None:
     first, rows = calibrated
     second, again = calibrate(scene.model, scene.verified, {}, "auto")
