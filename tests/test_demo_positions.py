@@ -132,5 +132,5 @@ def test_photos_with_wrong_gps_are_named_and_the_others_placed(photos: list[Chec
     assert summary["positions_used"] == 36
     model = read_model(tmp_path / "model", NAMES)
     by_name = {str(record["name"]): record for record in scene.positions}
-    named, _ = georeference(model, Positions(by_name, {}, found.wrong), 10.0)
+    named, _ = georeference(model, Positions(by_name, {}, found.wrong), 10.0, {})
     assert named.left_out == (NAMES[2], NAMES[4], NAMES[6], NAMES[8])
