@@ -166,7 +166,7 @@ def _fitted(
     if with_prior:
         # What contradicts by so many sigmas shows that the noise is of another kind than was taken: its share of the
         # answer goes down by as much, and all that is said of the accuracy as well (Birge, Phys. Rev. 40, 1932).
-        doubt = ratio if contradicted else 1.0
+        doubt = max(1.0, ratio) if drifting else 1.0
         prior = replace(directions.prior, sigma_rad=directions.prior.sigma_rad / doubt)
         _, axes = np.linalg.eigh(covariance)
         turned = turn_about_axis(alone.similarity, axes[:, -1], alone.centre, prior)
