@@ -30,7 +30,6 @@ MAX_ELEMENTS = 200_000  # Metashape's cameras.xml has some ten a photo
 MAX_CHARS = 200  # of a number, or a name that is kept
 HIGHEST_TERM_PX = 0.5  # what may be lost of a lens with terms that COLMAP has not, at worst
 INNER = 0.95  # of the picture: calibrations have no marks in the outermost corners
-CHECK_PX = 1000.0  # size of the picture that a lens is tried on
 LARGEST_COEFFICIENT = 100.0  # of distortion; a long lens has large ones, as r is small
 FORMATS = "COLMAP's cameras.txt, Metashape's calibration XML, or Pix4D's .cam or calibrated_camera_parameters.txt"
 CAM_KEYS = ("F", "Px", "Py", "K1", "K2", "K3", "T1", "T2")
