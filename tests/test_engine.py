@@ -14,7 +14,7 @@ import pytest
 
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
-from splatpipe.pipeline.engine.events import Event
+from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.lineage import delivered, lineage
 from splatpipe.pipeline.engine.runner import Line, Outcome, survey
 from splatpipe.pipeline.engine.session import Request, load_run, open_session, survey_line
@@ -65,6 +65,16 @@ def test_a_run_leaves_its_deliverable_and_a_second_one_runs_nothing(numbers: Pat
     second, events = walk(request_of(numbers, out))
     assert second.ran == []
     assert [event.kind for event in events] == ["run_started", *["stage_reused"] * 4, "run_finished"]
+
+
+def test_what_begins_is_told_however_soon_it_follows() -> None:
+    told: list[str] = []
+    reporter = EventReporter("count", lambda event: told.append(f"{event.data['what']} {event.data['done']}"))
+    for what in ("placing", "joining"):
+        for done in range(3):
+            reporter.progress(done, 1000, what)
+    assert told[0] == "placing 0"
+    assert "joining 0" in told
 
 
 def test_a_changed_option_is_felt_exactly_as_far_as_it_changes_bytes(numbers: Path, out: Path) -> None:

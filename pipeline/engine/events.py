@@ -53,18 +53,23 @@ Sink = Callable[[Event], None]
 
 
 class EventReporter:
-    """The Reporter that stage bodies are given: makes events of its calls and thins out the progress."""
+    """The Reporter that stage bodies are given: makes events of its calls and thins out the progress of one thing.
+
+    What begins is always told, however soon after the last: a person and a test wait for it by name.
+    """
 
     def __init__(self, stage: str, sink: Sink) -> None:
         self._stage = stage
         self._sink = sink
         self._last_progress_s = 0.0
+        self._last_what = ""
 
     def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
         now = time.monotonic()
-        if now - self._last_progress_s < PROGRESS_INTERVAL_S and done < total:
+        soon = now - self._last_progress_s < PROGRESS_INTERVAL_S
+        if soon and done < total and what == self._last_what:
             return
-        self._last_progress_s = now
+        self._last_progress_s, self._last_what = now, what
         self._send("progress", {"done": done, "total": total, "what": what, "unit": unit})
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None:
