@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import JSON
 
 BLOCK_BYTES = 1 << 20
@@ -133,6 +134,4 @@ class HashTable:
         return found
 
     def _save(self) -> None:
-        temporary = self._path.with_name(f"{self._path.name}.{os.getpid()}.new")
-        temporary.write_text(json.dumps(self._known), encoding="utf-8")
-        temporary.replace(self._path)
+        write_durably(self._path, json.dumps(self._known))

@@ -14,13 +14,14 @@ from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.config import Table, dump, load_file
 from splatpipe.pipeline.engine.digests import HashTable
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
 from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.runner import Line, Runner
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Machine, Stage
-from splatpipe.pipeline.engine.store import Part, Store, locked, open_store, write_synced
+from splatpipe.pipeline.engine.store import Part, Store, locked, open_store
 
 CONFIG_FILE = "config.toml"
 LOG_FILE = "splatpipe.log"
@@ -112,7 +113,7 @@ def _worker_environment(threads: int) -> dict[str, str]:
 
 def _save_config(store: Store, photos: Path, config: BaseModel) -> None:
     head = {"photos": os.fsdecode(photos), "splatpipe": importlib.metadata.version("splatpipe")}
-    write_synced(store.out / CONFIG_FILE, dump({**head, **config.model_dump(mode="json")}))
+    write_durably(store.out / CONFIG_FILE, dump({**head, **config.model_dump(mode="json")}))
 
 
 def load_run(out: Path) -> tuple[Path, Table]:

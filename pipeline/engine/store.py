@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.digests import FileEntry, canonical, digest, part_digest, tree_entries
+from splatpipe.pipeline.engine.durable import remove_unfinished, sync_folder, write_durably
 from splatpipe.pipeline.engine.errors import MachineError, StageError, UsageError
 from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
@@ -115,6 +116,7 @@ class Store:
         if folder.exists() and not stage.resumable:
             shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        remove_unfinished(folder)
         return folder
 
     def commit(
@@ -156,7 +158,7 @@ class Store:
             **run,
         }
         _sync_tree(partial)
-        write_synced(partial / "manifest.json", json.dumps(manifest, indent=1))
+        write_durably(partial / "manifest.json", json.dumps(manifest, indent=1))
         _drop_strays(partial, {"manifest.json", *(entry["path"] for part in parts.values() for entry in part["files"])})
         return self._publish(partial)
 
@@ -170,7 +172,7 @@ class Store:
             shutil.rmtree(replaced)
         else:
             partial.rename(final)
-        _sync_folder(self.stages)
+        sync_folder(self.stages)
         artifact = _read_artifact(final)
         if artifact is None:
             raise StageError(
@@ -267,30 +269,11 @@ def _drop_strays(folder: Path, keep: set[str]) -> None:
 def _sync_tree(folder: Path) -> None:
     for path in folder.rglob("*"):
         if path.is_dir():
-            _sync_folder(path)
+            sync_folder(path)
         else:
             with path.open("rb") as file:
                 os.fsync(file.fileno())
-    _sync_folder(folder)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_synced(path: Path, text: str) -> None:
-    """Write a file so that it is there whole or not at all, even after a power cut."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    _sync_folder(path.parent)
+    sync_folder(folder)
 
 
 def open_store(out: Path, *, create: bool) -> Store:
@@ -333,7 +316,7 @@ def open_store(out: Path, *, create: bool) -> Store:
         ) from error
     format_file = store.stages / "format.json"
     if not format_file.exists():
-        write_synced(format_file, json.dumps({"format": FORMAT}))
+        write_durably(format_file, json.dumps({"format": FORMAT}))
     return store
 
 

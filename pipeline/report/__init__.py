@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO
 
+from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 
 REPORT_FILE = "report.html"
@@ -35,12 +36,11 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
         OSError: if it cannot be written.
         MachineError: if this installation lacks the page's script or style.
     """
-    from splatpipe.pipeline.engine.store import write_synced
     from splatpipe.pipeline.report.holdings import open_holdings
     from splatpipe.pipeline.report.page import report_page
 
     path = out / REPORT_FILE
-    write_synced(path, report_page(open_holdings(out), drawn=drawn))
+    write_durably(path, report_page(open_holdings(out), drawn=drawn))
     return path
 
 
@@ -75,8 +75,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     except OSError as error:
         raise MachineError(f"The report could not be written: {error.strerror}.") from error
     finally:
-        for unfinished in out.glob(f"{REPORT_FILE}.*.new"):
-            unfinished.unlink(missing_ok=True)
+        remove_unfinished(out, REPORT_FILE)
     if _stamp(path) == before or (code != 0 and until_s is None):
         raise MachineError("The report could not be written.", hint=f"{log} ends with the reason.")
     return path

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.scene.control_file import COLUMNS, SurveyedPoint, Table, parse_table, read_table
 from splatpipe.pipeline.scene.survey_text import delimiter_of, find_columns, is_number
@@ -135,23 +134,10 @@ class ControlText:
             MachineError: if it cannot be written.
         """
         target = self.path.resolve()  # a link stays one
-        temporary = target.with_name(f".{target.name}.{os.getpid()}.new")
         text = (BOM if self.bom else "") + "".join(line + self.newline for _, line in self.table.lines)
         try:
-            with temporary.open("w", encoding="utf-8", newline="") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            if target.exists():
-                shutil.copymode(target, temporary)
-            temporary.replace(target)
-            folder = os.open(target.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            write_durably(target, text)
         except OSError as error:
-            temporary.unlink(missing_ok=True)
             raise MachineError(
                 f"Cannot write {self.path}: {error.strerror}.", hint="Check its permissions and the free space."
             ) from error

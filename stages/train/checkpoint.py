@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.scene.archives import read_archive
-from splatpipe.stages.train.durable import write_durably
 
 CHECKPOINT_FORMAT = 1
 _FACTS = "facts"

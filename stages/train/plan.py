@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.dataset import View, split_views
 from splatpipe.stages.options import TrainConfig
-from splatpipe.stages.train.durable import write_durably
 
 PLAN_FORMAT = 2
 EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
@@ -227,7 +227,7 @@ def load_or_write_plan(path: Path, make: Callable[[], Plan]) -> Plan:
         return Plan.from_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         fresh = make()
-        write_durably(path, lambda file: file.write(fresh.to_json().encode()))
+        write_durably(path, fresh.to_json())
         return fresh
 
 

@@ -1,0 +1,57 @@
+"""Files are replaced whole or not at all."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
+
+KILLED = """
+import os, signal
+from pathlib import Path
+from splatpipe.pipeline.engine.durable import write_durably
+
+def half(file):
+    file.write(b"half")
+    file.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+write_durably(Path({path!r}), half)
+"""
+
+
+def test_written_file_has_the_new_content_and_the_old_permissions(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text("old")
+    path.chmod(0o640)
+    write_durably(path, "Höhe")
+    assert path.read_bytes() == "Höhe".encode() and path.stat().st_mode & 0o777 == 0o640
+    write_durably(path, lambda file: file.write(b"\0\1"))
+    assert path.read_bytes() == b"\0\1" and list(tmp_path.iterdir()) == [path]
+
+
+def test_file_that_cannot_be_written_to_its_end_stays_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.npz"
+    path.write_text("old")
+
+    def full(file: IO[bytes]) -> None:
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        write_durably(path, full)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_process_was_writing_can_be_told_from_all_else_and_removed(tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    write_durably(path, "old")
+    subprocess.run([sys.executable, "-c", KILLED.format(path=str(path))], check=False)
+    assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 2
+    remove_unfinished(tmp_path, "other.json")
+    assert len(list(tmp_path.iterdir())) == 2
+    remove_unfinished(tmp_path)
+    assert list(tmp_path.iterdir()) == [path]
