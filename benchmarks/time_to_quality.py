@@ -26,7 +26,6 @@ from splatpipe.stages.options import LineConfig, TrainConfig
 from splatpipe.stages.rendering import as_trained, render_pixels
 from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train import loop
-from splatpipe.stages.train.depth import supervised
 from splatpipe.stages.train.flatness import ends_at
 from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
 from splatpipe.stages.train.state import TrainState
@@ -87,7 +86,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     views = load_views(dataset)
     start = read_splat(dataset / "init.ply")
     plan = make_plan(config.train, views, config.evaluate.every, arguments.held_out, len(start))
-    trained_on = supervised(loop.views_of(plan, views), dataset, plan.options)
+    trained_on = loop.views_of(plan, views)
     levels = coarse_levels(plan.options)
     with same_bits(arguments.threads):
         clocks.start()

@@ -237,7 +237,6 @@ def collect_metrics(inputs: Inputs, plan: Facts, points: Points, registered: int
         "train_seconds": train.get("train_seconds"),
         "train_megapixels": plan["train_megapixels"],
         "peak_memory_bytes": train.get("peak_memory_bytes"),
-        **{name: train[name] for name in ("camera_shift_median_px", "camera_shift_max_px") if name in train},
         "test_views": measured["test_views"],
         **measured["mean"],
         "floaters": measured["floaters"],

@@ -122,28 +122,13 @@ class TrainConfig(StageConfig):
     """Share of 1 - SSIM in the loss; the rest is L1."""
     loss: Literal["native", "kornia"] = "native"
     """Who computes the loss and its gradient: our kernels, or kornia's SSIM under torch, some 50 times slower."""
-    exposure: Literal["off", "affine", "bilateral"] = "off"
+    exposure: Literal["off", "affine"] = "off"
     """What exposure and white balance did to each photo: not modelled, or as an affine map of its colours that is
-    trained along; `bilateral`: one by place and brightness, for vignetting and local tone mapping. The splat keeps the
-    photos' mean appearance."""
-    exposure_side: Annotated[int, Field(ge=2, le=64)] = 8
-    """Nodes of a bilateral grid along each side of a photo."""
-    exposure_levels: Annotated[int, Field(ge=2, le=16)] = 4
-    """Its nodes from black to white."""
-    exposure_smoothness: NonNegativeFloat = 100.0
-    """Weight in the loss of the mean squared differences between its neighbouring nodes; with less of it the grid takes
-    shading and colour from the splat."""
+    trained along. The splat keeps the photos' mean appearance."""
     exposure_decay: NonNegativeFloat = 1e-3
     """How strongly the maps are drawn to the identity: this times their deviation joins the loss's gradient."""
     lr_exposure: PositiveFloat = 1e-3
     """Learning rate of the maps at the start; a tenth of it at the end."""
-    refine_cameras: Literal["off", "pose", "pose_focal"] = "off"
-    """Correct the training photos' poses by a fraction of a pixel, 2 at most, from a fifth of the run on; `pose_focal`
-    their focal lengths, too. All together stay where SfM and its georeference have them."""
-    refine_decay: NonNegativeFloat = 1e-3
-    """How strongly each is drawn back to SfM's: this times its motion in pixels joins the loss's gradient."""
-    lr_cameras: PositiveFloat = 0.05
-    """Learning rate of the cameras at the start, pixels; a tenth of it at the end."""
     antialias: bool = True
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
     filter_3d: bool = False
@@ -162,16 +147,12 @@ class TrainConfig(StageConfig):
     """Last iteration of density control. Auto: half of the run; for `mcmc` five sixths of it."""
     densify_every: Length = "auto"
     """Iterations between its steps. Auto: 100, at most a tenth of the run."""
-    density: Literal["published", "absolute", "error", "mcmc"] = "absolute"
+    density: Literal["published", "absolute", "mcmc"] = "absolute"
     """Where Gaussians are added: where the screen gradient is large, summed as `published` or as `absolute` magnitudes;
-    where Gaussians answer for the photos' `error`; or `mcmc`: where opacity is high, dead ones moving there."""
+    or `mcmc`: where opacity is high, dead ones moving there."""
     densify_gradient: Literal["auto"] | PositiveFloat = "auto"
-    """Gaussians are densified whose score is above this: the image-plane gradient (NDC), for `error` pixels of full
-    error a photo; `mcmc` has no score. Auto: 1.2e-3 for `absolute`, 2e-4 for `published`, 0.1 for `error`."""
-    opacity_decay: Literal["auto"] | NonNegativeFloat = "auto"
-    """Weight of the mean opacity in the loss: what no photo holds fades. Auto: 0.01 for `mcmc`, else 0."""
-    scale_decay: Literal["auto"] | NonNegativeFloat = "auto"
-    """Weight of the mean size (three axes, over the extent): what no photo holds shrinks. Auto: as above."""
+    """Gaussians are densified whose score is above this: the image-plane gradient (NDC); `mcmc` has no score.
+    Auto: 1.2e-3 for `absolute`, 2e-4 for `published`."""
     split_extent: PositiveFloat = 0.01
     """Those larger than this share of the scene's extent are split, smaller ones cloned."""
     split_shrink: Annotated[float, Field(ge=1.0, le=10.0)] = 1.6
@@ -207,12 +188,8 @@ class TrainConfig(StageConfig):
     """Learning rate of rotations."""
     sparse_adam: bool = True
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
-    depth_weight: NonNegativeFloat = 0.0
-    """Weight of the sparse points' depths in the loss, falling to a tenth of it; 0: they only start the training."""
     spread_weight: NonNegativeFloat = 0.0
     """Weight of the spread of the depths along a pixel's ray in the loss: layers become one surface. Tried: 0.05."""
-    sh_limit: bool = False
-    """Hold the degree of each Gaussian's colour to what the photos that saw it can tell by number and angles."""
     max_anisotropy: NonNegativeFloat = 0.0
     """No axis of a Gaussian is longer than this many times its middle one (at least 1): no needles. 0: no limit."""
     dropout: Literal["auto"] | Annotated[float, Field(ge=0.0, le=0.9)] = "auto"

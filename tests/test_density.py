@@ -14,11 +14,9 @@ from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.pipeline.scene.sh import rgb_to_dc
 from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.density import BLIND, Density, DensityStep, Look, Seen, make_density
-from splatpipe.stages.train.density.error import error_share, photo_error
 from splatpipe.stages.train.density.mcmc import composite_integral, disturb, draw_parents, shared
 from splatpipe.stages.train.density.strategy import ScoredDensity
 from splatpipe.stages.train.plan import resolve_schedule
-from splatpipe.stages.train.stream import TrainingPhoto
 
 WIDTH, HEIGHT = 40, 30
 CAMERA = Camera("photo.png", WIDTH, HEIGHT, 35.0, 36.0, 20.5, 14.5, np.eye(4))
@@ -49,14 +47,11 @@ def rendered(gaussians: Gaussians, look: Look = BLIND, probe: Tensor | None = No
 
 def observed(density: Density, gaussians: Gaussians, weights: Tensor) -> Tensor:
     """The score after one photo whose loss is Σ weights · colour."""
-    look = density.look(resolve_schedule(TrainConfig()), 500, 10)
-    probe = torch.zeros(len(gaussians), 2, requires_grad=True) if look.probe else None
-    render = rendered(gaussians.requires_grad_(), look, probe)
-    (render.colour * weights).sum().backward(retain_graph=look.again)
-    photo = TrainingPhoto(CAMERA, picture(), None)
+    probe = torch.zeros(len(gaussians), 2, requires_grad=True) if density.look.probe else None
+    render = rendered(gaussians.requires_grad_(), density.look, probe)
+    (render.colour * weights).sum().backward()
     with torch.no_grad():
-        gradient = None if probe is None else probe.grad
-        density.observe(Seen(gaussians, render, photo, look, gradient, render.colour), TrainConfig())
+        density.observe(Seen(render, None if probe is None else probe.grad), TrainConfig())
     assert isinstance(density, ScoredDensity)
     return density.statistics.score()
 
@@ -96,68 +91,19 @@ def test_gradient_scores_are_those_of_the_reference(name: str, magnitudes: bool)
     )
 
 
-def test_error_score_is_blending_weight_times_error_summed_over_the_pixels() -> None:
-    gaussians = scene(12)
-    error = (rendered(gaussians).colour - picture()).abs().mean(dim=2)
-    lone = gaussians.clone()
-    expected = torch.zeros(12)
-    for row in range(12):  # white where all others are black: the picture is the Gaussian's blending weight
-        lone.sh[:, 0] = rgb_to_dc(torch.zeros(3))
-        lone.sh[row, 0] = rgb_to_dc(torch.ones(3))
-        expected[row] = (rendered(lone).colour[..., 0] * error).sum()
-    score = observed(make_density(TrainConfig(density="error"), 12), gaussians, torch.ones(HEIGHT, WIDTH, 3))
-    torch.testing.assert_close(score, expected, rtol=1e-4, atol=1e-5)
+def test_mcmc_adds_the_gradient_of_its_decays_to_what_was_seen() -> None:
+    gaussians = scene(20).requires_grad_()
+    size = torch.exp(gaussians.log_scales).sum(dim=1) / 2.5
+    definition = 0.01 * torch.sigmoid(gaussians.opacity_logits).mean() + 0.01 * size.mean()
+    expected = torch.autograd.grad(definition, (gaussians.opacity_logits, gaussians.log_scales))
+    visible = torch.arange(20) % 3 > 0
+    gaussians.opacity_logits.grad, gaussians.log_scales.grad = torch.zeros(20), torch.zeros(20, 3)
+    make_density(MCMC, 20).add_gradients(gaussians, visible, extent=2.5)
+    torch.testing.assert_close(gaussians.opacity_logits.grad, expected[0] * visible)
+    torch.testing.assert_close(gaussians.log_scales.grad, expected[1] * visible[:, None])
 
 
-def test_error_is_that_of_the_render_as_its_sky_and_exposure_show_it() -> None:
-    gaussians, density = scene(12).requires_grad_(), make_density(TrainConfig(density="error"), 12)
-    look, photo = Look(again=True), TrainingPhoto(CAMERA, picture(), None)
-    render = rendered(gaussians, look)
-    with torch.no_grad():
-        density.observe(Seen(gaussians, render, photo, look, None, shown=picture()), TrainConfig())
-    assert isinstance(density, ScoredDensity) and not density.statistics.score().any()
-
-
-def test_error_share_looks_past_channels_that_are_clamped_and_masked_pixels() -> None:
-    gaussians = scene(1)
-    gaussians.sh[0, 0] = torch.tensor([-9.0, -9.0, 0.1])
-    render = rendered(gaussians.requires_grad_())
-    alpha = render.alpha.detach()
-    assert float(error_share(gaussians, render, torch.ones(HEIGHT, WIDTH))) == pytest.approx(
-        float(alpha.sum()), rel=1e-4
-    )
-    mask = torch.rand(HEIGHT, WIDTH) > 0.5
-    error = photo_error(torch.zeros(HEIGHT, WIDTH, 3), TrainingPhoto(CAMERA, torch.full((HEIGHT, WIDTH, 3), 0.5), mask))
-    torch.testing.assert_close(error, 0.5 * mask)
-
-
-@pytest.mark.parametrize(("every", "photos", "looks"), [(100, 11, 11), (100, 300, 25), (2, 5, 1), (1, 5, 1)])
-def test_error_is_looked_at_just_before_a_step_and_never_often(every: int, photos: int, looks: int) -> None:
-    options = resolve_schedule(TrainConfig(density="error", densify_every=every))
-    density = make_density(options, 3)
-    again = [density.look(options, iteration, photos).again for iteration in range(every + 1, 2 * every + 1)]
-    assert again == [False] * (every - looks) + [True] * looks
-
-
-def test_looking_at_the_error_leaves_the_gradients_of_the_loss() -> None:
-    """The second backward pass must not write into the memory that the first one's gradients lie in."""
-    gradients = []
-    for density in (None, make_density(TrainConfig(density="error"), 60)):
-        gaussians = scene(60).requires_grad_()
-        look = Look(again=density is not None)
-        render = rendered(gaussians, look)
-        (render.colour - picture()).square().mean().backward(retain_graph=look.again)
-        if density is not None:
-            with torch.no_grad():
-                photo = TrainingPhoto(CAMERA, picture(), None)
-                density.observe(Seen(gaussians, render, photo, look, None, render.colour), TrainConfig())
-        gradients.append({name: tensor.grad for name, tensor in gaussians.tensors().items()})
-    alone, looked_at = gradients
-    for name, gradient in alone.items():
-        assert gradient is not None and torch.equal(gradient, looked_at[name]), name
-
-
-@pytest.mark.parametrize("name", ["published", "absolute", "error", "mcmc"])
+@pytest.mark.parametrize("name", ["published", "absolute", "mcmc"])
 def test_every_strategy_keeps_to_the_limit_and_its_statistics_survive(name: str) -> None:
     options = resolve_schedule(TrainConfig.model_validate({"density": name, "densify_gradient": 1e-9}))
     gaussians = scene(50)

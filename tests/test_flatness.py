@@ -19,7 +19,7 @@ from splatpipe.stages.train.stream import TrainingPhoto
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-FEW = tiny_scene.plain(iterations=200, densify=False, sh_every=5, exposure="affine", dropout=0.1, depth_weight=0.1)
+FEW = tiny_scene.plain(iterations=200, densify=False, sh_every=5, exposure="affine", dropout=0.1)
 FLAT = FEW.model_copy(update={"stop_when_flat": 0.9})  # so much that any curve is flat
 PARTS = ("model.ply", "history.json", "exposures.json", "plan.json")
 

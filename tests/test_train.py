@@ -30,18 +30,15 @@ from splatpipe.stages.train.stream import TrainingPhoto
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-PARTS = ["cameras_refined.json", "exposures.json", "exposures.npz", "history.json", "model.ply", "plan.json", "sky.npz"]
+PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "sky.npz"]
 TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "exposure": "affine",
     "filter_3d": True,
     "antialias": True,
-    "depth_weight": 0.1,
-    "sh_limit": True,
     "dropout": 0.2,
     "max_anisotropy": 5.0,
     "spread_weight": 0.05,
     "prune_free_space": 2,
-    "refine_cameras": "pose_focal",
     "robust": 0.1,
     "stop_when_flat": 0.5,
 }
@@ -154,11 +151,8 @@ def test_killed_training_goes_on_and_ends_with_the_same_bits(
     assert digest(tmp_path) == digest(undisturbed)
 
 
-@pytest.mark.parametrize("exposure", ["affine", "bilateral"])
-def test_killed_training_with_every_technique_ends_with_the_same_bits(
-    scene: Path, tmp_path: Path, exposure: str
-) -> None:
-    config = QUICK.model_copy(update=TECHNIQUES | {"exposure": exposure})
+def test_killed_training_with_every_technique_ends_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
+    config = QUICK.model_copy(update=TECHNIQUES)
     whole = trained(scene, tmp_path / "whole", config)
     for name, value in TECHNIQUES.items():
         assert getattr(tiny_scene.plain(), name) != value
@@ -170,7 +164,7 @@ def test_killed_training_with_every_technique_ends_with_the_same_bits(
         assert (tmp_path / "killed" / part).read_bytes() == (whole / part).read_bytes()
 
 
-@pytest.mark.parametrize(("density", "when"), [("published", 18), ("error", 20), ("mcmc", 35)])
+@pytest.mark.parametrize(("density", "when"), [("published", 18), ("mcmc", 35)])
 def test_killed_training_of_every_strategy_ends_with_the_same_bits(
     scene: Path, undisturbed: Path, tmp_path: Path, density: str, when: int
 ) -> None:
@@ -251,7 +245,6 @@ def test_fewer_gaussians_than_points_may_be_asked_for(scene: Path, tmp_path: Pat
         {"sparse_adam": False},
         {"loss": "kornia", "iterations": 20},
         {"prune_screen_px": 5.0},
-        {"opacity_decay": 0.01, "scale_decay": 0.01},
     ],
 )
 def test_options_train_to_a_finite_model_and_repeat(

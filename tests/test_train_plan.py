@@ -56,21 +56,19 @@ def test_short_runs_have_every_phase_and_no_reset(iterations: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("density", "gradient", "until", "reset", "decay"),
+    ("density", "gradient", "until", "reset"),
     [
-        ("published", 2e-4, 15_000, 3000, 0.0),
-        ("absolute", 1.2e-3, 15_000, 3000, 0.0),
-        ("error", 0.1, 15_000, 3000, 0.0),
-        ("mcmc", 1.0, 25_000, 0, 0.01),
+        ("published", 2e-4, 15_000, 3000),
+        ("absolute", 1.2e-3, 15_000, 3000),
+        ("mcmc", 1.0, 25_000, 0),
     ],
 )
 def test_each_strategy_of_density_control_has_its_defaults(
-    density: str, gradient: float, until: int, reset: int, decay: float
+    density: str, gradient: float, until: int, reset: int
 ) -> None:
     options = resolve_schedule(TrainConfig.model_validate({"density": density}))
     assert (options.densify_gradient, options.densify_until, options.reset_every) == (gradient, until, reset)
-    assert options.opacity_decay == options.scale_decay == decay
-    given = {"density": density, "densify_gradient": 0.5, "densify_until": 9, "reset_every": 8, "opacity_decay": 0.0}
+    given = {"density": density, "densify_gradient": 0.5, "densify_until": 9, "reset_every": 8}
     assert resolve_schedule(TrainConfig.model_validate(given)).model_dump().items() >= given.items()
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.raster import _native
-from splatpipe.pipeline.raster.autograd import GradientBuffers, Probes, render_native
+from splatpipe.pipeline.raster.autograd import GradientBuffers, render_native
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions, check
 from splatpipe.pipeline.raster.isa import isa_name, isa_names, use_isa_of_environment
 from splatpipe.pipeline.raster.reference import render_reference
@@ -27,7 +27,6 @@ def render(
     *,
     backend: Backend = "auto",
     means2d_probe: Tensor | None = None,
-    camera_probe: Tensor | None = None,
     buffers: GradientBuffers | None = None,
 ) -> Render:
     """Render Gaussians as a camera sees them; differentiable with respect to every raw parameter.
@@ -42,7 +41,6 @@ def render(
         backend: ``native`` wants float32 on the CPU; ``auto`` takes it where it can.
         means2d_probe: Zeros (n, 2) whose gradient becomes dL/d(centre on screen), pixels, for density control; with
             `options.magnitudes` the sum of its absolute values over the pixels.
-        camera_probe: Zeros (7,) whose gradient becomes the one by ``Camera.moved``'s motion, to refine the camera.
         buffers: Where the native backend's backward pass writes its gradients; fresh memory without.
 
     Returns:
@@ -52,12 +50,12 @@ def render(
         ValueError: if an argument makes no sense, or the native backend is asked for other tensors than it takes.
         SplatpipeError: if the scene covers more pixels than memory or 32-bit indices hold.
     """
-    check(gaussians, camera, options, means2d_probe, camera_probe)
+    check(gaussians, camera, options, means2d_probe)
     means = gaussians.means
     native_fits = means.device.type == "cpu" and means.dtype == torch.float32
     if backend == "reference" or (backend == "auto" and not native_fits):
-        return render_reference(gaussians, camera, options, means2d_probe, camera_probe)
-    return render_native(gaussians, camera, options, Probes(means2d_probe, camera_probe), buffers)
+        return render_reference(gaussians, camera, options, means2d_probe)
+    return render_native(gaussians, camera, options, means2d_probe, buffers)
 
 
 def set_threads(threads: int) -> None:

@@ -58,7 +58,6 @@ class Frame:
         outputs: Sequence[Tensor],
         means2d: Tensor,
         magnitudes: bool = False,
-        camera: Tensor | None = None,
     ) -> None:
         """Gradients of the last forward(); can be repeated.
 
@@ -68,7 +67,6 @@ class Frame:
             outputs: Written: gradients of the parameters, laid out like them.
             means2d: Written: dL/d(centres on screen), pixels (n, 2).
             magnitudes: Make that the sum of its absolute values over the pixels, x and y apart.
-            camera: Written: the gradient by a motion of the camera (7,), see `Camera.moved`.
         """
 
     @property
@@ -91,14 +89,6 @@ def affine_colour_backward(
     affine: Tensor, picture: Tensor, upstream: Tensor, gradient: Tensor, by_affine: Tensor
 ) -> None:
     """Gradients by the picture and by the map, written to the last two, from the one by the result."""
-
-def bilateral_colour(grid: Tensor, picture: Tensor, out: Tensor) -> None:
-    """The colours of a float32 (h, w, 3) picture through a (levels, rows, columns, 12) grid of maps, to `out`."""
-
-def bilateral_colour_backward(
-    grid: Tensor, picture: Tensor, upstream: Tensor, gradient: Tensor, by_grid: Tensor
-) -> None:
-    """Gradients by the picture and by the grid, written to the last two, from the one by the result."""
 
 def adam_step(
     values: Sequence[Tensor],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -37,19 +36,11 @@ class GradientBuffers:
         return tuple(buffer.detach() for buffer in self._buffers)
 
 
-@dataclass(frozen=True)
-class Probes:
-    """Zeros whose gradients say more of a render than those of the Gaussians; see ``render``."""
-
-    means2d: Float[Tensor, "n 2"] | None = None
-    camera: Float[Tensor, " 7"] | None = None
-
-
 def render_native(
     gaussians: Gaussians,
     camera: Camera,
     options: RenderOptions,
-    probes: Probes,
+    means2d_probe: Float[Tensor, "n 2"] | None,
     buffers: GradientBuffers | None = None,
 ) -> Render:
     """Render with the native kernels; arguments as of ``render``.
@@ -62,7 +53,7 @@ def render_native(
     for name, tensor in gaussians.tensors().items():
         if tensor.device.type != "cpu" or tensor.dtype != torch.float32:
             raise ValueError(f"the native rasterizer takes float32 on the CPU, not {name} of {tensor.dtype}")
-    return Render(*_Rasterize.apply(camera, options, buffers, probes.means2d, probes.camera, *parameters))  # type: ignore[no-untyped-call]
+    return Render(*_Rasterize.apply(camera, options, buffers, means2d_probe, *parameters))  # type: ignore[no-untyped-call]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -75,7 +66,6 @@ class _Rasterize(torch.autograd.Function):
         options: RenderOptions,
         buffers: GradientBuffers | None,
         _means2d_probe: Tensor | None,
-        _camera_probe: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         parameters = tuple(tensor.detach().contiguous() for tensor in parameters)
@@ -124,13 +114,12 @@ class _Rasterize(torch.autograd.Function):
         # New memory a pass where none was given: a second pass must not write over the gradients of the first.
         gradients = (ctx.buffers or GradientBuffers()).like(parameters)
         means2d = torch.empty(len(parameters[0]), 2)
-        camera = torch.empty(7) if ctx.needs_input_grad[4] else None
         try:
-            ctx.frame.backward(parameters, pictures, gradients, means2d, ctx.magnitudes, camera)
+            ctx.frame.backward(parameters, pictures, gradients, means2d, ctx.magnitudes)
         except MemoryError as error:
             _refuse(error, len(parameters[0]))
         wanted = ctx.needs_input_grad[3:]
-        asked = (grad if needs else None for grad, needs in zip((means2d, camera, *gradients), wanted, strict=True))
+        asked = (grad if needs else None for grad, needs in zip((means2d, *gradients), wanted, strict=True))
         return (None, None, None, *asked)
 
 

@@ -105,18 +105,12 @@ class Render:
         return torch.where(seen, self.depth_sum / torch.where(seen, self.alpha, 1.0), 0.0)
 
 
-def check(
-    gaussians: Gaussians,
-    camera: Camera,
-    options: RenderOptions,
-    means2d_probe: Tensor | None,
-    camera_probe: Tensor | None,
-) -> None:
+def check(gaussians: Gaussians, camera: Camera, options: RenderOptions, means2d_probe: Tensor | None) -> None:
     """Refuse what no backend renders.
 
     Raises:
         ValueError: if the picture has no pixel or too many, the Gaussians do not hold the SH degree, the near plane or
-            a focal length is not positive and finite, or a probe has the wrong shape.
+            a focal length is not positive and finite, or the probe has the wrong shape.
     """
     if not (1 <= camera.width <= 65536 and 1 <= camera.height <= 65536):
         raise ValueError(f"a picture of {camera.width} × {camera.height} pixels cannot be rendered")
@@ -128,5 +122,3 @@ def check(
         raise ValueError(f"focal lengths {camera.fx}, {camera.fy}")
     if means2d_probe is not None and tuple(means2d_probe.shape) != (len(gaussians), 2):
         raise ValueError(f"means2d_probe is {tuple(means2d_probe.shape)}, not ({len(gaussians)}, 2)")
-    if camera_probe is not None and tuple(camera_probe.shape) != (7,):
-        raise ValueError(f"camera_probe is {tuple(camera_probe.shape)}, not (7,)")

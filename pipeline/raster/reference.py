@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -94,36 +94,14 @@ def rotation_from_quats(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def moved_camera(camera: Camera, motion: Float[Tensor, " 7"]) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, " 2"]]:
-    """``Camera.moved``, differentiable, in float64.
-
-    Args:
-        camera: The view.
-        motion: In the order of ``Camera.moved``.
-
-    Returns:
-        Its pose, and its focal lengths along x and y, pixels.
-    """
-    motion = motion.double()
-    pose = motion.new_tensor(camera.cam_from_world)
-    x, y, z = motion[:3].unbind()
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-    moved = torch.matrix_exp(skew) @ pose[:3] + torch.nn.functional.pad(motion[3:6, None], (3, 0))
-    return torch.cat([moved, pose[3:]]), motion.new_tensor([camera.fx, camera.fy]) * torch.exp(motion[6])
-
-
-def projection_jacobian(
-    points: Float[Tensor, "n 3"], camera: Camera, focal: Float[Tensor, " 2"]
-) -> Float[Tensor, "n 2 3"]:
+def projection_jacobian(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 2 3"]:
     """d(pixel) / d(point in the camera frame), with x/z and y/z clamped to the widened frustum of each side.
 
     Args:
         points: Camera frame, z > 0.
         camera: The view; its principal point need not be in the middle.
-        focal: Its focal lengths, pixels.
     """
-    fx, fy = focal.unbind()
+    fx, fy = camera.fx, camera.fy
     x, y, z = points.unbind(-1)
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * camera.width, FRUSTUM_MARGIN * 0.5 * camera.height
     ratio_x = (x / z).clamp(-(camera.cx + margin_x) / fx, (camera.width - camera.cx + margin_x) / fx)
@@ -134,30 +112,25 @@ def projection_jacobian(
     return torch.stack([row_x, row_y], -2)
 
 
-def project(
-    gaussians: Gaussians, camera: Camera, options: RenderOptions, motion: Float[Tensor, " 7"] | None = None
-) -> Splats:
+def project(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> Splats:
     """Project Gaussians to the screen.
 
     Args:
         gaussians: The scene.
         camera: The view.
         options: SH degree, near plane, variant.
-        motion: How the camera is moved first, as by ``Camera.moved``; differentiable.
 
     Returns:
         All of them, in order; the values of unusable ones mean nothing.
     """
     means = gaussians.means
-    pose, focal = moved_camera(camera, means.new_zeros(7) if motion is None else motion)
-    centre = (-pose[:3, :3].T @ pose[:3, 3]).to(means.dtype)
-    pose, focal = pose.to(means.dtype), focal.to(means.dtype)
+    pose, centre = means.new_tensor(camera.cam_from_world), means.new_tensor(camera.centre())
     points = means @ pose[:3, :3].T + pose[:3, 3]  # (n, 3)
     x, y, z = points.unbind(-1)
-    means2d = torch.stack([focal[0] * x / z + camera.cx, focal[1] * y / z + camera.cy], -1)  # (n, 2)
+    means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)  # (n, 2)
 
     axes = rotation_from_quats(gaussians.quats) * torch.exp(gaussians.log_scales)[:, None, :]  # (n, 3, 3)
-    jacobian = projection_jacobian(points, camera, focal) @ pose[:3, :3]  # (n, 2, 3) J W
+    jacobian = projection_jacobian(points, camera) @ pose[:3, :3]  # (n, 2, 3) J W
     row_x, row_y = (jacobian @ axes).unbind(-2)  # of B (n, 2, 3) with Σ' = B Bᵀ
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     sharp = (torch.linalg.cross(row_x, row_y) ** 2).sum(-1)  # det Σ' without cancellation (Cauchy-Binet)
@@ -203,7 +176,6 @@ def render_reference(
     camera: Camera,
     options: RenderOptions,
     means2d_probe: Float[Tensor, "n 2"] | None = None,
-    camera_probe: Float[Tensor, " 7"] | None = None,
 ) -> Render:
     """Render by the definition; arguments as of ``render``."""
     with torch.no_grad():
@@ -212,9 +184,7 @@ def render_reference(
         radii = torch.where(visible, everything.radii(), 0.0)
         index = torch.nonzero(visible)[:, 0]
         index = index[torch.argsort(everything.depths[index], stable=True)]
-    splats = project(
-        gaussians.select(index), camera, options, camera_probe
-    )  # NaNs of the others must not reach the gradient
+    splats = project(gaussians.select(index), camera, options)  # NaNs of the others must not reach the gradient
     probe = torch.zeros_like(splats.means) if means2d_probe is None else means2d_probe[index]
 
     rows = max(1, _PAIRS_AT_ONCE // (max(1, len(index)) * camera.width))

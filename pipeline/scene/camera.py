@@ -69,19 +69,6 @@ class Camera:
             cy=self.cy * by_y,
         )
 
-    def moved(self, motion: Float64[np.ndarray, " 7"]) -> Camera:
-        """The camera turned about its centre, then shifted, then with another focal length.
-
-        Args:
-            motion: Rotation vector (radians) and translation (world units) of a point in the camera's frame,
-                x' = exp(rotation) x + translation; logarithm of the factor on both focal lengths.
-        """
-        step = np.eye(4)
-        step[:3, :3] = rotation_matrix(motion[:3])
-        step[:3, 3] = motion[3:6]
-        factor = math.exp(motion[6])
-        return replace(self, fx=self.fx * factor, fy=self.fy * factor, cam_from_world=step @ self.cam_from_world)
-
     def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Project world points to pixels.
 

@@ -21,24 +21,6 @@ MODEL = "sparse/0"
 NAMES_SHOWN = 5  # of a list in a message
 
 
-@dataclass(frozen=True, eq=False)
-class PointDepths:
-    """How deep the sparse points lie that a photo shows.
-
-    Attributes:
-        share: Where, x and y as shares of the picture's width and height, in [0, 1): right at any size.
-        z: Along the view axis, world units, > 0.
-        weights: How far each is to be believed, > 0.
-    """
-
-    share: Float64[np.ndarray, "n 2"]
-    z: Float64[np.ndarray, " n"]
-    weights: Float64[np.ndarray, " n"]
-
-    def __len__(self) -> int:
-        return len(self.z)
-
-
 @dataclass(frozen=True)
 class View:
     """A photo of the dataset with its camera.
@@ -47,14 +29,12 @@ class View:
         camera: Its pinhole camera; ``camera.name`` is the photo's name.
         image_path: The undistorted photo, in the camera's grid.
         mask_path: Its mask (8-bit, 0 = ignored, same grid), or None.
-        depths: Of its sparse points, where training is to keep to them.
         sky_path: The mask of its sky (8-bit, 0 = something else, same grid), or None where nobody drew one.
     """
 
     camera: Camera
     image_path: Path
     mask_path: Path | None
-    depths: PointDepths | None = None
     sky_path: Path | None = None
 
 

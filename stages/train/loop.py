@@ -24,11 +24,9 @@ from splatpipe.stages.threads import same_bits
 from splatpipe.stages.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.stages.train.densify import is_density_step
 from splatpipe.stages.train.density import BLIND, Seen
-from splatpipe.stages.train.depth import supervised, with_depth
 from splatpipe.stages.train.draws import BACKGROUND, ELSEWHERE, uniform
 from splatpipe.stages.train.dropout import dropped
 from splatpipe.stages.train.exposure import exposures_json
-from splatpipe.stages.train.exposure_grid import write_grids
 from splatpipe.stages.train.flatness import ends_at, is_flat, place_in_schedule, settled_from
 from splatpipe.stages.train.interrupts import deferred_interrupts
 from splatpipe.stages.train.layers import depth_origin, is_spread_counted, spread_loss
@@ -42,8 +40,6 @@ from splatpipe.stages.train.plan import (
     sh_degree_at,
 )
 from splatpipe.stages.train.planning import Scene, under_budgets
-from splatpipe.stages.train.refinement import refined_json
-from splatpipe.stages.train.regularise import add_decay
 from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.state import TrainState
 from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
@@ -71,7 +67,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
 
     free = make_plan(config, views, every, names, len(start))
-    trained_on = supervised(views_of(free, views), dataset, free.options)
+    trained_on = views_of(free, views)
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
 
     def make() -> Plan:
@@ -113,11 +109,7 @@ def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dic
     """Write what was trained beside the Gaussians; what the summary says of techniques that were asked for."""
     write_panorama(out / "sky.npz", None if state.sky is None else state.sky.panorama)
     (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
-    write_grids(out / "exposures.npz", state.exposure)
-    (out / "cameras_refined.json").write_text(refined_json(state.refinement, options), encoding="utf-8")
     summary: dict[str, int | float] = {}
-    if state.refinement is not None:
-        summary |= state.refinement.summary()
     if options.sky != "off":
         summary["sky_photos"] = 0 if state.sky is None else state.sky.photos
     if state.history.flat_at:
@@ -268,46 +260,36 @@ def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str
 def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
-    if state.refinement is not None:
-        photo = state.refinement.refined(photo, iteration, options)
     observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
-    look = state.density.look(options, iteration, len(plan.train_views)) if observed else BLIND
+    look = state.density.look if observed else BLIND
     place = place_in_schedule(plan, state.history.flat_at, iteration)
     settings = render_options(plan, iteration, look.magnitudes)
     if spread := is_spread_counted(options, place):
         settings = replace(settings, depth=True, depth_origin=depth_origin(state.gaussians.means, photo.camera))
     probe = state.probe() if look.probe else None
     model = dropped(state.rendered_model(options), options, place)
-    buffers = None if look.again else state.buffers
-    rendered = raster.render(
-        model, photo.camera, settings, means2d_probe=probe, camera_probe=photo.camera_probe, buffers=buffers
-    )
-    photometric, penalties, photo, shown = losses(state, plan, photo, rendered, settings.background)
-    loss = with_depth(photometric, rendered, photo, options, place) + penalties
+    rendered = raster.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
+    photometric, penalties = losses(state, plan, photo, rendered, settings.background)
+    loss = photometric + penalties
     if spread:
         loss = loss + options.spread_weight * spread_loss(rendered, settings.depth_origin, photo.camera)
-    loss.backward(retain_graph=look.again)  # type: ignore[no-untyped-call]
+    loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
-    state.observe_directions(photo.camera)
-    add_decay(state.gaussians, rendered.visible, options, plan.extent)
+    state.density.add_gradients(state.gaussians, rendered.visible, plan.extent)
     with torch.no_grad():
         if observed:
-            gradient_px = None if probe is None else probe.grad
-            state.density.observe(Seen(state.gaussians, rendered, photo, look, gradient_px, shown), options)
+            state.density.observe(Seen(rendered, None if probe is None else probe.grad), options)
         state.step(rendered.visible, means_rate(plan, place), plan.extent, options)
         if state.exposure is not None:
             state.exposure.step(photo.camera.name, place, options)
-        if state.refinement is not None:
-            state.refinement.step(photo, place, options)
         if state.sky is not None:
             state.sky.step(min(1.0, place / options.iterations))
 
 
 def losses(
     state: TrainState, plan: Plan, photo: TrainingPhoto, rendered: raster.Render, behind: tuple[float, float, float]
-) -> tuple[Tensor, Tensor, TrainingPhoto, Tensor]:
-    """How far a render is from its photo, shown as the photo's sky and exposure would, what the sky adds to that, the
-    photo with what of it counts, and the render as shown.
+) -> tuple[Tensor, Tensor]:
+    """How far a render is from its photo, shown as the photo's sky and exposure would, and what the sky adds to that.
 
     Args:
         state: Of whose side models the render is completed.
@@ -327,7 +309,7 @@ def losses(
     if state.robust is not None:
         photo = state.robust.look(photo, rendered, shown)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty, photo, shown
+    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty
 
 
 def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.RenderOptions:
@@ -338,7 +320,7 @@ def render_options(plan: Plan, iteration: int, magnitudes: bool) -> raster.Rende
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,
-        depth=options.depth_weight > 0.0 or options.robust > 0.0,
+        depth=options.robust > 0.0,
         magnitudes=magnitudes,
     )
 

@@ -150,7 +150,7 @@ def _photos(views: Sequence[View], megapixels: float) -> tuple[list[TrainingPhot
         camera, pixels, mask = reduced_view(view, megapixels)
         colour = torch.from_numpy(pixels.astype(np.float32) * np.float32(1.0 / 255.0))
         counts = None if mask is None else torch.from_numpy(mask)
-        photos.append(TrainingPhoto(camera, colour, counts, view.depths))
+        photos.append(TrainingPhoto(camera, colour, counts))
     return photos, (time.monotonic() - began) / len(photos)
 
 

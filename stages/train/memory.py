@@ -6,8 +6,7 @@
 | their gradients | 236 |
 | Adam's two moments | 472 |
 | statistics of density control | 12 |
-| with `sh_limit`, where it was seen from | 20 |
-| **state of training**, without `sh_limit` | **956** |
+| **state of training** | **956** |
 | while density control copies parameters and moments, and the model is written | 860 |
 """
 
@@ -29,7 +28,6 @@ FLOAT_BYTES = 4
 SHAPE_NUMBERS = 11  # of a Gaussian besides its colour: position, scales, rotation, opacity
 STATE_COPIES = 4  # a parameter has a gradient and two moments
 STATISTICS_BYTES = 12
-COVERAGE_BYTES = 20  # with `sh_limit`
 PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
 PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
 FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
@@ -40,7 +38,7 @@ GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density con
 def bytes_per_gaussian(options: TrainConfig) -> int:
     """Most that a Gaussian takes at any time of a training."""
     numbers = SHAPE_NUMBERS + 3 * coefficient_count(options.sh_degree)
-    state = STATE_COPIES * FLOAT_BYTES * numbers + STATISTICS_BYTES + (COVERAGE_BYTES if options.sh_limit else 0)
+    state = STATE_COPIES * FLOAT_BYTES * numbers + STATISTICS_BYTES
     return int(state * (1.0 + PEAK_SHARE))
 
 

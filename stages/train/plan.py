@@ -35,20 +35,17 @@ class _Defaults:
         gradient: Score above which Gaussians are densified.
         until: Last step, as a share of the run.
         resets: Whether opacities are reset.
-        decay: Weight of mean opacity and of mean scale in the loss.
     """
 
     gradient: float
     until: float = 0.5
     resets: bool = True
-    decay: float = 0.0
 
 
 DENSITY_DEFAULTS = {
     "published": _Defaults(2e-4),
     "absolute": _Defaults(1.2e-3),
-    "error": _Defaults(0.1),
-    "mcmc": _Defaults(1.0, until=25 / 30, resets=False, decay=0.01),  # it has no score
+    "mcmc": _Defaults(1.0, until=25 / 30, resets=False),  # it has no score
 }
 
 
@@ -157,8 +154,6 @@ def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> TrainCon
         "densify_every": max(1, min(100, run // 10)),
         "reset_every": 3000 if run >= SHORT_RUN and strategy.resets else 0,
         "densify_gradient": strategy.gradient,
-        "opacity_decay": strategy.decay,
-        "scale_decay": strategy.decay,
         "coarse_until": until,
         "dropout": round(FEW_DROPOUT * share_of_few(photos), 4),
         "lr_boost": round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / run))), 4),

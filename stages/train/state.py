@@ -13,7 +13,6 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.scene.camera import Camera
 from splatpipe.pipeline.scene.free_space import FreeSpace
 from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.scene.sh import coefficient_count
@@ -31,13 +30,10 @@ from splatpipe.stages.train.densify import (
 )
 from splatpipe.stages.train.density import Density, DensityStep, make_density
 from splatpipe.stages.train.exposure import Exposure
-from splatpipe.stages.train.exposure_grid import make_exposure
 from splatpipe.stages.train.history import History
 from splatpipe.stages.train.plan import Plan
-from splatpipe.stages.train.refinement import CameraRefinement
 from splatpipe.stages.train.regularise import limit_needles
 from splatpipe.stages.train.robust import Robust, share_at
-from splatpipe.stages.train.sh_limit import Coverage
 from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.smoothing import REFRESH_EVERY, Sampling, raw_opacity_limits, smoothed
 
@@ -70,8 +66,6 @@ class TrainState:
         buffers: Memory of the gradients.
         exposure: The photos' colours, where they are modelled.
         sky: Trained beside the Gaussians; None where there is none.
-        refinement: Of the photos' cameras, with `refine_cameras`; its anchor is not in the checkpoint.
-        coverage: Directions that Gaussians were seen from; None without `sh_limit`.
         robust: What of each photo the others contradict; None without `robust`.
         sampling: The training cameras, with `filter_3d`; not in the checkpoint.
         free_space: What photos look through, with `prune_free_space`; not in the checkpoint.
@@ -87,8 +81,6 @@ class TrainState:
     buffers: GradientBuffers = field(default_factory=GradientBuffers)
     exposure: Exposure | None = None
     sky: SkyModel | None = None
-    refinement: CameraRefinement | None = None
-    coverage: Coverage | None = None
     robust: Robust | None = None
     sampling: Sampling | None = None
     free_space: FreeSpace | None = None
@@ -120,9 +112,7 @@ class TrainState:
         """Gaussians with everything that the plan wants beside them, nothing of it trained."""
         options = plan.options
         state = TrainState(gaussians, Adam(gaussians.tensors()), make_density(options, len(gaussians)), history)
-        state.exposure = make_exposure(plan.train_views, options)
-        state.refinement = CameraRefinement(plan.train_views) if options.refine_cameras != "off" else None
-        state.coverage = Coverage(len(gaussians)) if options.sh_limit else None
+        state.exposure = Exposure(plan.train_views) if options.exposure == "affine" else None
         state.robust = Robust(plan.train_views) if options.robust else None
         state.sky = sky
         return state
@@ -170,24 +160,10 @@ class TrainState:
         limit_needles(self.gaussians.log_scales.detach(), options)
         self.density.stepped(self.gaussians.detach(), options, means_rate, self.iteration + 1)
 
-    def observe_directions(self, camera: Camera) -> None:
-        """With `sh_limit`: note what the photo saw, and clear the gradients of degrees that are not allowed."""
-        logits, sh = self.gaussians.opacity_logits, self.gaussians.sh
-        if self.coverage is not None and logits.grad is not None and sh.grad is not None:
-            self.coverage.observe(self.gaussians.means.detach(), camera, logits.grad != 0.0)
-            self.coverage.clear(sh.grad)
-
     def end_epoch(self, iteration: int, photos: int, options: TrainConfig) -> None:
-        """After the last iteration of an epoch, with `sh_limit`: take its degrees, and clear what exceeds them; with
-        `robust`: take its threshold."""
-        if iteration % photos != 0:
-            return
-        if self.robust is not None:
+        """After the last iteration of an epoch, with `robust`: take its threshold."""
+        if self.robust is not None and iteration % photos == 0:
             self.robust.end_epoch(share_at(options, iteration))
-        if self.coverage is not None:
-            self.coverage.end_epoch()
-            for coefficients in (self.gaussians.sh.detach(), self.adam.mean["sh"], self.adam.square["sh"]):
-                self.coverage.clear(coefficients)
 
     def probe(self) -> Float[Tensor, "n 2"]:
         """Zeros whose gradient a render makes the one by the means on the image plane."""
@@ -248,8 +224,6 @@ class TrainState:
         self.gaussians, self.filter_sigmas = grown.requires_grad_(), None
         self.adam.select(growth.source)
         self.adam.zero_state(rows=growth.fresh)
-        if self.coverage is not None:
-            self.coverage.select(growth.source)
         self.density.restart(len(grown))
 
     def finished(self) -> Gaussians:
@@ -264,8 +238,6 @@ class TrainState:
         parts: dict[str, Stateful | None] = {
             "density": self.density,
             "exposure": self.exposure,
-            "refinement": self.refinement,
-            "coverage": self.coverage,
             "robust": self.robust,
             "sky": self.sky,
         }

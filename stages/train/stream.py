@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import PointDepths, View
+from splatpipe.pipeline.scene.dataset import View
 from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.stages.train.draws import permutation
 from splatpipe.stages.train.photo_cache import PhotoCache, stored_bytes
@@ -31,15 +31,11 @@ class TrainingPhoto:
         camera: Its camera, at the size of ``colour``.
         colour: In [0, 1].
         mask: True where the photo counts; None where all of it does.
-        depths: Of the sparse points that it shows; None where they do not count.
-        camera_probe: Takes the gradient by a motion of the camera, where that is wanted.
     """
 
     camera: Camera
     colour: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None
-    depths: PointDepths | None = None
-    camera_probe: Float[Tensor, " 7"] | None = None
 
 
 class PhotoStream:
@@ -139,7 +135,7 @@ class PhotoStream:
         colour = pixels.astype(np.float32)
         colour *= np.float32(1.0 / 255.0)
         counts = None if mask is None else torch.from_numpy(mask.copy())
-        return TrainingPhoto(camera, torch.from_numpy(colour), counts, self._views[key[0]].depths)
+        return TrainingPhoto(camera, torch.from_numpy(colour), counts)
 
     def _decoded(self, key: tuple[int, int]) -> tuple[Camera, Pixels, Mask | None]:
         stored = self._cache.get(key)

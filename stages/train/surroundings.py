@@ -10,7 +10,6 @@ from splatpipe.pipeline.scene.dataset import View
 from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.clearing import free_space_of
 from splatpipe.stages.train.plan import Plan
-from splatpipe.stages.train.refinement import anchor
 from splatpipe.stages.train.sky import SkyModel
 from splatpipe.stages.train.smoothing import sampling_of
 from splatpipe.stages.train.state import TrainState
@@ -29,7 +28,7 @@ def begin_sky(
 
 
 def surround(state: TrainState, plan: Plan, views: Sequence[View], dataset: Path) -> None:
-    """Give a state what its techniques want of the dataset: sampling, free space, cameras to hold to and to compare.
+    """Give a state what its techniques want of the dataset: sampling, free space, cameras to compare.
 
     Args:
         state: Changed in place.
@@ -42,6 +41,5 @@ def surround(state: TrainState, plan: Plan, views: Sequence[View], dataset: Path
     """
     state.sampling = sampling_of(plan, views)
     state.free_space = free_space_of(views, dataset, plan.options)
-    anchor(state.refinement, plan, views, dataset)
     if state.robust is not None:
         state.robust.watch(view.camera for view in views)

@@ -28,7 +28,6 @@ PLAIN: dict[str, object] = {
     "sky": "off",
     "prune_free_space": 0,
     "dropout": 0.0,
-    "depth_weight": 0.0,
     "lr_opacity": 0.05,
 }
 

@@ -13,8 +13,6 @@
 #include "adam.h"
 #include "adam_step.h"
 #include "affine_colour.h"
-#include "bilateral.h"
-#include "bilateral_colour.h"
 #include "colour.h"
 #include "loss.h"
 #include "photo_loss.h"
@@ -73,43 +71,6 @@ void affine_colour_backward(const Affine& map, const Image& in, const Image& ups
     for (int k = 0; k < splat::kAffine; ++k) map_gradient.data()[k] = static_cast<float>(sums[k]);
 }
 
-using Grid = nb::ndarray<const float, nb::shape<-1, -1, -1, splat::kAffine>, nb::c_contig, nb::device::cpu>;
-using MutableGrid = nb::ndarray<float, nb::shape<-1, -1, -1, splat::kAffine>, nb::c_contig, nb::device::cpu>;
-
-splat::ColourGrid grid_of(const Grid& maps) {
-    const std::size_t levels = maps.shape(0), rows = maps.shape(1), columns = maps.shape(2);
-    require(levels >= 2 && levels <= splat::kGridLevels, "a grid has 2 to 16 levels");
-    require(rows >= 2 && rows <= splat::kGridSide && columns >= 2 && columns <= splat::kGridSide,
-            "a grid has 2 to 64 nodes a side");
-    return {maps.data(), static_cast<int>(levels), static_cast<int>(rows), static_cast<int>(columns)};
-}
-
-void bilateral_colour(const Grid& maps, const Image& in, const MutableImage& out) {
-    const std::size_t height = in.shape(0), width = in.shape(1);
-    require(out.shape(0) == height && out.shape(1) == width, "pictures differ in size");
-    const splat::ColourGrid grid = grid_of(maps);
-    nb::gil_scoped_release release;
-    splat::bilateral_colour(grid, in.data(), static_cast<std::int64_t>(height), static_cast<std::int64_t>(width),
-                            out.data());
-}
-
-void bilateral_colour_backward(const Grid& maps, const Image& in, const Image& upstream, const MutableImage& gradient,
-                               const MutableGrid& grid_gradient) {
-    const std::size_t height = in.shape(0), width = in.shape(1);
-    require(upstream.shape(0) == height && upstream.shape(1) == width, "pictures differ in size");
-    require(gradient.shape(0) == height && gradient.shape(1) == width, "pictures differ in size");
-    for (std::size_t side = 0; side < 3; ++side)
-        require(grid_gradient.shape(side) == maps.shape(side), "grid and gradient differ in size");
-    const splat::ColourGrid grid = grid_of(maps);
-    std::vector<double> sums(maps.size());
-    {
-        nb::gil_scoped_release release;
-        splat::bilateral_colour_backward(grid, in.data(), upstream.data(), static_cast<std::int64_t>(height),
-                                         static_cast<std::int64_t>(width), gradient.data(), sums.data());
-    }
-    for (std::size_t k = 0; k < sums.size(); ++k) grid_gradient.data()[k] = static_cast<float>(sums[k]);
-}
-
 std::int64_t adam_step(const std::vector<Rows>& values, const std::vector<ConstRows>& gradients,
                        const std::vector<Rows>& means, const std::vector<Rows>& squares,
                        const std::vector<Rates>& rates, const std::optional<RowMask>& visible,
@@ -147,11 +108,6 @@ void bind_loss(nb::module_& m) {
     m.def("affine_colour_backward", &affine_colour_backward, "affine"_a.noconvert(), "picture"_a.noconvert(),
           "upstream"_a.noconvert(), "gradient"_a.noconvert(), "by_affine"_a.noconvert(),
           "Gradients by the picture and by the map, from the one by the result.");
-    m.def("bilateral_colour", &bilateral_colour, "grid"_a.noconvert(), "picture"_a.noconvert(), "out"_a.noconvert(),
-          "The colours of an (h, w, 3) picture through a (levels, rows, columns, 12) grid of affine maps, to `out`.");
-    m.def("bilateral_colour_backward", &bilateral_colour_backward, "grid"_a.noconvert(), "picture"_a.noconvert(),
-          "upstream"_a.noconvert(), "gradient"_a.noconvert(), "by_grid"_a.noconvert(),
-          "Gradients by the picture and by the grid, from the one by the result.");
     m.def(
         "adam_step",
         [](const std::vector<Rows>& values, const std::vector<ConstRows>& gradients, const std::vector<Rows>& means,

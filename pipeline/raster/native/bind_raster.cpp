@@ -135,8 +135,7 @@ class Frame {
     }
 
     void backward(const ParameterArrays<const float>& arrays, const PictureGradientArrays& gradients,
-                  const ParameterArrays<float>& outputs, const Grid<float>& means2d, bool magnitudes,
-                  const std::optional<Line<float>>& camera) {
+                  const ParameterArrays<float>& outputs, const Grid<float>& means2d, bool magnitudes) {
         const splat::Parameters in = parameters_of(arrays);
         const size_t n = in.count, k = view_.sh_count, h = view_.height, w = view_.width;
         if (in.count != count_ || std::get<4>(arrays).shape(1) != k)
@@ -153,8 +152,7 @@ class Frame {
                                                checked(opacity_logits, n, "opacity_logits"),
                                                checked(sh, n, k, "sh"),
                                                checked(means2d, n, 2, "means2d"),
-                                               magnitudes,
-                                               camera ? checked(*camera, splat::kCameraFloats, "camera") : nullptr};
+                                               magnitudes};
         nb::gil_scoped_release release;
         frame_->backward(in, pictures, out);
     }
@@ -181,8 +179,7 @@ void bind_raster(nb::module_& m) {
         .def("forward", &Frame::forward, nb::arg("parameters").noconvert(), nb::arg("camera").noconvert(), "options"_a,
              nb::arg("outputs").noconvert())
         .def("backward", &Frame::backward, nb::arg("parameters").noconvert(), nb::arg("gradients").noconvert(),
-             nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert(), "magnitudes"_a = false,
-             nb::arg("camera").noconvert() = nb::none())
+             nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert(), "magnitudes"_a = false)
         .def_prop_ro("pairs", &Frame::pairs)
         .def("contributing_pairs", &Frame::contributing_pairs, nb::call_guard<nb::gil_scoped_release>());
 }

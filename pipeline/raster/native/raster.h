@@ -35,9 +35,6 @@ constexpr float kHalfLog2E = 0.72134752044448170f;  // exp(-x/2) = 2^(-kHalfLog2
 constexpr uint32_t kCulled = 0xffffffffu;           // sort key of a Gaussian that is not visible
 constexpr int kSlotFloats = 12;       // a pair's gradients: SplatGradient's fields in their order, those of depth apart
 constexpr int kDepthSlotFloats = 16;  // with depth_u and depth_v, and padding
-// How a camera may move, in its own frame: a point x goes to exp(rotation) x + translation, about the camera's centre;
-// then both focal lengths are multiplied by exp(log_focal). In this order.
-constexpr int kCameraFloats = 7;
 
 // A camera and what to render, in the kernels' precision.
 struct View {
@@ -65,7 +62,6 @@ struct ParameterGradients {
     float *means, *log_scales, *quats, *opacity_logits, *sh;
     float* means2d;   // (n, 2), pixels
     bool magnitudes;  // means2d is the sum of each pixel's |dL/d(mean2D)|, not of dL/d(mean2D)
-    float* camera;    // (kCameraFloats), or null; of the kernels their Gaussians' share
 };
 
 // A Gaussian on the screen. In the whitened offset from its centre,

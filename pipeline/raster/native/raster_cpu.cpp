@@ -52,19 +52,9 @@ void RasterFrame::backward(const Parameters& in, const PictureGradients& gradien
     parallel_for(tile_count(view_), [&](int64_t tile) {
         blend_->blend_tile_backward(view_, data_, static_cast<int>(tile), gradients, out.magnitudes);
     });
-    const int64_t tasks = divide_up(in.count, kGaussiansATask);
-    float* shares = out.camera ? camera_.reserve(tasks * kCameraFloats) : nullptr;
-    for_tasks(in.count, [&](int64_t task, int64_t begin, int64_t end) {
-        ParameterGradients here = out;
-        here.camera = shares ? shares + task * kCameraFloats : nullptr;
-        project_->project_backward(view_, in, begin, end, data_, here);
+    for_tasks(in.count, [&](int64_t, int64_t begin, int64_t end) {
+        project_->project_backward(view_, in, begin, end, data_, out);
     });
-    if (!out.camera) return;
-    for (int f = 0; f < kCameraFloats; ++f) {  // in the tasks' order, whoever did them
-        double sum = 0.0;
-        for (int64_t task = 0; task < tasks; ++task) sum += shares[task * kCameraFloats + f];
-        out.camera[f] = static_cast<float>(sum);
-    }
 }
 
 int64_t RasterFrame::contributions() const {

@@ -109,7 +109,6 @@ class RasterFrame {
     Buffer<int32_t> pair_splat_, pair_slot_;
     Buffer<uint8_t> pair_blocks_;
     Buffer<float> slots_, transmittance_;
-    Buffer<float> camera_;  // (tasks, kCameraFloats)
     Buffer<int32_t> pixel_end_;
 };
 

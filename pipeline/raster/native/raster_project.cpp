@@ -250,7 +250,7 @@ SPLAT_INLINE void put_rows(const LanesGradient& d, Floats* sh, int sh_row, Mask 
 
 SPLAT_INLINE ParameterGradients rows_from(const ParameterGradients& out, int sh_row, int64_t first) {
     return {out.means + 3 * first,   out.log_scales + 3 * first, out.quats + 4 * first, out.opacity_logits + first,
-            out.sh + sh_row * first, out.means2d + 2 * first,    out.magnitudes,        nullptr};
+            out.sh + sh_row * first, out.means2d + 2 * first,    out.magnitudes};
 }
 
 void copy_rows(const GradientRows& from, int sh_row, int count, const ParameterGradients& to) {
@@ -261,15 +261,12 @@ void copy_rows(const GradientRows& from, int sh_row, int count, const ParameterG
     copy(to.opacity_logits, from.opacity_logits, 1), copy(to.means2d, from.means2d, 2), copy(to.sh, from.sh, sh_row);
 }
 
-// With or without the camera's gradient and that of depths, each compiled apart: the one without is rounded as if there
-// were no other.
-template <bool kCamera, bool kDepth>
+// With or without the gradient of depths, each compiled apart: the one without is rounded as if there were no other.
+template <bool kDepth>
 SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, int64_t begin, int64_t end,
                                       const FrameData& frame, const ParameterGradients& out) {
     Rows rows;
     GradientRows ragged;
-    Floats camera[kCameraFloats], share[kCameraFloats];
-    for (int f = 0; f < kCameraFloats; ++f) camera[f] = fill(0.0f);
     const int sh_row = view.sh_count * 3;
     constexpr int kFloats = kDepth ? kDepthSlotFloats : kSlotFloats;
     alignas(64) float sums[kFloats][kLanes], touched[kLanes];
@@ -302,35 +299,23 @@ SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, in
                                  kDepth ? load(sums[kSlotFloats + 1]) : fill(0.0f)};
         const Projection p = project_lanes(view, lanes);
         LanesGradient d = project_lanes_backward<kDepth>(view, p, g, out.magnitudes);
-        const Vec3 by_direction = colour_backward(view, lanes.mean, g.colour, sh);
-        d.mean = d.mean + by_direction;
+        d.mean = d.mean + colour_backward(view, lanes.mean, g.colour, sh);
         const Mask seen = less(fill(0.0f), load(touched));
-        if (kCamera) {
-            camera_gradient<kDepth>(view, p, d, by_direction, share);
-            for (int f = 0; f < kCameraFloats; ++f) camera[f] = camera[f] + only(seen, share[f]);
-        }
         const ParameterGradients here = rows_from(out, sh_row, first);
-        const ParameterGradients stack = {ragged.means, ragged.log_scales, ragged.quats,   ragged.opacity_logits,
-                                          ragged.sh,    ragged.means2d,    out.magnitudes, nullptr};
+        const ParameterGradients stack = {ragged.means, ragged.log_scales, ragged.quats,  ragged.opacity_logits,
+                                          ragged.sh,    ragged.means2d,    out.magnitudes};
         put_rows(d, sh, sh_row, seen, valid == kLanes ? here : stack);
         if (valid < kLanes) copy_rows(ragged, sh_row, valid, here);
     }
-    if (kCamera)
-        for (int f = 0; f < kCameraFloats; ++f) out.camera[f] = sum_lanes(camera[f]);
     streamed();
 }
 
 void project_backward(const View& view, const Parameters& in, int64_t begin, int64_t end, const FrameData& frame,
                       const ParameterGradients& out) {
-    const bool depth = frame.slot_floats == kDepthSlotFloats;
-    if (out.camera && depth)
-        project_backward_of<true, true>(view, in, begin, end, frame, out);
-    else if (out.camera)
-        project_backward_of<true, false>(view, in, begin, end, frame, out);
-    else if (depth)
-        project_backward_of<false, true>(view, in, begin, end, frame, out);
+    if (frame.slot_floats == kDepthSlotFloats)
+        project_backward_of<true>(view, in, begin, end, frame, out);
     else
-        project_backward_of<false, false>(view, in, begin, end, frame, out);
+        project_backward_of<false>(view, in, begin, end, frame, out);
 }
 
 }  // namespace

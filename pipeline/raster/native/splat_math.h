@@ -181,9 +181,6 @@ struct SplatGradient {
 struct LanesGradient {
     Vec3 mean, log_scale;
     Floats qw, qx, qy, qz, logit, mean2d_x, mean2d_y;
-    Vec3 point, jw0, jw1;     // by the point in the camera's frame, W held, and by the rows of J W
-    Vec3 w2;                  // by the last row of W through the depth's covariances alone; with depths only
-    Floats pixel_x, pixel_y;  // mean2d, of magnitudes, too
 };
 
 SPLAT_INLINE void quat_gradient(const Projection& p, const Vec3& g0, const Vec3& g1, const Vec3& g2,
@@ -252,7 +249,6 @@ SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projec
         out.log_scale = out.log_scale + times(slant.row2, p.row2);
         dr0 = dr0 + fill(view.rotation[6]) * du2, dr1 = dr1 + fill(view.rotation[7]) * du2;
         dr2 = dr2 + fill(view.rotation[8]) * du2;
-        out.w2 = {dot(du2, p.r0), dot(du2, p.r1), dot(du2, p.r2)};
     }
     quat_gradient(p, dr0, dr1, dr2, &out);
     out.logit = in.s * (fill(1.0f) - p.opacity);
@@ -265,43 +261,15 @@ SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projec
     const Vec3 djw1 = {dot(du1, p.r0), dot(du1, p.r1), dot(du1, p.r2)};
     const Floats fx = fill(view.fx), fy = fill(view.fy), zero = fill(0.0f);
     Floats dinv_z = fx * dot(djw0, w0 - p.ratio_x * w2) + fy * dot(djw1, w1 - p.ratio_y * w2);
-    out.pixel_x = kDepth ? out.mean2d_x + slant.x : out.mean2d_x;
-    out.pixel_y = kDepth ? out.mean2d_y + slant.y : out.mean2d_y;
-    const Floats dratio_x = fx * out.pixel_x + select(p.clamped_x, zero, -fx * p.inv_z * dot(djw0, w2));
-    const Floats dratio_y = fy * out.pixel_y + select(p.clamped_y, zero, -fy * p.inv_z * dot(djw1, w2));
+    const Floats pixel_x = kDepth ? out.mean2d_x + slant.x : out.mean2d_x;
+    const Floats pixel_y = kDepth ? out.mean2d_y + slant.y : out.mean2d_y;
+    const Floats dratio_x = fx * pixel_x + select(p.clamped_x, zero, -fx * p.inv_z * dot(djw0, w2));
+    const Floats dratio_y = fy * pixel_y + select(p.clamped_y, zero, -fy * p.inv_z * dot(djw1, w2));
     dinv_z = dinv_z + dratio_x * p.point.x + dratio_y * p.point.y;
     const Floats dz = in.depth - p.inv_z * p.inv_z * dinv_z;
     out.mean = (dratio_x * p.inv_z) * w0 + (dratio_y * p.inv_z) * w1 + dz * w2;
-    out.point = {dratio_x * p.inv_z, dratio_y * p.inv_z, dz};
-    out.jw0 = djw0, out.jw1 = djw1;
     if (magnitudes) out.mean2d_x = inv_k * a * in.size_x, out.mean2d_y = inv_k * in.size_y;
     return out;
-}
-
-// dL/d(camera), kCameraFloats, of one Gaussian a lane. `colour` is dL/d(mean) through the direction that its colour is
-// seen from: the camera's translation changes that, its rotation does not.
-template <bool kDepth>
-SPLAT_INLINE void camera_gradient(const View& view, const Projection& p, const LanesGradient& d, const Vec3& colour,
-                                  Floats* out) {
-    const Vec3 w0 = fill3(view.rotation), w1 = fill3(view.rotation + 3), w2 = fill3(view.rotation + 6);
-    const Floats fx_z = fill(view.fx) * p.inv_z, fy_z = fill(view.fy) * p.inv_z, zero = fill(0.0f);
-    // m(i, j) = dL/d(row i of W) . row j of W. A rotation by ω about the camera's centre adds [ω]x W to W.
-    const Floats m01 = fx_z * dot(d.jw0, w1), m02 = fx_z * dot(d.jw0, w2);
-    const Floats m10 = fy_z * dot(d.jw1, w0), m12 = fy_z * dot(d.jw1, w2);
-    const Floats m00 = fx_z * dot(d.jw0, w0), m11 = fy_z * dot(d.jw1, w1);
-    Floats m20 = -(p.ratio_x * m00 + p.ratio_y * m10), m21 = -(p.ratio_x * m01 + p.ratio_y * m11);
-    if (kDepth) m20 = m20 + dot(d.w2, w0), m21 = m21 + dot(d.w2, w1);
-    const Vec3 rotation = cross(p.point, d.point) + Vec3{m21 - m12, m02 - m20, m10 - m01};
-    const Vec3 translation = d.point + Vec3{dot(w0, colour), dot(w1, colour), dot(w2, colour)};
-    const Floats clamped_x = only(p.clamped_x, p.ratio_x * m02), clamped_y = only(p.clamped_y, p.ratio_y * m12);
-    const Floats focal = d.pixel_x * (fx_z * p.point.x) + d.pixel_y * (fy_z * p.point.y) + dot(d.jw0, p.jw0) +
-                         dot(d.jw1, p.jw1) + clamped_x + clamped_y;
-    const Floats all[kCameraFloats] = {rotation.x,    rotation.y,    rotation.z, translation.x,
-                                       translation.y, translation.z, focal};
-    Floats sum = zero;
-    for (int f = 0; f < kCameraFloats; ++f) sum = sum + zero * all[f];  // NaN where one is not finite: left out
-    const Mask finite = at_most(sum, zero);
-    for (int f = 0; f < kCameraFloats; ++f) out[f] = only(finite, all[f]);
 }
 
 }  // namespace

@@ -1,17 +1,15 @@
-"""Strategies of density control: four ways to choose where Gaussians are added, behind one interface.
+"""Strategies of density control: three ways to choose where Gaussians are added, behind one interface.
 
 | `train.density` | adds Gaussians where | source |
 |---|---|---|
 | `published` | the summed screen gradient is long | Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023 |
 | `absolute` | its pixels' magnitudes sum to much | Ye et al., "AbsGS", ACM MM 2024 |
-| `error` | a Gaussian answers for much of the photos' error | Rota Bulò et al., "Revising Densification", ECCV 2024 |
 | `mcmc` | opacity is high, and moves dead Gaussians there | Kheradmand et al., "3DGS as MCMC", NeurIPS 2024 |
 """
 
 from __future__ import annotations
 
 from splatpipe.stages.options import TrainConfig
-from splatpipe.stages.train.density.error import ErrorDensity
 from splatpipe.stages.train.density.gradient import AbsoluteDensity, PublishedDensity
 from splatpipe.stages.train.density.mcmc import McmcDensity
 from splatpipe.stages.train.density.strategy import BLIND, Density, DensityStep, Look, Seen
@@ -29,7 +27,6 @@ def make_density(options: TrainConfig, count: int) -> Density:
     strategies: dict[str, type[Density]] = {
         "published": PublishedDensity,
         "absolute": AbsoluteDensity,
-        "error": ErrorDensity,
         "mcmc": McmcDensity,
     }
     return strategies[options.density](count)

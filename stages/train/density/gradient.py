@@ -17,21 +17,17 @@ from splatpipe.stages.train.density.strategy import Look, ScoredDensity, Seen
 class PublishedDensity(ScoredDensity):
     """Ranks by the norm of the summed signed gradient."""
 
-    magnitudes = False
-
-    def look(self, _options: TrainConfig, _iteration: int, _photos: int, /) -> Look:
-        """The gradient of every iteration."""
-        return Look(probe=True, magnitudes=self.magnitudes)
+    look = Look(probe=True)
 
     def observe(self, seen: Seen, options: TrainConfig) -> None:
         """Add the norms, in NDC."""
         if seen.gradient_px is not None:
-            camera = seen.photo.camera
-            self.statistics.observe(seen.gradient_px, seen.rendered.visible, camera.width, camera.height)
+            height, width = seen.rendered.alpha.shape
+            self.statistics.observe(seen.gradient_px, seen.rendered.visible, width, height)
             self.observe_radii(seen, options)
 
 
 class AbsoluteDensity(PublishedDensity):
     """Ranks by the norm of the summed magnitudes."""
 
-    magnitudes = True
+    look = Look(probe=True, magnitudes=True)

@@ -4,7 +4,7 @@ Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 
 below `prune_opacity` onto live ones, drawn in proportion to opacity, and adds copies of such draws; the N that share a
 place get the opacity and the size that keep their sum as it was. Every iteration adds noise to the positions
 (stochastic gradient Langevin dynamics), shaped by the covariance and large only for nearly transparent Gaussians. Two
-decays (`opacity_decay`, `scale_decay`, see `regularise.py`) let those die that the photos do not need.
+decays, of opacity and of size, let those die that the photos do not need.
 
 Otherwise than published, the number rises to the cap by our schedule instead of by 5 % a step, so that short runs reach
 it, and it is one draw for the dead and the new.
@@ -17,15 +17,16 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.densify import Growth, rotate
-from splatpipe.stages.train.density.strategy import BLIND, Density, DensityStep, Look, Seen
+from splatpipe.stages.train.density.strategy import Density, DensityStep, Seen
 from splatpipe.stages.train.draws import POSITION_NOISE, RELOCATION, normal, uniform
 
+OPACITY_DECAY, SCALE_DECAY = 0.01, 0.01  # weights of the means over all Gaussians in the loss: published
 NOISE = 5e5  # of positions, times their learning rate and the covariance: published
 NOISE_SHARPNESS = 100.0  # published: noise falls by e each 0.01 of opacity
 NOISE_OPACITY = 0.005  # published: half of the noise is left there
@@ -39,12 +40,17 @@ class McmcDensity(Density):
 
     def __init__(self, count: int) -> None: ...
 
-    def look(self, _options: TrainConfig, _iteration: int, _photos: int, /) -> Look:
-        """Nothing."""
-        return BLIND
-
     def observe(self, seen: Seen, options: TrainConfig) -> None:
         """Nothing."""
+
+    def add_gradients(self, gaussians: Gaussians, visible: Bool[Tensor, " n"], extent: float) -> None:
+        """Those of the decays: the mean opacity, and the mean of the three axes' sum over the extent."""
+        logits, scales = gaussians.opacity_logits, gaussians.log_scales
+        assert logits.grad is not None and scales.grad is not None
+        with torch.no_grad():
+            opacity = torch.sigmoid(logits)
+            logits.grad += (OPACITY_DECAY / len(gaussians)) * visible * opacity * (1.0 - opacity)
+            scales.grad += (SCALE_DECAY / (len(gaussians) * extent)) * visible[:, None] * torch.exp(scales)
 
     def stepped(self, gaussians: Gaussians, options: TrainConfig, means_rate: float, iteration: int) -> None:
         """Disturb the positions."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +15,6 @@ from splatpipe.pipeline.raster import Render
 from splatpipe.pipeline.scene.gaussians import Gaussians
 from splatpipe.stages.options import TrainConfig
 from splatpipe.stages.train.densify import DensityStatistics, Growth, grow, prune_mask
-from splatpipe.stages.train.stream import TrainingPhoto
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,10 @@ class Look:
     Attributes:
         probe: The gradient by the means on the image plane.
         magnitudes: As the sum of its absolute values over the pixels.
-        again: A second backward pass, so that the graph is kept after the loss's.
     """
 
     probe: bool = False
     magnitudes: bool = False
-    again: bool = False
 
 
 BLIND = Look()
@@ -40,20 +38,12 @@ class Seen:
     """An iteration after the loss's backward pass, before the parameters step.
 
     Attributes:
-        gaussians: The model that was rendered, leaves of autograd.
-        rendered: With its graph where ``Look.again`` asked for it.
-        photo: What it was compared with.
-        look: What was asked for.
+        rendered: What was compared with the photo.
         gradient_px: (n, 2) by the means on the image plane, pixels; None where ``Look.probe`` did not ask for it.
-        shown: The render as it was compared with the photo: before its sky, with its exposure.
     """
 
-    gaussians: Gaussians
     rendered: Render
-    photo: TrainingPhoto
-    look: Look
     gradient_px: Float[Tensor, "n 2"] | None
-    shown: Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -78,24 +68,30 @@ class DensityStep:
 
 
 class Density(ABC):
-    """A strategy, with what it has observed since its last step."""
+    """A strategy, with what it has observed since its last step.
+
+    Attributes:
+        look: What it wants of an iteration's render, up to its last step.
+    """
+
+    look: ClassVar[Look] = BLIND
 
     @abstractmethod
     def __init__(self, count: int) -> None: ...
 
     @abstractmethod
-    def look(self, options: TrainConfig, iteration: int, photos: int, /) -> Look:
-        """What it wants of an iteration's render.
-
-        Args:
-            options: Resolved.
-            iteration: From 1, up to the last step of density control.
-            photos: How many the training has.
-        """
+    def observe(self, seen: Seen, options: TrainConfig) -> None:
+        """Add an iteration that was rendered as ``look`` asks for."""
 
     @abstractmethod
-    def observe(self, seen: Seen, options: TrainConfig) -> None:
-        """Add an iteration for which ``look`` was asked."""
+    def add_gradients(self, gaussians: Gaussians, visible: Bool[Tensor, " n"], extent: float) -> None:
+        """Add to the gradients of the loss what the strategy wants besides, in place.
+
+        Args:
+            gaussians: With gradients.
+            visible: Those that step.
+            extent: Of the scene, world units.
+        """
 
     @abstractmethod
     def stepped(self, gaussians: Gaussians, options: TrainConfig, means_rate: float, iteration: int) -> None:
@@ -139,6 +135,9 @@ class ScoredDensity(Density):
 
     def __init__(self, count: int) -> None:
         self.statistics = DensityStatistics(count)
+
+    def add_gradients(self, gaussians: Gaussians, visible: Bool[Tensor, " n"], extent: float) -> None:
+        """Nothing."""
 
     def stepped(self, gaussians: Gaussians, options: TrainConfig, means_rate: float, iteration: int) -> None:
         """Nothing: the optimiser alone moves the Gaussians."""
