@@ -1,7 +1,6 @@
 // Affine maps of colours and their gradients: against the definition, and the same bits for any number of threads.
 #include "colour.h"
 
-#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <string>

@@ -136,8 +136,7 @@ Outcome evaluate(splat::RasterFrame& frame, const Scene& scene, const splat::Vie
                                            out.opacity_logits.data(),
                                            out.sh.data(),
                                            out.magnitudes.data(),
-                                           true,
-                                           nullptr};
+                                           true};
     frame.backward(scene.parameters(), pictures, gradients);
     gradients.means2d = out.means2d.data(), gradients.magnitudes = false;
     frame.backward(scene.parameters(), pictures, gradients);
