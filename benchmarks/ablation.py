@@ -23,11 +23,11 @@ from measure import SilentReporter, machine, write_figures
 from tables import Row, print_table
 from variants import NAME, Variant, base_of, choose, config_of, split
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.digests import HashTable, digest
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.runner import versions
 from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.raster import rasterizer
 from splatpipe.stages.line import LINE
 
 VARIANTS = Path(__file__).with_suffix(".toml")
@@ -167,7 +167,8 @@ def cases_of(
         work: The work folder.
         arguments: The command line.
     """
-    build = {"stages": {stage.name: stage.version for stage in LINE}, "versions": versions(), "isa": raster.isa_name()}
+    stages = {stage.name: stage.version for stage in LINE}
+    build = {"stages": stages, "versions": versions(), "isa": rasterizer.isa_name()}
     digests = {name: contents(path, work, arguments.threads) for name, path in datasets.items()}
     cases = []
     for seed in range(arguments.seeds):

@@ -32,7 +32,7 @@ from tables import Row, print_table
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.session import load_run
 from splatpipe.pipeline.engine.store import open_store
-from splatpipe.pipeline.scene.photos import load_photo_list
+from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import Capture
 from splatpipe.pipeline.sfm.judging import judge
 from splatpipe.pipeline.sfm.ladder import climb

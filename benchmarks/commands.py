@@ -33,7 +33,7 @@ class Command:
 
 def splatpipe(name: str, arguments: Sequence[str], log: Path) -> Command:
     """A call of the line, whose message of failure is told."""
-    return Command(name, ("-m", "splatpipe.pipeline.cli", *arguments, "--json"), log)
+    return Command(name, ("-m", "splatpipe.pipeline.app.cli", *arguments, "--json"), log)
 
 
 @dataclass(frozen=True)

@@ -30,13 +30,13 @@ from tables import Row, print_table
 from splatpipe.demo.scene import building_corners
 from splatpipe.demo.truth import centre, depth_map, true_poses, true_surface, truth_from_model
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.images import Pixels
-from splatpipe.pipeline.scene.photos import decode, load_photo_list
-from splatpipe.pipeline.scene.similarity import Similarity
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
+from splatpipe.pipeline.photos.resampling import resample
+from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.stages.evaluate import flat_stems, mean_measures, measure
-from splatpipe.stages.resampling import resample
-from splatpipe.stages.threads import same_bits
 from splatpipe.stages.undistort import place
 
 WITHIN_GSD = 2.0

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 from tables import Row, print_table
 
-from splatpipe.pipeline.scene.photos import load_photo_list
+from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.ladder import climb
 from splatpipe.pipeline.sfm.options import SparseConfig

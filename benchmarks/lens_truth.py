@@ -153,7 +153,7 @@ def main() -> None:
             capture = CAPTURE
         elif not (capture / "gcp_list.txt").exists():
             make_capture(capture, lenses[name], source)
-        command = [sys.executable, "-m", "splatpipe.pipeline.cli", "run", str(capture / "photos"), str(out)]
+        command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture / "photos"), str(out)]
         command += ["--preset", arguments.preset, "--until", "georef", "--threads", "1"]
         command += [word for each in arguments.set for word in ("--set", each)]
         subprocess.run(command, check=True, stdout=sys.stderr)

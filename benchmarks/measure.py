@@ -27,24 +27,24 @@ from ceilings import measure_ceilings
 from rasterizing import contributing_pairs, raster_alone
 from tables import Row, console, print_table
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.runner import versions
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.raster import _native
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import IMAGES, MODEL, View, load_model, load_views, mask_path
-from splatpipe.pipeline.scene.images import load_colour, load_mask
-from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import IMAGES, MODEL, View, load_model, load_views, mask_path
+from splatpipe.pipeline.photos.images import load_colour, load_mask
+from splatpipe.pipeline.raster import _native, rasterizer
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.draws import permutation
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.smoothing import sampling_of
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.stages import initialize
-from splatpipe.stages.options import InitializeConfig, TrainConfig
-from splatpipe.stages.threads import same_bits
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.draws import permutation
-from splatpipe.stages.train.plan import make_plan
-from splatpipe.stages.train.smoothing import sampling_of
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import PhotoStream
 
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
 PARTS = ("forward", "loss", "backward", "adam")
@@ -329,7 +329,7 @@ def scratch() -> Iterator[Path]:
 
 def machine(threads: int) -> Row:
     """What the figures were measured on, with its ceilings."""
-    facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": raster.isa_name(), "isas": _native.isas()}
+    facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": rasterizer.isa_name(), "isas": _native.isas()}
     facts |= {"system": f"{platform.system()} {platform.release()}", "versions": versions()}
     facts["load_average"] = os.getloadavg()[0]  # of the minute before: well above 0, the machine was not idle
     return facts | measure_ceilings(threads)

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.session import load_run
 from splatpipe.pipeline.engine.store import Part, open_store
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import View, load_views, split_views
-from splatpipe.pipeline.scene.images import Pixels, reduced_camera
-from splatpipe.pipeline.scene.panorama import read_panorama
-from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages.rendering import Model, as_trained, render_pixels
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View, load_views, split_views
+from splatpipe.pipeline.photos.images import Pixels, reduced_camera
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.rendering import Model, as_trained, render_pixels
+from splatpipe.pipeline.splat.panorama import read_panorama
+from splatpipe.pipeline.splat.ply import read_splat
 
 STAGES = ("ingest", "georef", "undistort", "train")
 
@@ -43,7 +43,7 @@ class OpenedRun:
     photos_dir: Path
     parts: dict[str, Part]
     model: Model = field(repr=False)
-    options: raster.RenderOptions
+    options: rasterizer.RenderOptions
     megapixels: float | None
     views: list[View]
     held_out: list[str]
@@ -59,7 +59,7 @@ class OpenedRun:
     def median_depth(self, camera: Camera) -> Float32[np.ndarray, "h w"]:
         """Of a render, (h, w) float32, world units along the view axis; 0 where there is no surface."""
         with torch.no_grad():
-            return np.asarray(raster.render(self.model[0], camera, self.options.for_depths()).median_depth.numpy())
+            return np.asarray(rasterizer.render(self.model[0], camera, self.options.for_depths()).median_depth.numpy())
 
 
 def open_run(out: Path) -> OpenedRun:

@@ -26,8 +26,7 @@ from opened_run import OpenedRun, open_run, write_png
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.camera_path import (
+from splatpipe.pipeline.film.camera_path import (
     FINE_STEPS,
     Lens,
     cameras_along,
@@ -37,12 +36,13 @@ from splatpipe.pipeline.scene.camera_path import (
     spline,
     upright_route,
 )
-from splatpipe.pipeline.scene.consistency import AGREEMENT
-from splatpipe.pipeline.scene.dataset import load_points_and_tracks
-from splatpipe.pipeline.scene.images import Pixels
-from splatpipe.pipeline.scene.photo_route import Capture, followed_photos
-from splatpipe.stages.filming import open_scene
-from splatpipe.stages.threads import same_bits
+from splatpipe.pipeline.film.filming import open_scene
+from splatpipe.pipeline.film.photo_route import Capture, followed_photos
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import load_points_and_tracks
+from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.consistency import AGREEMENT
 
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, of coded values
 EVERY_PX = 3  # places of a frame that are followed into the next, both ways

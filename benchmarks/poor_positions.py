@@ -24,14 +24,14 @@ from jaxtyping import Float64
 from tables import Row, print_table
 
 from splatpipe.demo import CAPTURE
-from splatpipe.pipeline.scene.frames import Frame
-from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.pipeline.scene.photos import Photo
-from splatpipe.pipeline.scene.similarity import Similarity, fit_similarity, rotation_from_vector, turn_between
-from splatpipe.stages.georef.fitting import NoPlaceError
-from splatpipe.stages.georef.gps import georeference
-from splatpipe.stages.georef.level import Positions
-from splatpipe.stages.georef.model import SparseModel
+from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity, rotation_from_vector, turn_between
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.gps import georeference
+from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.survey.model import SparseModel
 
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
 PLACE = Origin(**TRUTH["frame"]["origin"])
@@ -100,7 +100,7 @@ def true_scene(run: Path | None) -> Scene:
         places = MODEL_FROM_WORLD.apply(np.random.default_rng(1).uniform(-12.0, 12.0, (500, 3)) * [1.0, 1.0, 0.3])
         model = SparseModel(list(truth), source, rotations, places, (), pycolmap.Reconstruction())
         return Scene(model, MODEL_FROM_WORLD.inverse(), centres, turns)
-    from splatpipe.stages.georef.model import model_of
+    from splatpipe.pipeline.survey.model import model_of
 
     folder = next(run.glob("stages/sparse-*/sparse/0"))
     model = model_of(pycolmap.Reconstruction(str(folder)), list(truth))

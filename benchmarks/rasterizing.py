@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatpipe.pipeline import raster
-from splatpipe.pipeline.raster import _native
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.plan import Plan, sh_degree_at
-from splatpipe.stages.train.state import TrainState
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster import _native, rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.plan import Plan, sh_degree_at
+from splatpipe.pipeline.train.state import TrainState
 
 WARMUP = 3  # renders that do not count
 
@@ -38,7 +37,7 @@ def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> di
         generator = torch.Generator().manual_seed(index)
         upstream = torch.randn(camera.height, camera.width, 3, generator=generator) / (camera.width * camera.height)
         began, began_cpu = time.perf_counter(), time.process_time()
-        rendered = raster.render(state.gaussians, camera, options, buffers=state.buffers)
+        rendered = rasterizer.render(state.gaussians, camera, options, buffers=state.buffers)
         rendered.colour.backward(upstream)  # type: ignore[no-untyped-call]
         took, took_cpu = time.perf_counter() - began, time.process_time() - began_cpu
         for tensor in state.gaussians.tensors().values():

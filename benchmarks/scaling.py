@@ -39,15 +39,15 @@ from measure import (
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.ply import read_splat, read_splat_header, write_splat
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.stages import train
-from splatpipe.stages.options import TrainConfig
-from splatpipe.stages.threads import same_bits
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.plan import Plan, make_plan
 
 COLUMNS = {
     "series": "series:",

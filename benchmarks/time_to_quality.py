@@ -18,19 +18,20 @@ from measure import Row, SilentReporter, machine, parse, parser, prepare, report
 
 from splatpipe.pipeline.engine.config import parse_set, resolve
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.images import load_colour, load_mask
-from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.images import load_colour, load_mask
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.rendering import as_trained, render_pixels
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.flatness import ends_at
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, coarse_levels, make_plan
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import PhotoStream
+from splatpipe.pipeline.train.surroundings import begin_sky, surround
 from splatpipe.stages.evaluate import measure
-from splatpipe.stages.options import LineConfig, TrainConfig
-from splatpipe.stages.rendering import as_trained, render_pixels
-from splatpipe.stages.threads import same_bits
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.flatness import ends_at
-from splatpipe.stages.train.plan import Plan, coarse_levels, make_plan
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import PhotoStream
-from splatpipe.stages.train.surroundings import begin_sky, surround
+from splatpipe.stages.options import LineConfig
 
 COLUMNS = {
     "iteration": "iteration:,",

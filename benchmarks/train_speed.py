@@ -25,7 +25,7 @@ from measure import (
     time_case,
 )
 
-from splatpipe.stages.options import InitializeConfig
+from splatpipe.pipeline.mvs.options import InitializeConfig
 
 COLUMNS = {
     "points": "points:",

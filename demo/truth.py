@@ -10,8 +10,8 @@ import trimesh
 from jaxtyping import Bool, Float64
 
 from splatpipe.demo import CAPTURE
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.similarity import Similarity, fit_similarity
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 
 Poses = dict[str, Float64[np.ndarray, "4 4"]]
 Triangles = Float64[np.ndarray, "m 3 3"]

@@ -16,17 +16,17 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.scene import metrics
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_views, split_views
-from splatpipe.pipeline.scene.images import Mask, Pixels, reduced_camera, reduced_view
-from splatpipe.pipeline.scene.panorama import read_panorama
-from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages.accuracy import measure_accuracy
-from splatpipe.stages.floaters import measure_floaters
-from splatpipe.stages.options import EvaluateConfig
-from splatpipe.stages.rendering import as_trained, render_depth, render_pixels
-from splatpipe.stages.threads import same_bits
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import load_views, split_views
+from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.floaters import measure_floaters
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.render.rendering import as_trained, render_depth, render_pixels
+from splatpipe.pipeline.render.splat_accuracy import measure_accuracy
+from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.splat.panorama import read_panorama
+from splatpipe.pipeline.splat.ply import read_splat
 
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
 EQUAL_DB = 100.0  # stands for the infinite PSNR of pictures that are equal: JSON has no infinity

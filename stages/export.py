@@ -18,18 +18,18 @@ import trimesh
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.crs import utm_of
-from splatpipe.pipeline.scene.dataset import Points, load_points, load_views
-from splatpipe.pipeline.scene.dome import sky_dome
-from splatpipe.pipeline.scene.frames import Frame, load_frame
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.georeference import georeference, scene_box, told_in_a_line
-from splatpipe.pipeline.scene.panorama import read_panorama
-from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, write_splat
-from splatpipe.stages.options import ExportConfig
-from splatpipe.stages.rendering import as_trained
-from splatpipe.stages.viewing import look_of, viewer_scene, write_viewer
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
+from splatpipe.pipeline.render.rendering import as_trained
+from splatpipe.pipeline.splat.dome import sky_dome
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import read_panorama
+from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
+from splatpipe.pipeline.survey.crs import utm_of
+from splatpipe.pipeline.survey.frames import Frame, load_frame
+from splatpipe.pipeline.survey.georeference import georeference, scene_box, told_in_a_line
+from splatpipe.pipeline.web.options import ExportConfig
+from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
 
 Doubles = npt.NDArray[np.float64]
 Facts = dict[str, Any]

@@ -11,9 +11,9 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.parallel import ordered_map
-from splatpipe.pipeline.scene.photos import PhotoList, load_photo_list
+from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
 from splatpipe.pipeline.sfm.keypoints import Bytes, extract, single_threaded_opencv
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 

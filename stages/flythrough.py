@@ -6,12 +6,13 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.camera_path import cameras_along
-from splatpipe.pipeline.scene.photo_route import photo_film
-from splatpipe.stages.filming import FilmFile, open_scene, write_film
-from splatpipe.stages.options import FILM_FROM_BUDGET_S, FlythroughConfig
-from splatpipe.stages.rendering import render_pixels
-from splatpipe.stages.threads import same_bits
+from splatpipe.pipeline.film.camera_path import cameras_along
+from splatpipe.pipeline.film.filming import FilmFile, open_scene, write_film
+from splatpipe.pipeline.film.options import FlythroughConfig
+from splatpipe.pipeline.film.photo_route import photo_film
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.rendering import render_pixels
+from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
 
 
 def run(config: FlythroughConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from splatpipe.pipeline.engine.stage import NamedFile, Stage
+from splatpipe.pipeline.film.options import FlythroughConfig
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.options import IngestConfig, UndistortConfig
+from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.stages.options import (
-    EvaluateConfig,
-    ExportConfig,
-    FlythroughConfig,
-    GeorefConfig,
-    IngestConfig,
-    InitializeConfig,
-    TrainConfig,
-    UndistortConfig,
-)
+from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.web.options import ExportConfig
 
 INGEST = Stage(
     "ingest",

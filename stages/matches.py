@@ -12,7 +12,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.photos import load_photo_list
+from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.layout import half_sizes, make_layout, make_views
 from splatpipe.pipeline.sfm.matching import look_alike, match_pairs, write_verified
 from splatpipe.pipeline.sfm.options import MatchesConfig

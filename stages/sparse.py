@@ -14,8 +14,8 @@ import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.dataset import some
-from splatpipe.pipeline.scene.photos import load_photo_list
+from splatpipe.pipeline.photos.dataset import some
+from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.judging import judge

@@ -12,15 +12,15 @@ import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.scene.camera import reduced_size
-from splatpipe.pipeline.scene.dataset import MASKS, MODEL, SKY_MASKS, image_path, mask_path, some
-from splatpipe.pipeline.scene.names import match_names
-from splatpipe.pipeline.scene.parallel import ordered_map
-from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, decode_sky_mask, load_photo_list
+from splatpipe.pipeline.geometry.camera import reduced_size
+from splatpipe.pipeline.photos.dataset import MASKS, MODEL, SKY_MASKS, image_path, mask_path, some
+from splatpipe.pipeline.photos.names import match_names
+from splatpipe.pipeline.photos.options import UndistortConfig
+from splatpipe.pipeline.photos.photo_list import Photo, decode, decode_mask, decode_sky_mask, load_photo_list
+from splatpipe.pipeline.photos.resampling import resample
 from splatpipe.pipeline.sfm.sparse_model import write_model
-from splatpipe.stages.options import UndistortConfig
-from splatpipe.stages.resampling import resample
 
 SHAPE_TOLERANCE = 0.01  # between the shapes of a photo and of its camera in the model
 JPEG_QUALITY = 97  # with full chroma: far above what training reaches, and a third of a PNG's size and decoding time

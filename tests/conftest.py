@@ -40,7 +40,7 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the whole demo capture with its control, at 0.1 megapixels: 26 dB. To be read only."""
     out = tmp_path_factory.mktemp("demo") / "out"
     sets = [part for text in DEMO for part in ("--set", text)]
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "run", str(capture_path()), str(out), *sets]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *sets]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return out

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import View
-from splatpipe.stages.train.stream import PhotoStream
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.train.stream import PhotoStream
 
 
 def main(picture: str, cache: str, few: str, many: str, epochs: str) -> None:

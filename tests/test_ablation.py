@@ -19,7 +19,7 @@ from commands import Command, End, run_all, splatpipe
 from finished import Finished, figures, work_folder
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.stages.options import TrainConfig
+from splatpipe.pipeline.train.options import TrainConfig
 
 KEYS = {"variant", "capture", "seed", "gaussians", "megapixels", "threads", "wall_s", "cpu_s", "peak_bytes"}
 KEYS |= {"psnr", "psnr_cc", "ssim", "train_seconds", "loss"}

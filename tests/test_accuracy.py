@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.scene.accuracy import accuracy_table
-from splatpipe.pipeline.scene.camera import Camera, rotation_matrix
-from splatpipe.pipeline.scene.frames import Frame, save_frame
-from splatpipe.pipeline.scene.gaussians import Gaussians, quat_from_rotation
-from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.pipeline.scene.similarity import Similarity
-from splatpipe.stages import evaluate, rendering
-from splatpipe.stages.accuracy import depth_at, measure_accuracy
-from splatpipe.stages.options import EvaluateConfig
+from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render import rendering
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.render.splat_accuracy import depth_at, measure_accuracy
+from splatpipe.pipeline.splat.gaussians import Gaussians, quat_from_rotation
+from splatpipe.pipeline.survey.frames import Frame, save_frame
+from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.residuals import accuracy_table
+from splatpipe.stages import evaluate
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -85,7 +86,7 @@ def rewrite(path: Path, value: dict[str, Any]) -> None:
 
 
 def measured(parts: dict[str, Path], held_out: tuple[str, ...] = (), gaussians: Gaussians | None = None) -> Any:
-    options = raster.RenderOptions(sh_degree=0)
+    options = rasterizer.RenderOptions(sh_degree=0)
     depth_of = partial(rendering.render_depth, gaussians or wall(), options=options)
     return measure_accuracy(parts, cameras(), held_out, depth_of)
 
@@ -190,11 +191,11 @@ def test_a_broken_control_json_says_what_to_do(parts: dict[str, Path], text: str
 
 
 def test_evaluate_leaves_it_in_its_metrics(parts: dict[str, Path], tmp_path: Path) -> None:
-    from splatpipe.pipeline.scene.dataset import load_views
-    from splatpipe.pipeline.scene.panorama import write_panorama
-    from splatpipe.pipeline.scene.ply import write_splat
-    from splatpipe.stages.options import TrainConfig
-    from splatpipe.stages.train.plan import make_plan
+    from splatpipe.pipeline.photos.dataset import load_views
+    from splatpipe.pipeline.splat.panorama import write_panorama
+    from splatpipe.pipeline.splat.ply import write_splat
+    from splatpipe.pipeline.train.options import TrainConfig
+    from splatpipe.pipeline.train.plan import make_plan
 
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")
     write_splat(tmp_path / "model.ply", wall())
@@ -258,7 +259,7 @@ def test_the_table_is_what_its_names_say() -> None:
 
 
 def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixture[str]) -> None:
-    from splatpipe.pipeline.console import show_accuracy
+    from splatpipe.pipeline.app.console import show_accuracy
 
     check = accuracy_table(np.array([[0.012, -0.034, 0.056], [0.01, 0.02, np.nan]]))
     report = {"gsd_m": 0.0312, "tables": {"gps": None, "control": None, "check": check}, "splat": None}

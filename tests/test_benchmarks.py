@@ -12,15 +12,17 @@ import pytest
 import torch
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.raster import RenderOptions
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster.definitions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.raster.reference import project, visible_splats
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.stages import evaluate, initialize, train
-from splatpipe.stages.options import EvaluateConfig, InitializeConfig, TrainConfig
-from splatpipe.stages.train.plan import make_plan
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))

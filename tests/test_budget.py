@@ -13,12 +13,12 @@ import pytest
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.scene.dataset import View
-from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages import evaluate, initialize, train
-from splatpipe.stages.options import FILM_FROM_BUDGET_S, EvaluateConfig, InitializeConfig, TrainConfig
-from splatpipe.stages.train import loop, planning
-from splatpipe.stages.train.budget import (
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop, planning
+from splatpipe.pipeline.train.budget import (
     FEWEST,
     FEWEST_GAUSSIANS,
     LONGEST,
@@ -33,12 +33,14 @@ from splatpipe.stages.train.budget import (
     fit_speed,
     forecast,
 )
-from splatpipe.stages.train.densify import room_at
-from splatpipe.stages.train.measure import Measured
-from splatpipe.stages.train.memory import FIXED_BYTES, bytes_per_gaussian, resident_bytes, return_free_heap
-from splatpipe.stages.train.plan import Plan, coarse_levels, duration, make_plan, means_rate, resolve_schedule
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.densify import room_at
+from splatpipe.pipeline.train.measure import Measured
+from splatpipe.pipeline.train.memory import FIXED_BYTES, bytes_per_gaussian, resident_bytes, return_free_heap
+from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
+from splatpipe.pipeline.train.plan import Plan, coarse_levels, duration, make_plan, means_rate, resolve_schedule
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.stages import evaluate, initialize, train
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -328,8 +330,8 @@ import tiny_scene
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
-from splatpipe.stages.train.measure import Measured
-from splatpipe.stages.train.memory import FIXED_BYTES, resident_bytes
+from splatpipe.pipeline.train.measure import Measured
+from splatpipe.pipeline.train.memory import FIXED_BYTES, resident_bytes
 
 scene, out = Path(sys.argv[2]), Path(sys.argv[3])
 limit = resident_bytes() + FIXED_BYTES + int(sys.argv[4])

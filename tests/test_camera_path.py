@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.scene.camera import Camera, rotation_matrix
-from splatpipe.pipeline.scene.camera_path import (
+from splatpipe.pipeline.film.camera_path import (
     Lens,
     Route,
     angle_of,
@@ -25,11 +24,12 @@ from splatpipe.pipeline.scene.camera_path import (
     towards,
     upright_route,
 )
-from splatpipe.pipeline.scene.clearance import Clearance
-from splatpipe.pipeline.scene.keyframe_file import read_keyframes
-from splatpipe.pipeline.scene.orbit import orbit
-from splatpipe.pipeline.scene.photo_route import Capture, followed_photos, photo_film
-from splatpipe.pipeline.scene.upright import rotation_to_up
+from splatpipe.pipeline.film.clearance import Clearance
+from splatpipe.pipeline.film.keyframe_file import read_keyframes
+from splatpipe.pipeline.film.orbit import orbit
+from splatpipe.pipeline.film.photo_route import Capture, followed_photos, photo_film
+from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.upright import rotation_to_up
 
 UP = np.array([0.48, -0.64, 0.6])
 TILT = rotation_to_up(UP).T  # world from the frame in which the tests think: z up

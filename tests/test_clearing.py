@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.free_space import FreeSpace, near_or_free
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.options import TrainConfig
-from splatpipe.stages.train.clearing import STEPS_BETWEEN, free_space_of, is_clearing_step, unwanted
-from splatpipe.stages.train.plan import make_plan, resolve_schedule
-from splatpipe.stages.train.state import TrainState
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.splat.free_space import FreeSpace, near_or_free
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.clearing import STEPS_BETWEEN, free_space_of, is_clearing_step, unwanted
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import make_plan, resolve_schedule
+from splatpipe.pipeline.train.state import TrainState
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene

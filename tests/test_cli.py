@@ -13,7 +13,7 @@ from splatpipe.pipeline.raster.isa import choose_isa, isa_names
 
 
 def splatpipe(*arguments: object, **how: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, **how)
 
 
@@ -30,7 +30,7 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
     for command in ("run", "stage", "demo", "georef", "render", "status", "clean", "doctor", "options"):
         assert command in done.stdout
     code = (
-        "import sys; from splatpipe.pipeline import cli; from splatpipe.stages import line\n"
+        "import sys; from splatpipe.pipeline.app import cli; from splatpipe.stages import line\n"
         "print([name for name in ('torch', 'numpy', 'pycolmap', 'cv2', 'kornia') if name in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatpipe.pipeline.raster import _native, set_threads
+from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.colour import affine_colour
+from splatpipe.pipeline.raster.rasterizer import set_threads
 
 
 @pytest.fixture(params=_native.isas(), autouse=True)

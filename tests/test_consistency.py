@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.consistency import (
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.render.consistency import (
     NO_SURFACE,
     SAMPLE_EVERY,
     depth_differences,

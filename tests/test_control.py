@@ -14,11 +14,11 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Summary
-from splatpipe.pipeline.scene.confidence import chi_squared_cdf, chi_squared_quantile, rmse_interval
-from splatpipe.pipeline.scene.frames import load_frame
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
+from splatpipe.pipeline.survey.confidence import chi_squared_cdf, chi_squared_quantile, rmse_interval
+from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.stages.georef import run
-from splatpipe.stages.options import GeorefConfig
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from surveyed import (

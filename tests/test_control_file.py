@@ -6,7 +6,7 @@ import pytest
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.control_file import ControlFile, Mark, read_control_file
+from splatpipe.pipeline.survey.control_file import ControlFile, Mark, read_control_file
 
 
 def read(folder: Path, text: str | bytes, name: str = "gcp_list.txt") -> ControlFile:

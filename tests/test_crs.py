@@ -12,7 +12,8 @@ import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.crs import (
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.survey.crs import (
     from_geodetic,
     open_operation,
     parse_crs,
@@ -22,11 +23,10 @@ from splatpipe.pipeline.scene.crs import (
     undulation,
     utm_of,
 )
-from splatpipe.pipeline.scene.frames import Frame
-from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.pipeline.scene.georeference import georeference, scene_box
-from splatpipe.pipeline.scene.similarity import Similarity
-from splatpipe.pipeline.scene.world import in_crs, open_world
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.georeference import georeference, scene_box
+from splatpipe.pipeline.survey.world import in_crs, open_world
 
 MILLIMETRE = 1e-3
 HALLSTATT = Origin(47.8412, 13.5127, 512.0)  # where the demo's house stands

@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import (
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import (
     image_path,
     load_points,
     load_points_and_tracks,

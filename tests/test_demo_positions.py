@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.scene.exif import Gps
-from splatpipe.pipeline.scene.frames import Frame
-from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.stages.georef.gps import georeference
-from splatpipe.stages.georef.level import Positions
-from splatpipe.stages.georef.model import read_model
-from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
-from splatpipe.stages.ingest.positions import PositionList, positions_json, read_positions
-from splatpipe.stages.ingest.scan import Candidate
-from splatpipe.stages.ingest.stated import read_places
+from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.exif import Gps
+from splatpipe.pipeline.photos.scan import Candidate
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.gps import georeference
+from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.survey.model import read_model
+from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
+from splatpipe.pipeline.survey.stated_positions import read_places
 
 from .test_georef import Survey, georef
 

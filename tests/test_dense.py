@@ -10,15 +10,15 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_points, load_views
-from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.dense import DensePoints, dense_points, thinned
+from splatpipe.pipeline.mvs.likeness import Picture
+from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, neighbours
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.mvs.sweep import sweep
+from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.stages.initialize import run
-from splatpipe.stages.initialize.dense import DensePoints, dense_points, thinned
-from splatpipe.stages.initialize.likeness import Picture
-from splatpipe.stages.initialize.neighbours import Tracks, inverse_depths, neighbours
-from splatpipe.stages.initialize.sweep import sweep
-from splatpipe.stages.options import InitializeConfig
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.options import TrainConfig
-from splatpipe.stages.train.densify import (
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.densify import (
     DensityStatistics,
     grow,
     half_opacity,
@@ -19,8 +18,9 @@ from splatpipe.stages.train.densify import (
     reset_opacity,
     room_at,
 )
-from splatpipe.stages.train.draws import normal, permutation, uniform
-from splatpipe.stages.train.plan import resolve_schedule
+from splatpipe.pipeline.train.draws import normal, permutation, uniform
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import resolve_schedule
 
 OPTIONS = resolve_schedule(TrainConfig(reset_every=100))
 EXTENT = 10.0  # so that sizes above 0.1 are split, and above 1 pruned

@@ -8,15 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatpipe.pipeline import raster
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.sh import rgb_to_dc
-from splatpipe.stages.options import TrainConfig
-from splatpipe.stages.train.density import BLIND, Density, DensityStep, Look, Seen, make_density
-from splatpipe.stages.train.density.mcmc import composite_integral, disturb, draw_parents, shared
-from splatpipe.stages.train.density.strategy import ScoredDensity
-from splatpipe.stages.train.plan import resolve_schedule
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.train.density import BLIND, Density, DensityStep, Look, Seen, make_density
+from splatpipe.pipeline.train.density.mcmc import composite_integral, disturb, draw_parents, shared
+from splatpipe.pipeline.train.density.strategy import ScoredDensity
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import resolve_schedule
 
 WIDTH, HEIGHT = 40, 30
 CAMERA = Camera("photo.png", WIDTH, HEIGHT, 35.0, 36.0, 20.5, 14.5, np.eye(4))
@@ -40,9 +40,9 @@ def picture(seed: int = 1) -> Tensor:
     return torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def rendered(gaussians: Gaussians, look: Look = BLIND, probe: Tensor | None = None) -> raster.Render:
-    options = raster.RenderOptions(0, near=0.2, depth=False, magnitudes=look.magnitudes)
-    return raster.render(gaussians, CAMERA, options, means2d_probe=probe)
+def rendered(gaussians: Gaussians, look: Look = BLIND, probe: Tensor | None = None) -> rasterizer.Render:
+    options = rasterizer.RenderOptions(0, near=0.2, depth=False, magnitudes=look.magnitudes)
+    return rasterizer.render(gaussians, CAMERA, options, means2d_probe=probe)
 
 
 def observed(density: Density, gaussians: Gaussians, weights: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ def test_published_score_is_the_norm_of_the_loss_by_the_place_on_screen() -> Non
     def loss(right: float, down: float) -> float:
         """With the one Gaussian moved by pixels, which moving the principal point does."""
         camera = replace(CAMERA, cx=CAMERA.cx + right, cy=CAMERA.cy + down)
-        colour = raster.render(gaussians, camera, raster.RenderOptions(0, near=0.2), backend="reference").colour
+        colour = rasterizer.render(gaussians, camera, rasterizer.RenderOptions(0, near=0.2), backend="reference").colour
         return float((colour * weights).sum())
 
     step = 1e-4
@@ -80,8 +80,8 @@ def test_gradient_scores_are_those_of_the_reference(name: str, magnitudes: bool)
     gaussians, weights = scene(20), picture(2) - 0.5
     exact = gaussians.to(dtype=torch.float64).requires_grad_()
     probe = torch.zeros(20, 2, dtype=torch.float64, requires_grad=True)
-    options = raster.RenderOptions(0, near=0.2, magnitudes=magnitudes)
-    colour = raster.render(exact, CAMERA, options, backend="reference", means2d_probe=probe).colour
+    options = rasterizer.RenderOptions(0, near=0.2, magnitudes=magnitudes)
+    colour = rasterizer.render(exact, CAMERA, options, backend="reference", means2d_probe=probe).colour
     (colour * weights).sum().backward()
     assert probe.grad is not None
     expected = torch.linalg.vector_norm(probe.grad * torch.tensor([WIDTH / 2, HEIGHT / 2]), dim=1)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
-from splatpipe.pipeline.scene.dome import SPACING_RAD, dome_directions, dome_radius, sky_dome
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, Panorama
-from splatpipe.pipeline.scene.sky import directions, elevations_deg
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.dome import SPACING_RAD, dome_directions, dome_radius, sky_dome
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama
+from splatpipe.pipeline.splat.sky import directions, elevations_deg
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
@@ -53,7 +53,7 @@ def test_dome_shows_the_panorama_without_holes(up: np.ndarray, x: float) -> None
     dome = sky_dome(panorama, scene_around(CAMERAS.mean(axis=0), 6.0), CAMERAS)
     for heading, pitch in ((0.0, 10.0), (130.0, 35.0), (250.0, 80.0)):
         camera = skies.look(heading, pitch, x=x)
-        rendered = raster.render(dome, camera, raster.RenderOptions(0))
+        rendered = rasterizer.render(dome, camera, rasterizer.RenderOptions(0))
         above = torch.from_numpy(elevations_deg(camera, up) > (0.0 if x == 4.0 else 6.0))
         assert float(rendered.alpha[above].min()) > 0.98
         error = (rendered.colour - panorama.at(directions(camera))).abs()[above]
@@ -77,5 +77,5 @@ def test_gaussians_of_the_scene_stay_in_sight() -> None:
     dome = sky_dome(coloured_panorama(skies.UP), scene, CAMERAS)
     before = scene.select(torch.tensor([7]))
     before = replace(before, opacity_logits=torch.full((1,), 6.0), sh=torch.full((1, 1, 3), -1.7))
-    both = raster.render(Gaussians.concat([dome, before]), camera, raster.RenderOptions(0)).colour
+    both = rasterizer.render(Gaussians.concat([dome, before]), camera, rasterizer.RenderOptions(0)).colour
     assert float(both[skies.HEIGHT // 2, skies.WIDTH // 2].max()) < 0.05

@@ -13,12 +13,13 @@ import torch
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.panorama import write_panorama
-from splatpipe.pipeline.scene.ply import write_splat
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.splat.panorama import write_panorama
+from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.stages import evaluate
-from splatpipe.stages.options import EvaluateConfig, TrainConfig
-from splatpipe.stages.train.plan import make_plan
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene

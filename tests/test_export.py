@@ -12,17 +12,19 @@ import torch
 import trimesh
 from plyfile import PlyData
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.scene import metrics
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_points, load_views
-from splatpipe.pipeline.scene.frames import load_frame
-from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, panorama_of, write_panorama
-from splatpipe.pipeline.scene.ply import read_splat, write_splat
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, write_panorama
+from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.web.options import ExportConfig
 from splatpipe.stages import evaluate, export
-from splatpipe.stages.options import EvaluateConfig, ExportConfig, TrainConfig
-from splatpipe.stages.train.plan import make_plan
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -109,7 +111,7 @@ def exported(inputs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def render(gaussians_path: Path, camera: Camera, near: float) -> torch.Tensor:
     gaussians = read_splat(gaussians_path)
     with torch.no_grad():
-        return raster.render(gaussians, camera, raster.RenderOptions(sh_degree=3, near=near)).colour
+        return rasterizer.render(gaussians, camera, rasterizer.RenderOptions(sh_degree=3, near=near)).colour
 
 
 def test_splat_looks_the_same_from_the_exported_cameras(inputs: Inputs, exported: Path) -> None:

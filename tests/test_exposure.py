@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.stages import initialize, train
-from splatpipe.stages.options import InitializeConfig, TrainConfig
-from splatpipe.stages.train.exposure import Exposure
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -52,12 +53,12 @@ def trained(scene: Path, out: Path, exposure: str) -> Path:
 def neutral_error(scene: Path, model: Path) -> float:
     """RMS difference of the model's renders, as they are, from the true ones at the photos' mean brightness."""
     gaussians, truth = read_splat(model), tiny_scene.true_model()
-    options = raster.RenderOptions(sh_degree=3)
+    options = rasterizer.RenderOptions(sh_degree=3)
     errors = []
     for view in load_views(scene / "dataset"):
         with torch.no_grad():
-            ours = raster.render(gaussians, view.camera, options).colour
-            true = raster.render(truth, view.camera, options).colour * float(GAINS.mean())
+            ours = rasterizer.render(gaussians, view.camera, options).colour
+            true = rasterizer.render(truth, view.camera, options).colour * float(GAINS.mean())
         errors.append(float((ours - true).square().mean()))
     return float(np.sqrt(np.mean(errors)))
 

@@ -11,19 +11,20 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.dropout import dropped, share_at
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.regularise import limit_needles
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
-from splatpipe.stages.options import InitializeConfig, TrainConfig
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.dropout import dropped, share_at
-from splatpipe.stages.train.plan import Plan
-from splatpipe.stages.train.regularise import limit_needles
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import TrainingPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -122,7 +123,7 @@ def test_share_of_dropped_gaussians_rises_to_the_option_and_they_are_not_project
         model = dropped(gaussians, options, iteration)
         left_out = model.opacity_logits.detach() < -20.0
         assert float(left_out.float().mean()) == pytest.approx(share, abs=4.0 * math.sqrt(0.25 / len(gaussians)))
-        rendered = raster.render(model, FRONT, raster.RenderOptions(sh_degree=0))
+        rendered = rasterizer.render(model, FRONT, rasterizer.RenderOptions(sh_degree=0))
         assert not bool(rendered.visible[left_out].any())
         gaussians.opacity_logits.grad = None
         rendered.colour.sum().backward()
@@ -137,10 +138,10 @@ def test_dropping_keeps_what_a_pixel_shows_on_average() -> None:
     options = TrainConfig(iterations=1, dropout=0.25)
     gaussians = wall(4.0)
     gaussians.opacity_logits -= 1.5  # below 0.75, so that no scaled opacity reaches 1
-    settings = raster.RenderOptions(sh_degree=0)
+    settings = rasterizer.RenderOptions(sh_degree=0)
     with torch.no_grad():
-        whole = raster.render(gaussians, FRONT, settings).alpha
-        draws = [raster.render(dropped(gaussians, options, draw), FRONT, settings).alpha for draw in range(1, 401)]
+        whole = rasterizer.render(gaussians, FRONT, settings).alpha
+        draws = [rasterizer.render(dropped(gaussians, options, draw), FRONT, settings).alpha for draw in range(1, 401)]
     stacked = torch.stack(draws)
     error = (stacked.mean(dim=0) - whole).abs()
     # Five standard errors, and the flanks of up to three Gaussians that only scaled opacities lift above 1/255.

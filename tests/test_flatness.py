@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.train import flatness, loop
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, means_rate, resolve_schedule
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
-from splatpipe.stages.options import InitializeConfig, TrainConfig
-from splatpipe.stages.train import flatness, loop
-from splatpipe.stages.train.plan import Plan, means_rate, resolve_schedule
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import TrainingPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene

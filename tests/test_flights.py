@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.scene.alignment import Correspondences, Shared, robust_similarity
-from splatpipe.pipeline.scene.flights import Stamp, tell_flights
-from splatpipe.pipeline.scene.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.geometry.alignment import Correspondences, Shared, robust_similarity
+from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.survey.flights import Stamp, tell_flights
 
 from .test_georef import Survey, errors_m, georef, grid, survey
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.raster import RenderOptions, render
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.stages.floaters import measure_floaters
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
+from splatpipe.pipeline.render.floaters import measure_floaters
+from splatpipe.pipeline.splat.gaussians import Gaussians
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene

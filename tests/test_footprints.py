@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.scene.photos import Photo
-from splatpipe.pipeline.scene.upright import enu_from_gimbal
+from splatpipe.pipeline.geometry.upright import enu_from_gimbal
+from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.photos.scan import Candidate
 from splatpipe.pipeline.sfm.footprints import Views, crossing_distances, overlaps
 from splatpipe.pipeline.sfm.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairs import Costs, Layout, choose_pairing, components, select_pairs
-from splatpipe.stages.ingest.check import CheckedPhoto, Limits, check_photo
-from splatpipe.stages.ingest.positions import positions_json, read_positions
-from splatpipe.stages.ingest.scan import Candidate
+from splatpipe.pipeline.survey.photo_positions import positions_json, read_positions
 
 HALF_SIZE = (0.6, 0.45)
 

@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.alignment import Correspondences, DirectionPrior, robust_similarity
-from splatpipe.pipeline.scene.frames import Frame, load_frame, save_frame
-from splatpipe.pipeline.scene.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
-from splatpipe.pipeline.scene.similarity import Similarity, fit_similarity, rotation_from_vector
-from splatpipe.pipeline.scene.upright import (
+from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, robust_similarity
+from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity, rotation_from_vector
+from splatpipe.pipeline.geometry.upright import (
     camera_axes,
     display_from_stored,
     enu_from_gimbal,
@@ -22,6 +20,8 @@ from splatpipe.pipeline.scene.upright import (
     rotation_to_up,
     up_from_cameras,
 )
+from splatpipe.pipeline.survey.frames import Frame, load_frame, save_frame
+from splatpipe.pipeline.survey.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
 
 EXACT = 1e-12  # float64, a handful of products of numbers near one
 

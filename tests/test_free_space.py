@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.scene import free_space as module
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.free_space import FreeSpace, free_space, free_space_views, near_or_free, share_of_opacity
-from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat import free_space as module
+from splatpipe.pipeline.splat.free_space import FreeSpace, free_space, free_space_views, near_or_free, share_of_opacity
+from splatpipe.pipeline.splat.gaussians import Gaussians
 
 WALL = 10.0  # depth; every camera looks along z, so that a cell of 20 pixels is half a unit wide there
 WIDTH, HEIGHT, FOCAL = 480, 360, 400.0

@@ -11,12 +11,12 @@ import pytest
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.source import ABSENT
 from splatpipe.pipeline.engine.stage import Inputs, Summary
-from splatpipe.pipeline.scene.frames import Frame, load_frame
-from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.pipeline.scene.photos import Photo, PhotoList, save_photo_list
-from splatpipe.pipeline.scene.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
+from splatpipe.pipeline.survey.frames import Frame, load_frame
+from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.stages.georef import run
-from splatpipe.stages.options import GeorefConfig
 
 PLACE = Origin(46.84266, -91.994, 199.0)
 TRUTH = Similarity(

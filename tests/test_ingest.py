@@ -19,11 +19,18 @@ from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Summary
-from splatpipe.pipeline.scene.exif import Exif
-from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask, decode_sky_mask, load_photo_list, photo_root
+from splatpipe.pipeline.photos.camera_groups import focal_prior
+from splatpipe.pipeline.photos.exif import Exif
+from splatpipe.pipeline.photos.options import IngestConfig
+from splatpipe.pipeline.photos.photo_list import (
+    Photo,
+    decode,
+    decode_mask,
+    decode_sky_mask,
+    load_photo_list,
+    photo_root,
+)
 from splatpipe.stages.ingest import run
-from splatpipe.stages.ingest.cameras import focal_prior
-from splatpipe.stages.options import IngestConfig
 
 WIDTH, HEIGHT = 400, 300
 JPEG_ERROR = 12  # grey values, of a smooth picture at quality 95

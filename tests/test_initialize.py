@@ -10,11 +10,11 @@ import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.scene.dataset import Points
-from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.pipeline.scene.sh import dc_to_rgb
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import Points
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.sh import dc_to_rgb
 from splatpipe.stages.initialize import choose_points, point_sizes, run
-from splatpipe.stages.options import InitializeConfig
 
 RNG = np.random.default_rng(7)
 FAR = np.array([[0.0, 0.0, -100.0]])  # a camera so far away that no size is capped

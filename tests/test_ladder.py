@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.scene.photos import load_photo_list
+from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.ladder import Work, climb, settle, without
 from splatpipe.pipeline.sfm.ladder_joins import join

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train.layers import FREE_PX, HALF_PX, depth_origin, is_spread_counted, spread_loss
 from splatpipe.stages import initialize, train
-from splatpipe.stages.options import InitializeConfig
-from splatpipe.stages.train.layers import FREE_PX, HALF_PX, depth_origin, is_spread_counted, spread_loss
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -35,8 +35,8 @@ def layers(depths: tuple[float, ...], opacity: float) -> Gaussians:
 
 
 def spread(gaussians: Gaussians, origin: float = 0.0, backend: str = "native") -> torch.Tensor:
-    options = raster.RenderOptions(0, depth_origin=origin)
-    rendered = raster.render(gaussians, FRONT, options, backend=backend)  # type: ignore[arg-type]
+    options = rasterizer.RenderOptions(0, depth_origin=origin)
+    rendered = rasterizer.render(gaussians, FRONT, options, backend=backend)  # type: ignore[arg-type]
     return spread_loss(rendered, origin, FRONT)
 
 
@@ -70,8 +70,8 @@ def test_gradient_agrees_with_finite_differences() -> None:
 
     def value(means: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
         gaussians = replace(base, means=means, opacity_logits=logits)
-        options = raster.RenderOptions(0, depth_origin=3.0)
-        rendered = raster.render(gaussians, camera, options, backend="reference")
+        options = rasterizer.RenderOptions(0, depth_origin=3.0)
+        rendered = rasterizer.render(gaussians, camera, options, backend="reference")
         seen = rendered.alpha.detach() >= 0.2
         alpha = torch.where(seen, rendered.alpha, 1.0)
         mean = torch.where(seen, rendered.depth_sum, 0.0) / alpha - 3.0
@@ -104,7 +104,7 @@ def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:
         for view in load_views(tmp_path / "dataset")[::4]:
             origin = depth_origin(model.means, view.camera)
             with torch.no_grad():
-                rendered = raster.render(model, view.camera, raster.RenderOptions(3, depth_origin=origin))
+                rendered = rasterizer.render(model, view.camera, rasterizer.RenderOptions(3, depth_origin=origin))
             shares.append(float(spread_loss(rendered, origin, view.camera)))
         found.append(sum(shares))
     assert found[1] < 0.8 * found[0]

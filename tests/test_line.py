@@ -36,7 +36,7 @@ def sets(*assignments: str) -> list[str]:
 
 
 def splatpipe(*arguments: object) -> dict[str, object]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments), "--json"]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     told: dict[str, object] = json.loads(done.stdout)
@@ -214,7 +214,7 @@ def hear_ctrl_c() -> None:
 def test_a_stopped_command_says_so_and_goes_on_later(
     photos: Path, copy_of_run: Path, number: signal.Signals, code: int
 ) -> None:
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "run", photos, copy_of_run]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", photos, copy_of_run]
     longer = sets(*QUICK, "train.iterations=100000")
     told_before = len((copy_of_run / "events.jsonl").read_text())
     pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

@@ -27,8 +27,8 @@ PATIENCE_S = 240.0  # far more than it takes; of a busy machine
 def training(demo_run: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
     """The demo, trained again and for longer; all before it is reused."""
     out = linked_copy(demo_run, tmp_path / "out")
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "run", str(capture_path()), str(out), "--threads", "1"]
-    command += ["--config", str(demo_run / "config.toml"), "--set", "train.iterations=20000"]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out)]
+    command += ["--threads", "1", "--config", str(demo_run / "config.toml"), "--set", "train.iterations=20000"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     yield out, process
     process.send_signal(signal.SIGTERM)
@@ -47,7 +47,7 @@ def wait(page: Page, until: Callable[[Any], bool]) -> Any:
 
 
 def wait_for_work(out: Path) -> None:
-    from splatpipe.pipeline.view.opened import open_run
+    from splatpipe.pipeline.app.view.opened import open_run
 
     deadline = time.monotonic() + PATIENCE_S
     while not open_run(out).is_at_work() and time.monotonic() < deadline:

@@ -18,15 +18,15 @@ from playwright.sync_api import Page
 
 from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.demo.truth import true_poses
+from splatpipe.pipeline.app.view.job import open_job
+from splatpipe.pipeline.app.view.marking import Marking, WrongRequestError
+from splatpipe.pipeline.app.view.opened import open_run
+from splatpipe.pipeline.app.view.photo import without_metadata
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.control_edit import ControlText
-from splatpipe.pipeline.scene.control_file import read_control_file
-from splatpipe.pipeline.scene.names import NameFinder
-from splatpipe.pipeline.view.job import open_job
-from splatpipe.pipeline.view.marking import Marking, WrongRequestError
-from splatpipe.pipeline.view.opened import open_run
-from splatpipe.pipeline.view.photo import without_metadata
-from splatpipe.stages.georef.level import Positions
+from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.survey.control_edit import ControlText
+from splatpipe.pipeline.survey.control_file import read_control_file
+from splatpipe.pipeline.survey.level import Positions
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from served import Served, linked_copy, serving
@@ -41,7 +41,7 @@ POINTS = "EPSG:32633\nname,x,y,z\n" + "".join(
 
 
 def splatpipe(*arguments: object) -> None:
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -7,12 +7,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from splatpipe.pipeline.scene.exif import Exif
+from splatpipe.pipeline.photos import camera_groups as ingest_cameras
+from splatpipe.pipeline.photos.camera_groups import CameraGroup, describe_cameras, group_cameras
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.exif import Exif
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
 from splatpipe.pipeline.sfm.verified import Verified
-from splatpipe.stages.ingest import cameras as ingest_cameras
-from splatpipe.stages.ingest.cameras import CameraGroup, describe_cameras, group_cameras
-from splatpipe.stages.ingest.check import CheckedPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from surveyed import HEIGHT, LENS, TRUTH, WIDTH, true_model

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.photos import Photo
+from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.sfm.layout import make_layout, viewing_direction
 from splatpipe.pipeline.sfm.pairs import (
     Costs,

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.scene.panorama import (
+from splatpipe.pipeline.splat.panorama import (
     COLUMNS,
     ROWS,
     Panorama,
@@ -17,7 +17,7 @@ from splatpipe.pipeline.scene.panorama import (
     read_panorama,
     write_panorama,
 )
-from splatpipe.pipeline.scene.sky import directions, elevations_deg
+from splatpipe.pipeline.splat.sky import directions, elevations_deg
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies

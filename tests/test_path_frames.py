@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpipe.pipeline.scene.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from path_frames import Frame, change, nearest_first

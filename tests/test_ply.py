@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.ply import (
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import (
     MIP_COMMENT,
     property_names,
     read_splat,

@@ -11,18 +11,18 @@ import pycolmap
 import pytest
 
 from splatpipe.demo import CAPTURE
-from splatpipe.pipeline.scene.alignment import robust_similarity
-from splatpipe.pipeline.scene.correspondences import Correspondences, Shared
-from splatpipe.pipeline.scene.frames import Frame
-from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.pipeline.scene.receiver_noise import fit_with_noise
-from splatpipe.pipeline.scene.similarity import Similarity, rotation_from_vector, turn_between
-from splatpipe.pipeline.scene.uncertainty import student_95
-from splatpipe.stages.georef.fitting import NoPlaceError, PositionFit
-from splatpipe.stages.georef.gps import georeference, tell
-from splatpipe.stages.georef.level import Positions
-from splatpipe.stages.georef.model import SparseModel
-from splatpipe.stages.georef.place import stations_of
+from splatpipe.pipeline.geometry.alignment import robust_similarity
+from splatpipe.pipeline.geometry.correspondences import Correspondences, Shared
+from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector, turn_between
+from splatpipe.pipeline.survey.fitting import NoPlaceError, PositionFit
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.gps import georeference, tell
+from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.place import stations_of
+from splatpipe.pipeline.survey.receiver_noise import fit_with_noise
+from splatpipe.pipeline.survey.uncertainty import student_95
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.camera_angles import gimbal_from_nadir, tell_convention
-from splatpipe.pipeline.scene.exif import Exif, Gps
-from splatpipe.pipeline.scene.upright import enu_from_gimbal
-from splatpipe.stages.ingest.check import CheckedPhoto
-from splatpipe.stages.ingest.doubts import find_wrong
-from splatpipe.stages.ingest.positions import Position, PositionList, positions_json, read_positions
-from splatpipe.stages.ingest.stated import read_places
+from splatpipe.pipeline.geometry.upright import enu_from_gimbal
+from splatpipe.pipeline.photos.camera_angles import gimbal_from_nadir, tell_convention
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.doubts import find_wrong
+from splatpipe.pipeline.photos.exif import Exif, Gps
+from splatpipe.pipeline.survey.photo_positions import Position, PositionList, positions_json, read_positions
+from splatpipe.pipeline.survey.stated_positions import read_places
 
 HERE = Gps(47.8412, 13.5127, 512.0)
 

@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.raster import GradientBuffers, Render, RenderOptions, _native, render, set_threads
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, RenderOptions, render, set_threads
+from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from random_scene import random_camera, random_scene

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.photos import PhotoList
+from splatpipe.pipeline.photos.photo_list import PhotoList
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.probing import probe

@@ -14,29 +14,30 @@ import torch
 from PIL import Image
 from playwright.sync_api import Browser
 
-from splatpipe.pipeline import raster
+from splatpipe.pipeline.app.renders import Shot, Wanted, render_run
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.lineage import delivered, lineage
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.engine.store import open_store
-from splatpipe.pipeline.renders import Shot, Wanted, render_run
-from splatpipe.pipeline.scene.camera import Camera, rotation_matrix
-from splatpipe.pipeline.scene.camera_path import cameras_along
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.frames import load_frame
-from splatpipe.pipeline.scene.gaussians import Gaussians, quat_from_rotation
-from splatpipe.pipeline.scene.keyframe_file import read_keyframes
-from splatpipe.pipeline.scene.panorama import write_panorama
-from splatpipe.pipeline.scene.photo_route import photo_film
-from splatpipe.pipeline.scene.ply import write_splat
-from splatpipe.pipeline.scene.similarity import Similarity
+from splatpipe.pipeline.film.camera_path import cameras_along
+from splatpipe.pipeline.film.filming import coloured_depth, coloured_normals, open_scene
+from splatpipe.pipeline.film.keyframe_file import read_keyframes
+from splatpipe.pipeline.film.options import FlythroughConfig
+from splatpipe.pipeline.film.photo_route import photo_film
+from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.rendering import render_normals, render_pixels
+from splatpipe.pipeline.splat.gaussians import Gaussians, quat_from_rotation
+from splatpipe.pipeline.splat.panorama import write_panorama
+from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.stages import flythrough
-from splatpipe.stages.filming import coloured_depth, coloured_normals, open_scene
 from splatpipe.stages.line import EXPORT
-from splatpipe.stages.options import FlythroughConfig, TrainConfig
-from splatpipe.stages.rendering import render_normals, render_pixels
-from splatpipe.stages.threads import same_bits
-from splatpipe.stages.train.plan import make_plan
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -46,7 +47,7 @@ SECONDS = 4.0  # of the shared run's film
 
 
 def render(out: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "render", out, *arguments, "--json"]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "render", out, *arguments, "--json"]
     return subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
 
 
@@ -286,12 +287,12 @@ def test_normals_of_a_slanted_wall_are_its_own() -> None:
     normal = turn[:, 2]
     for camera in tiny_scene.cameras()[::4]:
         camera = camera.scaled(4 * camera.width, 4 * camera.height)
-        normals = render_normals(wall, camera, raster.RenderOptions(sh_degree=0))
+        normals = render_normals(wall, camera, rasterizer.RenderOptions(sh_degree=0))
         towards = normal if (camera.centre() @ normal) > 0.0 else -normal
         seen = normals[80:140, 100:190].reshape(-1, 3)
         assert np.degrees(np.arccos(np.clip(seen @ towards, -1.0, 1.0))).max() < 2.0
     empty = wall.select(torch.zeros(len(wall), dtype=torch.bool))
-    assert not render_normals(empty, camera, raster.RenderOptions(sh_degree=0)).any()
+    assert not render_normals(empty, camera, rasterizer.RenderOptions(sh_degree=0)).any()
 
 
 def test_colours_of_depths_and_normals() -> None:
@@ -319,5 +320,5 @@ def test_threads_do_not_change_a_film(tmp_path: Path) -> None:
         with same_bits(threads):
             flythrough.run(FlythroughConfig(seconds=0.4), inputs, folder / "out", tiny_scene.Recorder())
         films.append((folder / "out" / "film" / "flythrough.webm").read_bytes())
-    raster.set_threads(1)
+    rasterizer.set_threads(1)
     assert films[0] == films[1]

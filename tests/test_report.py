@@ -18,12 +18,12 @@ import pytest
 from PIL import Image
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.console import show_bad_cameras
-from splatpipe.pipeline.report import make_report, write_report
-from splatpipe.pipeline.report.holdings import open_holdings
-from splatpipe.pipeline.report.page import report_page
-from splatpipe.pipeline.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
-from splatpipe.pipeline.report.verdict import judge
+from splatpipe.pipeline.app.console import show_bad_cameras
+from splatpipe.pipeline.app.report import make_report, write_report
+from splatpipe.pipeline.app.report.holdings import open_holdings
+from splatpipe.pipeline.app.report.page import report_page
+from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
 
 QUICK = ("features.extractor=opencv-sift", "features.max_image_size=700", "undistort.max_megapixels=0.03")
@@ -35,7 +35,7 @@ def sets(*assignments: str) -> list[str]:
 
 
 def splatpipe(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
@@ -172,7 +172,7 @@ def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
 def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open_page: Callable[..., object]) -> None:
     """Ctrl-C in a longer training: how far it came, its curve, and that the files beside it are an earlier run's."""
     before = len((copy_of_run / "events.jsonl").read_text())
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "stage", "train", str(copy_of_run)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "stage", "train", str(copy_of_run)]
     command += sets("train.iterations=100000")
     hear = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **hear) as running:
@@ -212,7 +212,7 @@ def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_
     make_report(copy_of_run, copy_of_run / "splatpipe.log", until_s=time.monotonic() + 600.0)
     assert "<svg role=" in (copy_of_run / "report.html").read_text()
     code = (
-        "import sys; from pathlib import Path; from splatpipe.pipeline.report import write_report\n"
+        "import sys; from pathlib import Path; from splatpipe.pipeline.app.report import write_report\n"
         f"write_report(Path({str(copy_of_run)!r}), drawn=False)\n"
         "print([name for name in ('matplotlib', 'torch', 'pycolmap', 'cv2') if name in sys.modules])"
     )

@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.raster import Render, RenderOptions, render
-from splatpipe.pipeline.scene import metrics
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.stages import initialize, train
-from splatpipe.stages.options import InitializeConfig, TrainConfig
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.plan import Plan, resolve_schedule
-from splatpipe.stages.train.robust import (
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
+from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, resolve_schedule
+from splatpipe.pipeline.train.robust import (
     GRID,
     LEAST_RESIDUAL,
     MOST_OF_A_PHOTO,
@@ -27,8 +27,9 @@ from splatpipe.stages.train.robust import (
     cell_residuals,
     share_at,
 )
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.stages import initialize, train
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene

@@ -10,21 +10,22 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.reference import rotation_from_quats
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import View, load_views
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.ply import MIP_COMMENT, read_splat, read_splat_header
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, read_splat_header
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train import state as state_module
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.smoothing import Sampling, raw_opacity_limits, sampling_of, smoothed
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
-from splatpipe.stages.options import InitializeConfig, TrainConfig
-from splatpipe.stages.train import loop
-from splatpipe.stages.train import state as state_module
-from splatpipe.stages.train.plan import Plan, make_plan
-from splatpipe.stages.train.smoothing import Sampling, raw_opacity_limits, sampling_of, smoothed
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import TrainingPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -173,9 +174,9 @@ def ideal(camera: Camera) -> np.ndarray:
     truth = tiny_scene.true_model()
     truth.log_scales -= THINNER
     fine = camera.scaled(SUBPIXELS * camera.width, SUBPIXELS * camera.height)
-    options = raster.RenderOptions(3, antialias=True, depth=False)  # a pixel's blur is an eighth of one here
+    options = rasterizer.RenderOptions(3, antialias=True, depth=False)  # a pixel's blur is an eighth of one here
     with torch.no_grad():
-        colour = raster.render(truth, fine, options).colour.clamp(0.0, 1.0).numpy()
+        colour = rasterizer.render(truth, fine, options).colour.clamp(0.0, 1.0).numpy()
     parts = colour.reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS, 3)
     return np.asarray(parts.mean(axis=(1, 3)))
 
@@ -237,11 +238,11 @@ def test_the_file_renders_as_training_did(scene: Path, tmp_path: Path, monkeypat
     state, baked = states[-1], read_splat(out / "model.ply")
     plan = Plan.from_json((out / "plan.json").read_text())
     view = load_views(scene / "dataset")[2].camera
-    options = raster.RenderOptions(3, antialias=True, near=plan.near, depth=False)
+    options = rasterizer.RenderOptions(3, antialias=True, near=plan.near, depth=False)
     with torch.no_grad():
-        as_trained = raster.render(state.rendered_model(plan.options), view, options).colour
-        as_viewed = raster.render(baked, view, options).colour
-        raw = raster.render(state.gaussians, view, options).colour
+        as_trained = rasterizer.render(state.rendered_model(plan.options), view, options).colour
+        as_viewed = rasterizer.render(baked, view, options).colour
+        raw = rasterizer.render(state.gaussians, view, options).colour
     assert float((as_viewed - as_trained).abs().max()) < 1e-5  # quaternions were normalised
     assert float((raw - as_trained).abs().max()) > 1e-3
 
@@ -283,13 +284,13 @@ def test_no_gaussian_of_the_file_is_finer_than_its_filter(scene: Path, models: d
 
 def test_renders_at_half_and_double_resolution_are_as_bright_as_they_should(models: dict[str, Gaussians]) -> None:
     def brightness(name: str) -> tuple[float, float]:
-        settings = raster.RenderOptions(3, antialias=name == "both", depth=False)
+        settings = rasterizer.RenderOptions(3, antialias=name == "both", depth=False)
         shares = []
         for factor in (0.5, 2.0):
             camera = tiny_scene.cameras()[4]  # held out
             camera = camera.scaled(int(factor * camera.width), int(factor * camera.height))
             with torch.no_grad():
-                rendered = raster.render(models[name], camera, settings).colour.clamp(0.0, 1.0)
+                rendered = rasterizer.render(models[name], camera, settings).colour.clamp(0.0, 1.0)
             shares.append(float(rendered.mean()) / float(ideal(camera).mean()))
         return shares[0], shares[1]
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.spz import spz_bytes
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.spz import spz_bytes
 
 QUARTER_TURN = math.sqrt(0.5)
 

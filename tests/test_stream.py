@@ -16,11 +16,11 @@ import pytest
 import torch
 
 from splatpipe.pipeline.engine.errors import MachineError, StageError
-from splatpipe.pipeline.scene.camera import Camera, reduced_size
-from splatpipe.pipeline.scene.dataset import View, load_views
-from splatpipe.pipeline.scene.images import load_colour, load_mask, reduced_camera, reduced_view
-from splatpipe.stages.train import photo_cache
-from splatpipe.stages.train.stream import PhotoStream, TrainingPhoto
+from splatpipe.pipeline.geometry.camera import Camera, reduced_size
+from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.photos.images import load_colour, load_mask, reduced_camera, reduced_view
+from splatpipe.pipeline.train import photo_cache
+from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene

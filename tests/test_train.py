@@ -12,20 +12,21 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.scene import metrics
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.images import load_colour
-from splatpipe.pipeline.scene.ply import read_splat
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.images import load_colour
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.checkpoint import load_checkpoint
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
-from splatpipe.stages.options import InitializeConfig, TrainConfig
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.checkpoint import load_checkpoint
-from splatpipe.stages.train.plan import Plan
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import TrainingPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -82,7 +83,8 @@ def held_out_psnr(scene: Path, model: Path) -> float:
     view = next(view for view in load_views(scene / "dataset") if view.camera.name.endswith("photo_4.png"))
     gaussians = read_splat(model)
     with torch.no_grad():
-        render = raster.render(gaussians, view.camera, raster.RenderOptions(sh_degree=gaussians.sh_degree)).colour
+        options = rasterizer.RenderOptions(sh_degree=gaussians.sh_degree)
+        render = rasterizer.render(gaussians, view.camera, options).colour
     photo = torch.from_numpy(load_colour(view).astype(np.float32) / 255.0)
     return float(metrics.psnr(render.clamp(0.0, 1.0), photo))
 

@@ -8,16 +8,16 @@ import pytest
 from pydantic import ValidationError
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import View
-from splatpipe.stages.options import TrainConfig
-from splatpipe.stages.train.checkpoint import (
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.train.checkpoint import (
     BrokenCheckpointError,
     Checkpoint,
     load_checkpoint,
     save_checkpoint,
 )
-from splatpipe.stages.train.plan import (
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import (
     Plan,
     coarse_levels,
     load_or_write_plan,

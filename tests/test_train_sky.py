@@ -12,23 +12,25 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.raster import Render
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, read_panorama
-from splatpipe.pipeline.scene.ply import read_splat, write_splat
-from splatpipe.pipeline.scene.sky import SkyMask, directions
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.rasterizer import Render
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, read_panorama
+from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.sky import SkyMask, directions
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.measure import Effort, measure
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.sky import SkyModel, filled
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import evaluate, initialize, train
-from splatpipe.stages.options import EvaluateConfig, InitializeConfig, TrainConfig
-from splatpipe.stages.train import loop
-from splatpipe.stages.train.measure import Effort, measure
-from splatpipe.stages.train.plan import Plan, make_plan
-from splatpipe.stages.train.sky import SkyModel, filled
-from splatpipe.stages.train.state import TrainState
-from splatpipe.stages.train.stream import TrainingPhoto
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
@@ -177,7 +179,7 @@ def opacity_in_sky(scene: Path, model: Path) -> float:
         _, truth = skies.trace(view.camera)
         inner = cv2.erode(truth.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         with torch.no_grad():
-            alpha = raster.render(gaussians, view.camera, raster.RenderOptions(gaussians.sh_degree)).alpha
+            alpha = rasterizer.render(gaussians, view.camera, rasterizer.RenderOptions(gaussians.sh_degree)).alpha
         found.append(float(alpha[torch.from_numpy(inner)].mean()))
     return float(np.mean(found))
 

@@ -15,12 +15,12 @@ from jaxtyping import Float64
 from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.demo.scene import building_corners
 from splatpipe.demo.truth import Poses, centre, depth_map, true_poses, true_surface, truth_from_model
-from splatpipe.pipeline.raster import RenderOptions, render
-from splatpipe.pipeline.scene.dataset import load_points_and_tracks, load_views
-from splatpipe.pipeline.scene.free_space import free_space, near_or_free
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.pipeline.scene.similarity import Similarity
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_views
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
+from splatpipe.pipeline.splat.free_space import free_space, near_or_free
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import read_splat
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -48,7 +48,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [
         sys.executable,
         "-m",
-        "splatpipe.pipeline.cli",
+        "splatpipe.pipeline.app.cli",
         "run",
         capture_path(),
         folder,

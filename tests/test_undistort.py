@@ -13,10 +13,11 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.scene.dataset import load_points, load_views
-from splatpipe.pipeline.scene.photos import PhotoList, load_photo_list, save_photo_list
-from splatpipe.stages import resampling, undistort
-from splatpipe.stages.options import UndistortConfig
+from splatpipe.pipeline.photos import resampling
+from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.photos.options import UndistortConfig
+from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list, save_photo_list
+from splatpipe.stages import undistort
 from splatpipe.stages.undistort import pinhole_camera
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.scene.video import VideoWriter
+from splatpipe.pipeline.film.video import VideoWriter
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from decoded import decoded, psnr

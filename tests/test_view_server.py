@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.view.files import NotThereError, open_inside, wanted_range
-from splatpipe.pipeline.view.log import MOST_POINTS, Curve, RunLog
+from splatpipe.pipeline.app.view.files import NotThereError, open_inside, wanted_range
+from splatpipe.pipeline.app.view.log import MOST_POINTS, Curve, RunLog
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from served import Answer, Served, linked_copy, serving
@@ -323,7 +323,7 @@ def test_the_viewer_opens_from_here_with_its_splat_inside_or_beside_it(served: S
 
 def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> None:
     def view(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "splatpipe.pipeline.cli", "view", *map(str, arguments), "--no-browser"]
+        command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", *map(str, arguments), "--no-browser"]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=240)
 
     done = view(tmp_path)

@@ -19,16 +19,16 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from splatpipe.demo import CAPTURE
-from splatpipe.pipeline import raster
 from splatpipe.pipeline.engine.store import open_store
-from splatpipe.pipeline.scene.dataset import load_views
-from splatpipe.pipeline.scene.frames import Frame, Origin, Similarity, load_frame
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.panorama import COLUMNS, ROWS, panorama_of, read_panorama
-from splatpipe.pipeline.scene.ply import read_splat
-from splatpipe.pipeline.scene.sh import rgb_to_dc
-from splatpipe.stages.rendering import as_trained, render_pixels
-from splatpipe.stages.viewing import Look, upright, viewer_scene, write_viewer
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.rendering import as_trained, render_pixels
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, read_panorama
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.survey.frames import Frame, Origin, Similarity, load_frame
+from splatpipe.pipeline.web.viewer_scene import Look, upright, viewer_scene, write_viewer
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -272,7 +272,7 @@ def test_blur_without_antialiasing_the_sky_and_an_off_centre_lens_are_ours(tiny:
     camera = tiny_scene.cameras()[2]
     page = view(tiny / "viewer.html", camera.width, camera.height)
     page.evaluate("name => splatpipe.goToCamera(name)", camera.name)
-    options = raster.RenderOptions(sh_degree=3)
+    options = rasterizer.RenderOptions(sh_degree=3)
     ours = render_pixels((tiny_scene.true_model(), tiny_sky()), camera, options)
     bare = render_pixels((tiny_scene.true_model(), None), camera, options)
     assert psnr(ours, bare) < LIKE_OURS_DB  # the sky is seen
@@ -300,7 +300,7 @@ def test_the_last_splat_of_a_batch_is_drawn_whole(tmp_path: Path, view: Opened) 
     write_tiny(tmp_path, model=model)
     page = view(tmp_path / "viewer.html", camera.width, camera.height)
     page.evaluate("name => splatpipe.goToCamera(name)", camera.name)
-    ours = render_pixels((model, tiny_sky()), camera, raster.RenderOptions(sh_degree=0))
+    ours = render_pixels((model, tiny_sky()), camera, rasterizer.RenderOptions(sh_degree=0))
     assert psnr(picture(page), ours) >= LIKE_OURS_DB
 
 

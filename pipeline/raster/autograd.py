@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.splat.gaussians import Gaussians
 
 
 class GradientBuffers:

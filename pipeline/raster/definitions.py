@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.gaussians import Gaussians
 
 ALPHA_MAX = 0.99
 """Cap on a pixel's alpha, so that 1 - alpha can be divided by."""

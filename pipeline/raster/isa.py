@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.raster import _native
 
+__all__ = ["_native", "choose_isa", "isa_name", "isa_names", "use_isa_of_environment"]
+
 VARIABLE = "SPLATPIPE_ISA"
 INSTRUCTION_SETS = ("avx512", "avx2", "baseline")
 """All that kernels are compiled for on some machine, best first."""
@@ -52,3 +54,6 @@ def isa_name() -> str:
 def isa_names() -> list[str]:
     """Instruction sets that this CPU has, best first."""
     return _native.isas()
+
+
+use_isa_of_environment()

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatpipe.pipeline.raster import _native
-from splatpipe.pipeline.scene.metrics import SSIM_WINDOW
+from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.splat.metrics import SSIM_WINDOW
 
 MIN_SIDE_PX = SSIM_WINDOW // 2 + 1
 """The smallest image whose border can be reflected by half a window."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.raster.isa import _native
 
 _MEAN = "mean."
 _SQUARE = "square."

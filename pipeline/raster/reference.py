@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -33,9 +34,8 @@ from splatpipe.pipeline.raster.definitions import (
     Render,
     RenderOptions,
 )
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.sh import eval_sh
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.sh import eval_sh
 
 _PAIRS_AT_ONCE = 1 << 22
 """Pixel-Gaussian pairs that are held at a time: some ten tensors of 32 MB each in float64."""

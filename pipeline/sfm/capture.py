@@ -11,7 +11,7 @@ import pycolmap
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.scene.photos import PhotoList
+from splatpipe.pipeline.photos.photo_list import PhotoList
 from splatpipe.pipeline.sfm.verified import Verified
 
 

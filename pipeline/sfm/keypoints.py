@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from splatpipe.pipeline.scene.photos import Photo, decode, decode_mask
+from splatpipe.pipeline.photos.photo_list import Photo, decode, decode_mask
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 
 Floats = npt.NDArray[np.float32]

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
-from splatpipe.pipeline.scene.similarity import Similarity, fit_similarity
+from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 from splatpipe.pipeline.sfm.ladder_poses import (
     CELLS,
     ERROR,

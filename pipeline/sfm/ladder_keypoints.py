@@ -13,8 +13,8 @@ import numpy as np
 import pycolmap
 from jaxtyping import UInt8
 
+from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.scene.parallel import ordered_map
 from splatpipe.pipeline.sfm.capture import Capture, Found
 from splatpipe.pipeline.sfm.keypoints import extract, single_threaded_opencv
 from splatpipe.pipeline.sfm.ladder_pairs import take_verified

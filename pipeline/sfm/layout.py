@@ -11,8 +11,8 @@ import pycolmap
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.scene.photos import Photo
-from splatpipe.pipeline.scene.upright import display_from_stored, enu_from_gimbal
+from splatpipe.pipeline.geometry.upright import display_from_stored, enu_from_gimbal
+from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.sfm.footprints import Views
 from splatpipe.pipeline.sfm.pairs import LOCATED_SHARE, Layout
 

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import pycolmap
 
-from splatpipe.pipeline.scene.parallel import watched
+from splatpipe.pipeline.engine.parallel import watched
 from splatpipe.pipeline.sfm.completion import complete
 from splatpipe.pipeline.sfm.reduction import best_keypoints, write_reduced
 from splatpipe.pipeline.sfm.verified import read_verified

@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 from jaxtyping import UInt8
 
+from splatpipe.pipeline.engine.parallel import watched
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.scene.parallel import watched
 from splatpipe.pipeline.sfm.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.reduction import copy_photos
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs

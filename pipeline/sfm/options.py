@@ -6,10 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from splatpipe.pipeline.engine.ranges import NonNegativeInt, PositiveInt
 from splatpipe.pipeline.engine.stage import StageConfig
-
-PositiveInt = Annotated[int, Field(ge=1)]
-NonNegativeInt = Annotated[int, Field(ge=0)]
 
 
 class FeaturesConfig(StageConfig):

@@ -13,10 +13,10 @@ from jaxtyping import Float64, UInt8
 from jinja2 import Environment
 from markupsafe import Markup
 
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.crs import UNKNOWN
-from splatpipe.pipeline.scene.local_crs import LocalCrs
-from splatpipe.pipeline.scene.panorama import FULL_FROM_DEG, NOTHING_UP_TO_DEG
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.panorama import FULL_FROM_DEG, NOTHING_UP_TO_DEG
+from splatpipe.pipeline.survey.crs import UNKNOWN
+from splatpipe.pipeline.survey.local_crs import LocalCrs
 from splatpipe.pipeline.web import asset
 
 TEMPLATE = Path(__file__).resolve().parent / "viewer.html"

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.scene.photos import Photo, PhotoList, save_photo_list
+from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
 
 WIDTH, HEIGHT, FOCAL, RADIAL = 480, 360, 420.0, -0.08
 ROOM_M = 3.0

@@ -88,7 +88,7 @@ class Served:
 @contextlib.contextmanager
 def serving(out: Path, *options: object) -> Iterator[Served]:
     """``splatpipe view OUT`` while the context lasts."""
-    command = [sys.executable, "-m", "splatpipe.pipeline.cli", "view", str(out), "--no-browser", *map(str, options)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", str(out), "--no-browser", *map(str, options)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None

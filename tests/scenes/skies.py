@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import tiny_scene
 
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.sky import SkyPhoto, directions
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.sky import SkyPhoto, directions
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
 EYE = 2.0  # world units over the plain

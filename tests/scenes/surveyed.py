@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from splatpipe.demo import CAPTURE
 from splatpipe.demo.truth import true_surface
-from splatpipe.pipeline.scene.geodesy import Origin
-from splatpipe.pipeline.scene.photos import Photo, PhotoList, save_photo_list
-from splatpipe.pipeline.scene.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
 from splatpipe.pipeline.sfm.sparse_model import write_model
+from splatpipe.pipeline.survey.geodesy import Origin
 
 Array = NDArray[np.float64]
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))

@@ -10,11 +10,11 @@ import numpy as np
 import pycolmap
 import torch
 
-from splatpipe.pipeline import raster
-from splatpipe.pipeline.scene.camera import Camera
-from splatpipe.pipeline.scene.gaussians import Gaussians
-from splatpipe.pipeline.scene.sh import dc_to_rgb, rgb_to_dc
-from splatpipe.stages.options import TrainConfig
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.sh import dc_to_rgb, rgb_to_dc
+from splatpipe.pipeline.train.options import TrainConfig
 
 WIDTH, HEIGHT, FOCAL = 72, 54, 70.0
 CAMERAS = 9
@@ -95,7 +95,7 @@ def cameras(count: int = CAMERAS) -> list[Camera]:
 def photograph(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """(h, w, 3) RGB, 8 bits."""
     with torch.no_grad():
-        colour = raster.render(gaussians, camera, raster.RenderOptions(sh_degree=gaussians.sh_degree)).colour
+        colour = rasterizer.render(gaussians, camera, rasterizer.RenderOptions(sh_degree=gaussians.sh_degree)).colour
     return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).numpy()
 
 

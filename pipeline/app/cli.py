@@ -1,0 +1,333 @@
+"""The command line: thin commands over the engine, and one place where errors become exit codes."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, NoReturn
+
+import typer
+
+from splatpipe.pipeline.app.cli_options import (
+    ConfigOption,
+    DeviceOption,
+    FpsOption,
+    JsonOption,
+    MaxMemoryOption,
+    OutArgument,
+    PathOption,
+    PhotosArgument,
+    PresetOption,
+    RerunFromOption,
+    RerunOption,
+    SecondsOption,
+    SeedOption,
+    SetOption,
+    SizeOption,
+    StillsOption,
+    TargetOption,
+    ThreadsOption,
+    TimeBudgetOption,
+    UntilOption,
+    WhatOption,
+)
+from splatpipe.pipeline.app.cli_runs import (
+    Overrides,
+    RunSession,
+    available_cores,
+    check_stage,
+    existing,
+    overrides,
+    request_of,
+    stages_to_rerun,
+    with_budgets,
+)
+from splatpipe.pipeline.app.ending import Ending, for_the_user, print_json
+from splatpipe.pipeline.engine.errors import (
+    EXIT_INTERRUPTED,
+    EXIT_TERMINATED,
+    EXIT_USAGE,
+    Stopped,
+    UsageError,
+    exit_code,
+)
+
+app = typer.Typer(
+    name="splatpipe",
+    help="From a folder of drone photos to a georeferenced, quality-checked 3D Gaussian splat.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"splatpipe {version('splatpipe')}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(
+    photos: PhotosArgument,
+    out: OutArgument,
+    preset: PresetOption = "standard",
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    time_budget: TimeBudgetOption = None,
+    max_memory: MaxMemoryOption = None,
+    until: UntilOption = None,
+    rerun: RerunOption = None,
+    rerun_from: RerunFromOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    seed: SeedOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Turn a folder of photos into a Gaussian splat; what is there and valid is reused."""
+    from splatpipe.pipeline.engine.config import load_preset
+
+    with Ending(out, as_json) as done:
+        assignments = with_budgets(assignments, time_budget, max_memory)
+        resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
+        again = stages_to_rerun(rerun or [], rerun_from, until)
+        with RunSession(request_of(photos, out, resolved, device, threads)) as runner:
+            done.outcome = runner.outcome
+            runner.walk(until=until, rerun=again)
+
+
+@app.command()
+def demo(
+    out: OutArgument,
+    preset: PresetOption = "demo",
+    assignments: SetOption = None,
+    time_budget: TimeBudgetOption = None,
+    max_memory: MaxMemoryOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    seed: SeedOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the line on the capture that ships with splatpipe, to see it work."""
+    from splatpipe.demo import capture_path
+
+    budgets = {"time_budget": time_budget, "max_memory": max_memory}
+    machine = {"device": device, "threads": threads, "seed": seed, "as_json": as_json}
+    run(capture_path(), out, preset, None, assignments, **budgets, **machine)  # type: ignore[arg-type]
+
+
+@app.command()
+def stage(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The stage to run.")],
+    out: OutArgument,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Run one stage again on an existing OUT, and nothing else."""
+    from splatpipe.pipeline.engine.config import known
+    from splatpipe.pipeline.engine.session import load_run
+    from splatpipe.stages.options import LineConfig
+
+    with Ending(out, as_json) as done:
+        check_stage(name)
+        photos, table = load_run(out)
+        resolved = overrides(None, assignments, None).resolve(known(LineConfig, table))
+        request = request_of(photos, out, resolved, device, threads)
+        with RunSession(request) as runner:
+            done.outcome = runner.outcome
+            runner.run_alone(name)
+
+
+@app.command()
+def georef(
+    out: OutArgument,
+    gcp: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Control points: gcp_list.txt or CSV; auto, or none. Else as before."),
+    ] = None,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Place a finished run anew: other control points, another CRS. What does not change is reused."""
+    from splatpipe.pipeline.engine.config import known
+    from splatpipe.pipeline.engine.session import load_run
+    from splatpipe.stages.options import LineConfig
+
+    with Ending(out, as_json) as done:
+        photos, table = load_run(out)
+        control = [] if gcp is None else [{"georef": {"control": gcp}}]
+        resolved = overrides(None, assignments, None).resolve(known(LineConfig, table), *control)
+        with RunSession(request_of(photos, out, resolved, device, threads)) as runner:
+            done.outcome = runner.outcome
+            runner.walk()
+
+
+@app.command()
+def render(
+    out: OutArgument,
+    path: PathOption = "cameras",
+    what: WhatOption = "colour",
+    stills: StillsOption = False,
+    size: SizeOption = "",
+    seconds: SecondsOption = 10.0,
+    fps: FpsOption = 25,
+    target: TargetOption = None,
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a film or stills of a finished run, along its cameras, around it, or by a file of keyframes."""
+    with Ending(out, as_json) as done:
+        from splatpipe.pipeline.app.renders import Wanted, render_run
+
+        wanted = Wanted(path, what, stills, size, seconds, fps, target)
+        done.told = {"render": render_run(out, wanted, threads or available_cores())}
+
+
+@app.command()
+def view(
+    out: OutArgument,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for a free one.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    mark: Annotated[bool, typer.Option("--mark", help="Mark control points in the photos.")] = False,
+    points: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="With --mark: points and their coordinates, a CSV: name,x,y,z."),
+    ] = None,
+) -> None:
+    """Show a run in the browser: its training as it runs, its results; with --mark, mark control points."""
+    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.view.server import ViewOptions, serve
+
+    if points is not None and not mark:
+        raise UsageError("--points says what to mark.", hint="Add --mark.")
+    serve(out, ViewOptions(port, browser, mark, points), say)
+
+
+@app.command()
+def status(out: OutArgument, as_json: JsonOption = False) -> None:
+    """Say what is there, what is stale and why."""
+    from splatpipe.pipeline.app.console import show_standings
+    from splatpipe.pipeline.engine.runner import survey
+    from splatpipe.pipeline.engine.session import survey_line
+
+    with Ending(out, as_json) as done:
+        standings = list(survey(*survey_line(existing(out))))
+        stages = [
+            {
+                "name": standing.stage.name,
+                "state": standing.state,
+                "reason": standing.reason,
+                "seconds": standing.artifact.manifest["seconds"] if standing.artifact else None,
+                "summary": standing.artifact.summary if standing.artifact else None,
+            }
+            for standing in standings
+        ]
+        done.told = {"stages": stages}
+    if not as_json:
+        show_standings(standings)
+
+
+@app.command()
+def report(out: OutArgument, as_json: JsonOption = False) -> None:
+    """Write OUT/report.html anew, from what is there."""
+    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.report import make_report
+    from splatpipe.pipeline.engine.session import LOG_FILE
+    from splatpipe.pipeline.engine.store import open_store
+
+    with Ending(out, as_json) as done:
+        open_store(out, create=False)
+        path = make_report(out, out / LOG_FILE)
+        done.told = {"outputs": [str(path)]}
+    say(str(path))
+
+
+@app.command()
+def clean(out: OutArgument, as_json: JsonOption = False) -> None:
+    """Remove artifacts that the present configuration no longer asks for."""
+    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.engine.runner import survey
+    from splatpipe.pipeline.engine.session import survey_line
+    from splatpipe.pipeline.engine.store import locked
+
+    with Ending(out, as_json) as done:
+        line, store = survey_line(existing(out))
+        with locked(store):
+            keep = [(standing.stage.name, standing.key) for standing in survey(line, store)]
+            removed, freed = store.remove_stale(keep)
+        done.told = {"removed": removed, "freed_bytes": freed}
+        say(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")
+
+
+@app.command()
+def options(preset: PresetOption = "standard") -> None:
+    """List every option with its value in a preset and what it does."""
+    from splatpipe.pipeline.app.console import show_table
+    from splatpipe.pipeline.engine.config import load_preset, lookup, option_help
+
+    resolved = Overrides([]).resolve(load_preset(preset))
+    rows = [(name, str(lookup(resolved, name)), text) for name, text in option_help(type(resolved))]
+    show_table(rows, ("option", "value", "what it does"))
+
+
+@app.command()
+def doctor(as_json: JsonOption = False) -> None:
+    """Say what this machine can do."""
+    from splatpipe.pipeline.app.console import show_table
+    from splatpipe.pipeline.app.doctor import examine
+
+    findings = examine()
+    if as_json:
+        print_json(findings)
+    else:
+        show_table([(name, str(value)) for name, value in findings.items()], ("what", "found"))
+
+
+def _stop(number: int, _frame: FrameType | None) -> NoReturn:
+    raise Stopped(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_TERMINATED)
+
+
+def main() -> NoReturn:
+    """Run the command line; every error becomes its message and its exit code here."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup means it
+            signal.signal(number, _stop)
+    try:
+        app()
+    except SystemExit as error:  # typer has told what is wrong with the call
+        if error.code == EXIT_USAGE and "--json" in sys.argv:
+            print_json({"exit_code": EXIT_USAGE, "error": {"message": "Wrong call; see stderr.", "hint": "--help"}})
+        raise
+    except Stopped as error:
+        from splatpipe.pipeline.app.console import say
+
+        say(f"{error} {error.hint}")
+        sys.exit(error.exit_code)
+    except Exception as error:
+        from splatpipe.pipeline.app.console import show_error
+
+        show_error(for_the_user(error))
+        sys.exit(exit_code(error))
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

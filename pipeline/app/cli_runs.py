@@ -1,0 +1,123 @@
+"""What a command of the line needs before it can begin: its options resolved, the request, an open session."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.runner import Runner
+    from splatpipe.pipeline.engine.session import Request
+    from splatpipe.stages.options import LineConfig
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """What the command line says about the configuration."""
+
+    tables: Sequence[dict[str, Any]]
+
+    def resolve(self, *below: dict[str, Any]) -> LineConfig:
+        from splatpipe.pipeline.engine.config import resolve
+        from splatpipe.stages.options import LineConfig
+
+        return resolve(LineConfig, [*below, *self.tables])
+
+
+def overrides(config: Path | None, assignments: Sequence[str] | None, seed: int | None) -> Overrides:
+    from splatpipe.pipeline.engine.config import load_file, parse_set, with_seed
+    from splatpipe.stages.options import LineConfig
+
+    tables = [load_file(config)] if config else []
+    for table in tables:  # OUT/config.toml has these two besides the options
+        table.pop("photos", None), table.pop("splatpipe", None)
+    if seed is not None:
+        tables.append(with_seed(LineConfig, seed))
+    return Overrides([*tables, *(parse_set(text, LineConfig) for text in assignments or ())])
+
+
+def with_budgets(assignments: Sequence[str] | None, time_budget: str | None, max_memory: str | None) -> list[str]:
+    """``--time-budget`` and ``--max-memory`` as the assignments that they are short for."""
+    from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
+
+    budgets = []
+    if time_budget is not None:
+        budgets.append(f"train.time_budget_s={parse_duration(time_budget, '--time-budget')!r}")
+    if max_memory is not None:
+        budgets.append(f"train.max_memory_bytes={parse_bytes(max_memory, '--max-memory')}")
+    return [*budgets, *(assignments or ())]
+
+
+def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
+    from splatpipe.pipeline.engine.session import Request
+    from splatpipe.pipeline.engine.source import with_absolute_files
+    from splatpipe.pipeline.engine.stage import Machine
+    from splatpipe.stages.line import LINE
+
+    began_s = round(time.monotonic(), 3)
+    if device not in ("auto", "cpu", "cuda"):
+        raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
+    if device == "cuda":
+        raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
+    if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
+        import splatpipe.pipeline.raster.isa  # noqa: F401
+    machine = Machine(device, threads or available_cores(), began_s)
+    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def existing(out: Path) -> Request:
+    from splatpipe.pipeline.engine.config import known
+    from splatpipe.pipeline.engine.session import load_run
+    from splatpipe.stages.options import LineConfig
+
+    photos, table = load_run(out)
+    return request_of(photos, out, Overrides([]).resolve(known(LineConfig, table)))
+
+
+def check_stage(name: str) -> None:
+    from splatpipe.stages.line import LINE
+
+    names = [entry.name for entry in LINE]
+    if name not in names:
+        raise UsageError(f'There is no stage "{name}".', hint=f"The line is: {', '.join(names)}.")
+
+
+def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | None) -> frozenset[str]:
+    from splatpipe.stages.line import LINE
+
+    for name in [*rerun, *filter(None, (rerun_from, until))]:
+        check_stage(name)
+    names = [entry.name for entry in LINE]
+    return frozenset([*rerun, *(names[names.index(rerun_from) :] if rerun_from else [])])
+
+
+class RunSession:
+    """An open session whose events go to the terminal, which is left tidy whatever happens."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+
+    def __enter__(self) -> Runner:
+        from splatpipe.pipeline.app.console import RunConsole
+        from splatpipe.pipeline.engine.session import open_session
+
+        self._console = RunConsole()
+        self._session = open_session(self._request, self._console)
+        return self._session.__enter__()
+
+    def __exit__(self, *error: Any) -> bool | None:
+        self._console.close()
+        return self._session.__exit__(*error)

@@ -1,0 +1,142 @@
+"""How a command ends: a summary for people, one JSON object for programs, a message and an exit code for errors."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, exit_code
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.runner import Outcome
+
+STOP_S = 4.0  # after Ctrl-C the report is over, too: an end within five seconds is promised, on a busy machine as well
+
+
+class Ending:
+    """Tells the end of a command, good or bad: a summary for people on stderr, one JSON object for programs."""
+
+    outcome: Outcome | None = None
+    told: Mapping[str, Any] | None = None
+    _reported: Path | None = None
+
+    def __init__(self, out: Path, as_json: bool) -> None:
+        self._out, self._as_json = out, as_json
+        self._started_s = time.monotonic()
+
+    def __enter__(self) -> Ending:
+        return self
+
+    def __exit__(self, _kind: Any, error: BaseException | None, _traceback: Any) -> None:
+        seconds = time.monotonic() - self._started_s
+        if isinstance(error, GeneratorExit | SystemExit):
+            return
+        if self.outcome is not None and not _insists(error):
+            self._report(error)
+        if error is None and self.outcome is not None:
+            self._show(self.outcome, seconds)
+        if self._as_json:
+            print_json({**self._as_object(error, seconds), **(self.told or {})})
+
+    def _report(self, error: BaseException | None) -> None:
+        """Have the report written; what is wrong with it is told, and changes nothing about the run."""
+        from splatpipe.pipeline.app.console import say
+        from splatpipe.pipeline.app.report import make_report
+        from splatpipe.pipeline.engine.session import LOG_FILE
+
+        until_s = error.at_s + STOP_S if isinstance(error, Stopped) else None
+        try:
+            self._reported = make_report(self._out, self._out / LOG_FILE, until_s=until_s)
+        except SplatpipeError as trouble:
+            say(f"{trouble.message} {trouble.hint}".strip())
+
+    def _show(self, outcome: Outcome, seconds: float) -> None:
+        from splatpipe.pipeline.app.console import show_accuracy, show_bad_cameras, show_outputs
+
+        show_accuracy(*_accuracy(outcome))
+        show_outputs(self._out, seconds, len(outcome.ran), _headline(outcome), self._files(outcome))
+        if "sparse" in outcome.artifacts:
+            show_bad_cameras(outcome.artifacts["sparse"].summary.get("verdict") or {})
+
+    def _files(self, outcome: Outcome) -> list[Path]:
+        from splatpipe.stages.line import LINE
+
+        made = [(stage, outcome.artifacts[stage.name]) for stage in LINE if stage.name in outcome.artifacts]
+        files = [self._out / name for stage, artifact in made for name in artifact.deliverables(stage)]
+        return [path for path in [*files, *filter(None, [self._reported])] if path.is_file()]
+
+    def _as_object(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
+        outcome = self.outcome
+        artifacts = outcome.artifacts if outcome else {}
+        return {
+            "out": str(self._out),
+            "exit_code": exit_code(error),
+            "error": None if error is None else {"message": str(error), "hint": getattr(error, "hint", "")},
+            "seconds": round(seconds, 3),
+            "stages": [
+                {
+                    "name": name,
+                    "state": "ran" if outcome and name in outcome.ran else "reused",
+                    "seconds": artifact.manifest["seconds"],
+                    "summary": artifact.summary,
+                }
+                for name, artifact in artifacts.items()
+            ],
+            "failed": outcome.failed if outcome else "",
+            "outputs": [str(path) for path in self._files(outcome)] if outcome else [],
+        }
+
+
+def _insists(error: BaseException | None) -> bool:
+    """Whether the user pressed Ctrl-C once more while the first one was being obeyed: then nothing is waited for."""
+    before = None if error is None else error.__context__
+    while before is not None and not isinstance(before, Stopped):
+        before = before.__context__
+    return isinstance(error, Stopped) and before is not None
+
+
+def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The accuracy report, with the splat's own if it was measured, and the surveyed points; empty where not walked."""
+    artifacts = outcome.artifacts.values()
+    parts = {name: part.path for artifact in artifacts for name, part in artifact.parts.items()}
+    report: dict[str, Any] = {}
+    points: list[dict[str, Any]] = []
+    with suppress(OSError, ValueError, KeyError, TypeError):  # what is damaged is told by ``status``
+        if "evaluate.metrics" in parts:
+            report = dict(json.loads(parts["evaluate.metrics"].read_text(encoding="utf-8"))["accuracy"])
+        elif "georef.accuracy" in parts:
+            report = dict(json.loads(parts["georef.accuracy"].read_text(encoding="utf-8")))
+        if "georef.control" in parts:
+            points = list(json.loads(parts["georef.control"].read_text(encoding="utf-8"))["points"])
+    return report, points
+
+
+def _headline(outcome: Outcome) -> dict[str, Any]:
+    """The figures that people ask for first."""
+    merged: dict[str, Any] = {}
+    for artifact in outcome.artifacts.values():
+        merged.update(artifact.summary)
+    wanted = ("photos", "registered", "points3d", "gaussians", "psnr", "ssim")
+    return {name: merged[name] for name in wanted if merged.get(name) is not None}
+
+
+def print_json(value: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(value) + "\n")
+    sys.stdout.flush()
+
+
+def for_the_user(error: Exception) -> SplatpipeError:
+    if isinstance(error, SplatpipeError):
+        return error
+    if isinstance(error, OSError):
+        return MachineError(str(error), "Check the free space and the permissions.")
+    with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:
+        traceback.print_exception(error, file=file)
+    return StageError(f"A fault of splatpipe: {type(error).__name__}: {error}", f"Please report it with {file.name}")

@@ -1,0 +1,278 @@
+"""What ``splatpipe render`` does: films and stills of a finished run, along its cameras, around it, or by keyframes."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+
+from splatpipe.pipeline.app.console import RunConsole
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.events import Event, EventReporter
+from splatpipe.pipeline.engine.lineage import delivered, lineage
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.engine.store import open_store
+from splatpipe.pipeline.film.camera_path import Lens, Route, cameras_along
+from splatpipe.pipeline.film.filming import (
+    LEAST_SIDE,
+    MOST_SIDE,
+    FilmFile,
+    Pictures,
+    TrainedScene,
+    What,
+    depth_range,
+    open_scene,
+    write_film,
+)
+from splatpipe.pipeline.film.keyframe_file import Keyframes, read_keyframes
+from splatpipe.pipeline.film.orbit import orbit
+from splatpipe.pipeline.film.photo_route import followed_photos, photo_film
+from splatpipe.pipeline.film.video import CODECS
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.stages.evaluate import flat_stems
+from splatpipe.stages.line import EXPORT, FLYTHROUGH, TRAIN
+
+ORBIT_STILLS = 12
+FOLDER = "renders"  # below OUT
+OWN_PATHS = ("cameras", "orbit")
+READ = (*FLYTHROUGH.reads, "georef.frame")
+UP = np.array([0.0, 0.0, 1.0])  # of the world of `splat.ply`
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to render.
+
+    Attributes:
+        path: ``cameras``, ``orbit``, or a file of keyframes.
+        what: ``colour``, ``depth`` or ``normals``.
+        stills: Pictures instead of a film.
+        size: `1280x720`; empty for one like the training's.
+        seconds: Of a film whose path has no times of its own.
+        fps: Frames a second.
+        to: The film, or the folder of stills; None for one below OUT.
+    """
+
+    path: str = "cameras"
+    what: str = "colour"
+    stills: bool = False
+    size: str = ""
+    seconds: float = 10.0
+    fps: int = 25
+    to: Path | None = None
+
+    def checked(self) -> tuple[What, tuple[int, int] | None]:
+        """What is shown, and its size in pixels.
+
+        Raises:
+            UsageError: if they make no sense.
+        """
+        what: What | None = next((known for known in get_args(What) if known == self.what), None)
+        if what is None:
+            raise UsageError(
+                f'--what "{self.what[:20]}" is nothing that can be rendered.',
+                hint=f"Choose {', '.join(get_args(What))}.",
+            )
+        if not self.size:
+            return what, None
+        match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", self.size)
+        size = (int(match[1]), int(match[2])) if match else (0, 0)
+        if not all(LEAST_SIDE <= side <= MOST_SIDE and (self.stills or side % 2 == 0) for side in size):
+            raise UsageError(
+                f'--size "{self.size[:20]}" is no size that can be rendered.',
+                hint=f"Write it like 1280x720: {LEAST_SIDE} to {MOST_SIDE} pixels, even ones for a film.",
+            )
+        return what, size
+
+    def target(self, out: Path) -> Path:
+        """Where it goes; the folder that it lies in is made.
+
+        Raises:
+            UsageError: if it is no place for that.
+            MachineError: if it cannot be made.
+        """
+        stem = self.path if self.path in OWN_PATHS else flat_stems([Path(self.path).name])[0]
+        target = self.to or out / FOLDER / f"{stem}-{self.what}{'' if self.stills else '.webm'}"
+        if self.stills and target.exists() and not target.is_dir():
+            raise UsageError(f"{target} is a file.", hint="Stills go into a folder: name another one with -o.")
+        if self.stills and target.suffix in CODECS:
+            raise UsageError(f"{target} is a film's name.", hint="Stills go into a folder: name one with -o.")
+        if not self.stills and (target.suffix not in CODECS or target.is_dir()):
+            raise UsageError(f"{target} is no film.", hint=f"A film ends in {' or '.join(CODECS)}.")
+        folder = target if self.stills else target.absolute().parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise MachineError(
+                f"Cannot make {folder}: {error.strerror}.", hint="Name another place with -o."
+            ) from error
+        return target
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A scene, where it lies, and what is wanted of it.
+
+    Attributes:
+        scene: The trained one, in its model's frame.
+        world_from_model: To that of `splat.ply`.
+        wanted: What.
+        keyframes: Of the path's file; None without one.
+        size: Pixels; None for one like the training's.
+    """
+
+    scene: TrainedScene
+    world_from_model: Similarity
+    wanted: Wanted
+    keyframes: Keyframes | None
+    size: tuple[int, int] | None
+
+    def film(self) -> list[Camera]:
+        """A camera a frame, in the model's frame."""
+        seconds, fps = self.wanted.seconds, self.wanted.fps
+        capture, lens = self.scene.capture, self.scene.lens(self.size)
+        if self.keyframes is not None:
+            distance = followed_photos(capture)[1] * self.world_from_model.scale
+            route, angles = self.keyframes.film(distance, fps, seconds)
+            return self._from_world(route, self._lenses(angles, len(route)))
+        frames = max(1, round(seconds * fps))
+        route = orbit(capture, frames) if self.wanted.path == "orbit" else photo_film(capture, frames, seconds)
+        return cameras_along(route, lens, capture.up)
+
+    def stills(self) -> tuple[list[str], list[Camera]]:
+        """Names, and cameras in the model's frame: the photos' own, some around, or the keyframes."""
+        if self.keyframes is not None:
+            route = self.keyframes.route
+            cameras = self._from_world(route, self._lenses(self.keyframes.angles_deg, len(route)))
+        elif self.wanted.path == "orbit":
+            capture = self.scene.capture
+            cameras = cameras_along(orbit(capture, ORBIT_STILLS), self.scene.lens(self.size), capture.up)
+        else:
+            cameras = [camera.scaled(*self.size) if self.size else camera for camera in self.scene.cameras]
+        return flat_stems([camera.name for camera in cameras]), cameras
+
+    def _lenses(self, angles_deg: np.ndarray | None, count: int) -> list[Lens]:
+        lens = self.scene.lens(self.size)
+        if angles_deg is None:
+            return [lens] * count
+        return [Lens.of_angle(lens.width, lens.height, float(angle)) for angle in angles_deg]
+
+    def _from_world(self, route: Route, lenses: Sequence[Lens]) -> list[Camera]:
+        """A way in the world of `splat.ply` as cameras in the model's frame."""
+        similarity = self.world_from_model
+        cameras = []
+        for camera in cameras_along(route, lenses, UP):
+            pose = np.eye(4)
+            pose[:3, :3] = camera.cam_from_world[:3, :3] @ similarity.rotation
+            offset = camera.cam_from_world[:3, :3] @ similarity.translation + camera.cam_from_world[:3, 3]
+            pose[:3, 3] = offset / similarity.scale
+            cameras.append(replace(camera, cam_from_world=pose))
+        return cameras
+
+
+def render_run(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
+    """Render a run that has been trained.
+
+    Args:
+        out: Its OUT.
+        wanted: What.
+        threads: Of the rasterizer, at least 1.
+
+    Returns:
+        What was written.
+
+    Raises:
+        SplatpipeError: if there is nothing to render, or the wish makes no sense.
+    """
+    what, size = wanted.checked()
+    keyframes = None if wanted.path in OWN_PATHS else read_keyframes(_file(wanted.path))
+    parts = _parts(out)
+    target = wanted.target(out)
+    console, began = RunConsole(), time.monotonic()
+    console(Event("stage_started", "render", {"reason": f"{what} along {wanted.path}"}))
+    try:
+        with same_bits(threads):
+            similarity = load_frame(parts["georef.frame"]).world_from_model
+            shot = Shot(open_scene(parts, threads), similarity, wanted, keyframes, size)
+            told = _shoot(shot, what, target, EventReporter("render", console))
+    finally:
+        console.close()
+    console(Event("stage_finished", "render", {"seconds": time.monotonic() - began, "summary": told}))
+    return told
+
+
+def _shoot(shot: Shot, what: What, target: Path, report: Reporter) -> dict[str, Any]:
+    pictures = Pictures(shot.scene, what, shot.world_from_model.rotation, shot.world_from_model.scale)
+    if not shot.wanted.stills:
+        cameras = shot.film()
+        pictures = replace(pictures, depths=depth_range(pictures, cameras))
+        write_film(FilmFile(target, shot.wanted.fps), cameras, pictures.pixels, report)
+    else:
+        names, cameras = shot.stills()
+        pictures = replace(pictures, depths=depth_range(pictures, cameras))
+        for done, (name, camera) in enumerate(zip(names, cameras, strict=True), start=1):
+            write_still(target / name, pictures, camera)
+            report.progress(done, len(cameras), "rendering", "pictures")
+    told = {"pictures": len(cameras), "width": cameras[0].width, "height": cameras[0].height, "file": str(target)}
+    return told if what != "depth" else told | {"nearest": pictures.depths[0], "farthest": pictures.depths[1]}
+
+
+def write_still(stem: Path, pictures: Pictures, camera: Camera) -> None:
+    """Write a picture as PNG, and depths or normals as they are as TIFF beside it, float32.
+
+    Args:
+        stem: Without the ending.
+        pictures: Makes it.
+        camera: Its camera.
+
+    Raises:
+        MachineError: if it cannot be written.
+    """
+    values = pictures.values(camera)
+    pixels = pictures.pixels(camera, values)
+    try:
+        _write(stem.with_name(f"{stem.name}.png"), pixels[:, :, ::-1])
+        if values is not None:
+            _write(stem.with_name(f"{stem.name}.tif"), values if values.ndim == 2 else values[:, :, ::-1])
+    except OSError as error:
+        raise MachineError(f"Cannot write {stem}: {error.strerror}.", hint="Check the free space.") from error
+
+
+def _write(path: Path, array: np.ndarray) -> None:
+    done, data = cv2.imencode(path.suffix, np.ascontiguousarray(array))
+    assert done, path
+    path.write_bytes(data.tobytes())
+
+
+def _file(path: str) -> Path:
+    file = Path(path).expanduser()
+    if not file.is_file():
+        raise UsageError(f"There is no file {path[:200]}.", hint="--path is cameras, orbit, or a file of keyframes.")
+    return file
+
+
+def _parts(out: Path) -> dict[str, Path]:
+    """The parts that OUT's splat was made of; of the newest training where nothing was exported.
+
+    Raises:
+        UsageError: if training is not done.
+    """
+    store = open_store(out, create=False)
+    made = delivered(store, EXPORT) or delivered(store, TRAIN)
+    found = {} if made is None else {name: part.path for name, part in lineage(store, made).items()}
+    missing = [name for name in READ if name not in found]
+    if missing:
+        raise UsageError(
+            f"{out} has no trained splat: {missing[0]} is not there.",
+            hint=f"Train one first: splatpipe run PHOTOS {out}",
+        )
+    return found

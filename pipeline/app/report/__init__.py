@@ -1,0 +1,101 @@
+"""The report of a run: one page for the client, built from the events and the manifests.
+
+`write_report` makes it here; `make_report` in a process of its own, as the commands do: a fault or a crash in it can
+neither spoil a good run nor hold one up that is to end, and the command does not pay for its libraries.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO
+
+from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
+from splatpipe.pipeline.engine.errors import MachineError
+
+REPORT_FILE = "report.html"
+PATIENCE_S = 600.0  # far more than hundreds of photos take
+LEAST_S = 2.0  # where the time is over at once: enough for the report without pictures, also on a busy machine
+POLL_S = 0.02
+
+
+def write_report(out: Path, *, drawn: bool = True) -> Path:
+    """Write OUT/report.html, whole or not at all.
+
+    Args:
+        out: The run's folder; the run may be finished, stopped, failed, or go on.
+        drawn: With charts and pictures.
+
+    Returns:
+        Its path.
+
+    Raises:
+        OSError: if it cannot be written.
+        MachineError: if this installation lacks the page's script or style.
+    """
+    from splatpipe.pipeline.app.report.holdings import open_holdings
+    from splatpipe.pipeline.app.report.page import report_page
+
+    path = out / REPORT_FILE
+    write_durably(path, report_page(open_holdings(out), drawn=drawn))
+    return path
+
+
+def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
+    """Have OUT/report.html written by a process of its own.
+
+    Args:
+        out: The run's folder.
+        log: Takes what it says if something is wrong.
+        until_s: ``time.monotonic()`` by which it has to be over: then a page without pictures comes first, which
+            stays if the time does not suffice for the other. None: there is time.
+
+    Returns:
+        Its path.
+
+    Raises:
+        MachineError: if it could not be written.
+    """
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.report", str(out)]
+    command += [] if until_s is None else ["--hurry"]
+    path = out / REPORT_FILE
+    before = _stamp(path)
+    began_s = time.monotonic()
+    end_s = began_s + PATIENCE_S if until_s is None else until_s
+
+    def over() -> bool:
+        now_s = time.monotonic()
+        return now_s > end_s and (_stamp(path) != before or now_s > began_s + LEAST_S)
+
+    try:
+        with log.open("a", encoding="utf-8") as said:
+            code = _run(command, said, over)
+    except OSError as error:
+        raise MachineError(f"The report could not be written: {error.strerror}.") from error
+    finally:
+        remove_unfinished(out, REPORT_FILE)
+    if _stamp(path) == before or (code != 0 and until_s is None):
+        raise MachineError("The report could not be written.", hint=f"{log} ends with the reason.")
+    return path
+
+
+def _run(command: Sequence[str], said: IO[str], over: Callable[[], bool]) -> int:
+    """Run a process to its end, or until its time is over; its exit code. Whatever interrupts the wait ends it, too."""
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+    try:
+        while process.poll() is None and not over():
+            time.sleep(POLL_S)
+    finally:
+        process.kill()
+    return process.wait()
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        told = path.stat()
+    except OSError:
+        return None
+    return told.st_mtime_ns, told.st_ino

@@ -1,0 +1,246 @@
+"""The report's chapters on the photos: what was captured and left out, and how the cameras were found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.wording import count, length, number, share
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.app.report.geometry import Geometry
+
+Chapter = dict[str, Any]
+MOST_LISTED = 200  # rows of a table of photos
+LEAST_POINTS = 100  # observed by a photo that is placed well
+
+
+def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: bool) -> Chapter:
+    """What was captured: photos, cameras, positions, map, overlap, and what was left out and why.
+
+    Args:
+        holdings: What there is.
+        geometry: Of the model, if there is one.
+        drawn: Whether to draw maps.
+    """
+    summary = holdings.summary("ingest")
+    photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
+    left_out = holdings.read("ingest.left_out").get("left_out", [])
+    positions = holdings.read("ingest.positions").get("positions", [])
+    times = sorted(str(photo["time"]) for photo in photos if photo.get("time"))
+    facts = [
+        ("Photos", f"{count(summary.get('photos'))} used, {count(summary.get('left_out'))} left out"),
+        ("Pixels", f"{number(summary.get('megapixels'), 1)} megapixels in all"),
+        ("Taken", _span(times)),
+        ("Positions", _positions(summary, positions)),
+        ("Masks", _masks(summary)),
+    ]
+    cameras = holdings.read("ingest.cameras").get("cameras", [])
+    told = summary.get("camera_groups") or [{}] * len(cameras)
+    chapter: Chapter = {
+        "facts": [fact for fact in facts if fact[1]],
+        "cameras": [_camera(camera, row) for camera, row in zip(cameras, told, strict=False)],
+        "left_out": left_out[:MOST_LISTED],
+        "left_out_more": max(0, len(left_out) - MOST_LISTED),
+    }
+    if geometry is not None:
+        chapter |= _mapped(holdings, geometry)
+    elif drawn and len(positions) > 1:
+        from splatpipe.pipeline.app.report.charts import stated_map
+
+        places = [(float(position["latitude"]), float(position["longitude"])) for position in positions]
+        text = "Where the photos say that they were taken, joined in name order. Whereto they look is not known yet."
+        chapter["maps"] = [{"svg": stated_map(places), "text": text}]
+    return chapter
+
+
+def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter:
+    """How the cameras were found: matches, tracks, reprojection errors, calibration."""
+    sparse, matches, features = (holdings.summary(name) for name in ("sparse", "matches", "features"))
+    models = holdings.read("sparse.summary")
+    facts = [
+        ("Photos placed", f"{count(sparse.get('registered'))} of {count(sparse.get('photos'))}"),
+        ("Keypoints", f"{count(features.get('keypoints'))}, {count(features.get('keypoints_per_photo'))} a photo"),
+        ("Pairs", f"{count(matches.get('verified'))} verified of {count(matches.get('pairs'))} tried"),
+        ("Matches a pair", f"{count(matches.get('median_inliers'))} (median)"),
+        ("Pairs chosen", str(matches.get("pairing", ""))),
+        ("Sparse points", count(sparse.get("points3d"))),
+        ("Track length", f"{number(sparse.get('mean_track_length'), 1)} photos a point on average"),
+        ("Reprojection error", f"{number(sparse.get('mean_reprojection_error_px'), 2)} pixels on average"),
+    ]
+    if not sparse:  # the stage failed or was never reached
+        facts = [fact for fact in facts if "–" not in fact[1] and fact[1]]
+    unregistered = [str(name) for name in models.get("unregistered", [])]
+    lenses = {row["camera"]: row for row in models.get("lenses", [])}
+    chapter: Chapter = {
+        "facts": facts,
+        "unregistered": unregistered[:MOST_LISTED],
+        "unregistered_more": max(0, len(unregistered) - MOST_LISTED),
+        "other_models": models.get("other_models", []),
+        "cameras": [_calibrated(camera, lenses.get(camera.get("id"), {})) for camera in sparse.get("cameras", [])],
+        "tried": [_tried(row) for row in sparse.get("tried", [])],
+        "rungs": [_rung(row) for row in sparse.get("ladder", [])],
+    }
+    if geometry is not None:
+        chapter |= _registration_charts(holdings, geometry)
+    return chapter
+
+
+def unit_of(holdings: Holdings) -> str:
+    """``m`` where the model has a scale, else nothing."""
+    return "m" if holdings.read("georef.frame").get("kind") == "enu" else ""
+
+
+def held_out(holdings: Holdings) -> list[str]:
+    """Names of the photos that training never saw, as far as it is known."""
+    plan = holdings.read("train.plan") or holdings.read_unfinished("train", "plan.json")
+    return [str(name) for name in plan.get("test_views", [])]
+
+
+def _mapped(holdings: Holdings, geometry: Geometry) -> Chapter:
+    from splatpipe.pipeline.app.report.charts import overlap_map, survey_map
+
+    unit, shares = unit_of(holdings), geometry.overlap.shares
+    gsd = holdings.read("georef.accuracy").get("gsd_m")
+    heights = sorted(float(height) for height in geometry.taken.centres[:, 2] - geometry.ground)
+    west, east, south, north = geometry.box
+    facts = [
+        (
+            "Overlap",
+            f"{share(shares[3])} of the places with sparse points lie in 3 photos or more, {share(shares[5])} in 5",
+        ),
+        ("A point is found in", f"{float(geometry.tracks.mean()):.1f} photos on average"),
+    ]
+    if unit:
+        facts = [
+            ("Ground sample distance", f"{length(gsd)} a pixel"),
+            (
+                "Height above ground",
+                f"{heights[0]:.1f} to {heights[-1]:.1f} m, median {heights[len(heights) // 2]:.1f} m",
+            ),
+            ("Mapped area", f"{east - west:,.0f} m × {north - south:,.0f} m"),
+            *facts,
+        ]
+    maps = [
+        {
+            "svg": survey_map(geometry, unit, held_out(holdings)),
+            "text": "Where the photos were taken, whereto they look, and the ground that each shows (footprint), up to "
+            "where its points end; that walls and trees are in the way is not counted.",
+        },
+        {"svg": overlap_map(geometry.overlap, unit), "text": "In how many of these footprints each place lies."},
+    ]
+    return {"map_facts": facts, "maps": maps}
+
+
+def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
+    from splatpipe.pipeline.app.report import charts
+
+    found = holdings.read("matches.pairs")
+    pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])]
+    drawn = [
+        (charts.observations_bars(geometry), f"Photos with fewer than {LEAST_POINTS} points (red) are placed poorly."),
+        (
+            charts.track_histogram(geometry),
+            "Points of two photos only (orange) prove little; longer tracks hold the model.",
+        ),
+        (charts.error_histogram(geometry), "How far the points miss their pixels."),
+    ]
+    for number_of, field in enumerate(geometry.fields[:4], start=1):
+        text = "Mean residuals over the picture, much enlarged: a pattern would tell that the lens model does not fit."
+        drawn.append((charts.residual_field(field, number_of), text))
+    if pairs:
+        drawn.append((charts.match_map(geometry, pairs, unit_of(holdings)), "Which photos were matched with which."))
+    return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
+
+
+def _camera(camera: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, str]:
+    make, model = str(camera.get("make") or ""), str(camera.get("model_name") or "")
+    name = (model if model.casefold().startswith(make.casefold()) else f"{make} {model}").strip() or "unknown camera"
+    known = str(camera.get("focal_source", "")).replace("-", " ")
+    focal = f"{number(camera.get('focal_px'), 1)} px" + (f" ({known})" if known else "")
+    size = f"{count(camera.get('width'))} × {count(camera.get('height'))}"
+    if told.get("exif_size"):
+        size += " ({} from {} × {})".format(
+            "cropped" if told.get("cropped") else "reduced", *map(count, told["exif_size"])
+        )
+    return {"name": name, "photos": count(camera.get("photos")), "size": size, "focal": focal}
+
+
+def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str, str]:
+    """A camera's lens as it was found, and what of it was freed."""
+    prior, focal = camera.get("prior_focal_px"), camera.get("focal_px")
+    change = (focal / prior - 1.0) if camera.get("has_prior") and prior and focal else math.nan
+    told = f"{change:+.2%}".replace("%", " %") if math.isfinite(change) else "–"
+    stated = f"{number(prior, 1)} px" if camera.get("has_prior") else "not stated"
+    model = str(camera.get("model", ""))
+    if lens.get("freed"):
+        model += f" ({', '.join(str(name) for name in lens['freed'])})"
+    source = str(camera.get("focal_source") or "").replace("-", " ") if camera.get("has_prior") else ""
+    photos = f"{count(camera.get('placed'))} of {count(camera.get('photos'))}"
+    return {
+        "name": str(camera.get("name") or "unknown camera"),
+        "photos": photos,
+        "model": model,
+        "prior": stated + (f" ({source})" if source else ""),
+        "focal": f"{number(focal, 1)} px",
+        "change": told,
+        "error": f"{number(camera.get('error_px'), 2)} px",
+    }
+
+
+def _tried(row: Mapping[str, Any]) -> dict[str, str]:
+    """A way of mapping that was tried; figures that it has not are dashes."""
+    against, pairs = row.get("contradicted") or (None, None)
+    return {
+        "how": str(row.get("how", row.get("mapper", ""))),
+        "placed": count(row.get("placed")),
+        "points": count(row.get("points3d")),
+        "error": number(row.get("error_px"), 2),
+        "focal": ", ".join(number(focal, 0) for focal in row.get("focal_px", [])) or "–",
+        "explained": share(row["explained"], 1) if "explained" in row else "–",
+        "held_out": share(row["held_out"], 1) if "held_out" in row else "–",
+        "against": "–" if against is None else f"{count(against)} of {count(pairs)}",
+        "cpu": number(row.get("cpu_s"), 1),
+        "taken": "taken" if row.get("chosen") else "",
+        "why": str(row.get("why", "")),
+    }
+
+
+def _rung(row: Mapping[str, Any]) -> dict[str, str]:
+    """A rung of the ladder for photos that were left."""
+    return {
+        "rung": str(row.get("rung", "")).replace("_", " "),
+        "left": count(row.get("left")),
+        "placed": count(row.get("placed")),
+        "pairs": count(row.get("verified_pairs_added")),
+        "keypoints": count(row.get("keypoints_added")),
+        "cpu": number(row.get("cpu_s"), 1),
+    }
+
+
+def _masks(summary: Mapping[str, Any]) -> str:
+    kinds = [(summary.get("masks"), "of what to ignore"), (summary.get("sky_masks"), "of the sky")]
+    return ", ".join(f"{count(number_of)} {what}" for number_of, what in kinds if number_of) or "none"
+
+
+def _span(times: Sequence[str]) -> str:
+    if not times:
+        return "no times in the photos"
+    first, last = times[0].replace("T", " "), times[-1].replace("T", " ")
+    return first if first == last else f"{first} to {last} (camera's clock)"
+
+
+def _positions(summary: Mapping[str, Any], positions: Sequence[Mapping[str, Any]]) -> str:
+    if not positions:
+        return "none of the photos has one"
+    told = f"{len(positions):,} photos"
+    sources = ", ".join(str(source) for source in summary.get("position_sources", []))
+    told += f", from {sources}" if sources else ""
+    flights = summary.get("flights")
+    told += f", {count(flights)} flights" if isinstance(flights, int) and flights > 1 else ""
+    horizontal, vertical = summary.get("sigma_horizontal_m"), summary.get("sigma_vertical_m")
+    if horizontal is not None:
+        told += f"; taken to be good to {length(horizontal)} horizontally, {length(vertical)} in height"
+    return told

@@ -1,0 +1,274 @@
+"""The report's charts: maps, registration, training, held-out photos, time. Each is an SVG element."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import BoundaryNorm, ListedColormap
+
+from splatpipe.pipeline.app.report.drawing import (
+    BLUE,
+    FAINT,
+    GREEN,
+    GREY,
+    HEIGHT,
+    INK,
+    LINE,
+    ORANGE,
+    RED,
+    WIDTH,
+    as_map,
+    map_size,
+    new_figure,
+    to_svg,
+)
+from splatpipe.pipeline.app.report.geometry import Field, Geometry, Overlap
+
+POINTS_DRAWN = 20_000  # of a cloud: more add nothing at this size
+PAIRS_DRAWN = 3_000  # lines, the strongest
+OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # from so many photos on a colour of its own
+OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa564", "#1a6b3c")
+ARROW_SHARE = 0.12  # of the map's width, that the longest residual is drawn as
+SQUASHED = 4.0  # times the iterations reached: a planned end further off leaves no room for the curve
+METRES_A_DEGREE = 111_195.0  # of a sphere: enough to draw by
+MOST_NAMES = 30  # points with their names on a map
+Residual = tuple[str, Sequence[float], Sequence[float]]  # name; place and residual: east, north, up, metres
+
+
+def survey_map(geometry: Geometry, unit: str, held_out: Sequence[str]) -> Markup:
+    """Where the photos were taken, whereto they look and what ground they show, over the sparse points."""
+    taken, box = geometry.taken, _with_cameras(geometry)
+    figure, axes = new_figure(*map_size(box))
+    _draw_points(axes, geometry)
+    faint = min(0.03, 0.6 / len(taken.names))
+    outlines = PolyCollection(list(taken.footprints), facecolor=(*_rgb(BLUE), faint), edgecolor=(*_rgb(BLUE), 0.18))
+    outlines.set_linewidth(0.5)
+    axes.add_collection(outlines)
+    out = np.isin(np.array(taken.names, dtype=object), list(held_out))
+    span = 0.035 * max(box[1] - box[0], box[3] - box[2])
+    heads = taken.centres[:, :2] + span * taken.axes[:, :2]
+    lines = list(np.stack([taken.centres[:, :2], heads], axis=1))
+    axes.add_collection(LineCollection(lines, colors=INK, linewidths=0.7))
+    for chosen, colour, label in ((~out, BLUE, "photo"), (out, ORANGE, "held-out photo")):
+        if chosen.any():
+            axes.plot(*taken.centres[chosen, :2].T, "o", ms=4, mfc=colour, mec="white", mew=0.5, label=label)
+    axes.legend(loc="upper right", fontsize=8)
+    as_map(axes, box, unit)
+    return to_svg(figure, "Map of the photos' positions, viewing directions and footprints")
+
+
+def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
+    """Where the photos say that they were taken: all there is before the cameras are found.
+
+    Args:
+        places: Latitude and longitude, degrees.
+    """
+    degrees = np.array(places, np.float64)
+    north = METRES_A_DEGREE * (degrees[:, 0] - degrees[:, 0].mean())
+    east = METRES_A_DEGREE * math.cos(math.radians(degrees[0, 0])) * (degrees[:, 1] - degrees[:, 1].mean())
+    box = _about(np.stack([east, north], axis=1))
+    figure, axes = new_figure(*map_size(box))
+    axes.plot(east, north, "o-", ms=4, mfc=BLUE, mec="white", mew=0.5, color=LINE, lw=0.8)
+    as_map(axes, box, "m")
+    return to_svg(figure, "Map of where the photos say that they were taken")
+
+
+def overlap_map(overlap: Overlap, unit: str) -> Markup:
+    """How many footprints cover each place."""
+    figure, axes = new_figure(*map_size(overlap.box), right=1.15)
+    norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
+    shown = np.ma.masked_equal(overlap.counts, 0)
+    axes.imshow(
+        shown, extent=overlap.box, cmap=ListedColormap(OVERLAP_COLOURS), norm=norm, interpolation="nearest", zorder=1
+    )
+    labels = ["1", "2", "3", "4", "5–6", "7–9", "10 or more"]
+    for colour, label in zip(OVERLAP_COLOURS, labels, strict=True):
+        axes.plot([], [], "s", ms=7, color=colour, label=label)
+    axes.legend(title="photos", loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+    as_map(axes, overlap.box, unit)
+    return to_svg(figure, "Map of how many photos show each place")
+
+
+def match_map(geometry: Geometry, pairs: Sequence[tuple[str, str, int]], unit: str) -> Markup:
+    """The verified pairs as lines between the photos, darker with more matches."""
+    box = _about(geometry.taken.centres[:, :2])
+    figure, axes = new_figure(*map_size(box))
+    places = dict(zip(geometry.taken.names, geometry.taken.centres[:, :2], strict=True))
+    known = [pair for pair in pairs if pair[0] in places and pair[1] in places]
+    strongest = sorted(known, key=lambda pair: -pair[2])[:PAIRS_DRAWN][::-1]
+    lines = LineCollection([(places[a], places[b]) for a, b, _ in strongest], cmap="Blues", linewidths=0.9)
+    lines.set_array(np.log10([max(1, pair[2]) for pair in strongest]))
+    lines.set_clim(0.5, 3.0)
+    axes.add_collection(lines)
+    axes.plot(*geometry.taken.centres[:, :2].T, "o", ms=3.5, color=INK)
+    for matches in (10, 100, 1000):
+        colour = lines.cmap(lines.norm(np.log10(matches)))
+        axes.plot([], [], "-", color=colour, lw=2.5, label=f"{matches:,} matches")
+    axes.legend(loc="upper right", fontsize=8)
+    as_map(axes, box, unit)
+    return to_svg(figure, "Map of the pairs of photos that were matched")
+
+
+def observations_bars(geometry: Geometry) -> Markup:
+    """Sparse points that each photo observes, in name order."""
+    figure, axes = new_figure(WIDTH, 2.6)
+    counts = geometry.taken.points
+    axes.bar(np.arange(len(counts)) + 1, counts, width=0.85, color=np.where(counts < 100, RED, BLUE))
+    axes.axhline(float(np.median(counts)), color=FAINT, lw=0.8, ls="--")
+    axes.set_xlabel("photo, in name order")
+    axes.set_ylabel("sparse points observed")
+    return to_svg(figure, "Sparse points that each photo observes")
+
+
+def track_histogram(geometry: Geometry) -> Markup:
+    """In how many photos the sparse points were found."""
+    figure, axes = new_figure(WIDTH, 2.6)
+    longest = int(np.clip(geometry.tracks.max(), 3, 20))
+    lengths = np.clip(geometry.tracks, 2, longest)
+    values, counts = np.unique(lengths, return_counts=True)
+    axes.bar(values, counts, width=0.8, color=np.where(values < 3, ORANGE, BLUE))
+    ticks = list(range(2, longest + 1, 1 if longest <= 12 else 2))
+    more = int(geometry.tracks.max()) > longest
+    axes.set_xticks(ticks, [f"{tick}{'+' if more and tick == longest else ''}" for tick in ticks])
+    axes.set_xlabel("photos in which a point was found")
+    axes.set_ylabel("sparse points")
+    return to_svg(figure, "Track lengths of the sparse points")
+
+
+def error_histogram(geometry: Geometry) -> Markup:
+    """Mean reprojection errors of the sparse points."""
+    figure, axes = new_figure()
+    errors = geometry.errors_px[np.isfinite(geometry.errors_px)]
+    top = float(np.percentile(errors, 99.5)) if len(errors) else 1.0
+    axes.hist(np.clip(errors, 0.0, top), bins=48, range=(0.0, max(top, 1e-6)), color=BLUE)
+    if len(errors):
+        axes.axvline(float(errors.mean()), color=ORANGE, lw=1.4, label=f"mean {errors.mean():.2f} px")
+        axes.legend(fontsize=8)
+    axes.set_xlabel("mean reprojection error of a point (pixels)")
+    axes.set_ylabel("sparse points")
+    return to_svg(figure, "Reprojection errors of the sparse points")
+
+
+def residual_field(field: Field, camera: int) -> Markup:
+    """Mean residuals over the picture: a pattern tells that the lens model does not fit."""
+    width, height = field.size
+    figure, axes = new_figure(*map_size((0.0, float(width), 0.0, float(height))))
+    largest = float(np.linalg.norm(field.residuals, axis=1).max())
+    scale = max(largest, 1e-6) * 14.0 / width
+    axes.quiver(
+        *field.places.T, *field.residuals.T, angles="xy", scale_units="xy", scale=scale, color=BLUE, width=0.004
+    )
+    axes.set_xlim(0, width)
+    axes.set_ylim(height, 0)
+    axes.set_aspect("equal")
+    axes.set_title(f"longest arrow: {largest:.2f} pixels", fontsize=9, color=FAINT, loc="left")
+    axes.set_xlabel("x in the picture (pixels)")
+    axes.set_ylabel("y (pixels)")
+    return to_svg(figure, f"Mean residuals over the pictures of camera {camera}")
+
+
+def residual_map(geometry: Geometry, groups: Mapping[str, Sequence[Residual]]) -> Markup:
+    """Residuals as arrows on the map, far longer than they are.
+
+    Args:
+        geometry: Of the scene.
+        groups: Of points or photos, by kind.
+    """
+    every = [entry for entries in groups.values() for entry in entries]
+    box = _about(np.array([entry[1][:2] for entry in every], np.float64))
+    figure, axes = new_figure(*map_size(box))
+    _draw_points(axes, geometry)
+    longest = max(math.hypot(*entry[2][:2]) for entry in every)
+    scale = max(longest, 1e-9) / (ARROW_SHARE * (box[1] - box[0]))
+    colours = {"control": BLUE, "check": ORANGE, "left out": RED, "photo": GREY}
+    for kind, entries in groups.items():
+        place = np.array([entry[1][:2] for entry in entries], np.float64)
+        residual = np.array([entry[2][:2] for entry in entries], np.float64)
+        colour = colours.get(kind, GREEN)
+        axes.plot(*place.T, "o", ms=3.5, color=colour, label=kind)
+        axes.quiver(*place.T, *residual.T, angles="xy", scale_units="xy", scale=scale, color=colour, width=0.004)
+        if kind != "photo" and len(entries) <= MOST_NAMES:
+            for (name, _, _), (x, y) in zip(entries, place, strict=True):
+                axes.annotate(name[:16], (x, y), xytext=(3, 3), textcoords="offset points", fontsize=7, color=INK)
+    axes.set_title(
+        f"arrows {1 / scale:,.0f} times as long; the longest is {longest:.3f} m", fontsize=9, color=FAINT, loc="left"
+    )
+    axes.legend(loc="upper right", fontsize=8)
+    as_map(axes, box, "m")
+    return to_svg(figure, f"Residuals on the map: {', '.join(groups)}")
+
+
+def training_curve(name: str, curve: Mapping[float, float], planned: float | None, log: bool) -> Markup:
+    """A figure over the iterations, with the planned end where it was not reached."""
+    figure, axes = new_figure(WIDTH, 2.8)
+    steps = sorted(curve)
+    axes.plot(steps, [curve[step] for step in steps], color=BLUE, lw=1.2)
+    if log and min(curve.values()) > 0.0:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
+    if planned and SQUASHED * steps[-1] >= planned > steps[-1]:
+        axes.axvline(planned, color=ORANGE, lw=1.0, ls="--", label=f"planned end: {planned:,.0f}")
+        axes.legend(fontsize=8)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel(name)
+    return to_svg(figure, f"Training: {name}")
+
+
+def view_bars(views: Sequence[tuple[str, float]], unit: str) -> Markup:
+    """A measure of each held-out photo, the worst first."""
+    figure, axes = new_figure(WIDTH, 2.6)
+    values = [value for _, value in views]
+    axes.bar(np.arange(len(values)) + 1, values, width=0.8, color=BLUE)
+    axes.axhline(float(np.mean(values)), color=ORANGE, lw=1.2, label=f"mean {np.mean(values):.2f} {unit}")
+    axes.set_ylim(max(0.0, min(values) - 5.0), max(values) + 4.0)
+    axes.set_xlabel("held-out photo, the worst first")
+    axes.set_ylabel(f"PSNR ({unit})")
+    axes.legend(fontsize=8, loc="upper left")
+    return to_svg(figure, "PSNR of the held-out photos")
+
+
+def stage_bars(rows: Sequence[tuple[str, float]], label: str, title: str) -> Markup:
+    """A figure a stage, as bars to the right."""
+    figure, axes = new_figure(WIDTH, HEIGHT * max(0.4, len(rows) / 11))
+    names, values = [name for name, _ in rows][::-1], [value for _, value in rows][::-1]
+    axes.barh(names, values, color=BLUE, height=0.7)
+    axes.set_xlabel(label)
+    axes.grid(visible=False, axis="y")
+    return to_svg(figure, title)
+
+
+def _draw_points(axes: Axes, geometry: Geometry) -> None:
+    chosen = np.linspace(0, len(geometry.points) - 1, min(POINTS_DRAWN, len(geometry.points))).astype(int)
+    colours = geometry.colours[chosen] / 255.0
+    east, north = geometry.points[chosen, :2].T
+    axes.scatter(east, north, s=0.6, c=colours, linewidths=0, rasterized=True, zorder=0)
+
+
+def _with_cameras(geometry: Geometry) -> tuple[float, float, float, float]:
+    west, east, south, north = geometry.box
+    low, high = geometry.taken.centres[:, :2].min(axis=0), geometry.taken.centres[:, :2].max(axis=0)
+    margin = 0.06 * float(max(high - low))
+    return (
+        min(west, float(low[0]) - margin),
+        max(east, float(high[0]) + margin),
+        min(south, float(low[1]) - margin),
+        max(north, float(high[1]) + margin),
+    )
+
+
+def _about(places: Float64[np.ndarray, "n 2"]) -> tuple[float, float, float, float]:
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = 0.15 * float(max(high - low)) + 1e-6
+    return float(low[0]) - margin, float(high[0]) + margin, float(low[1]) - margin, float(high[1]) + margin
+
+
+def _rgb(colour: str) -> tuple[float, float, float]:
+    return int(colour[1:3], 16) / 255.0, int(colour[3:5], 16) / 255.0, int(colour[5:7], 16) / 255.0

@@ -1,0 +1,174 @@
+"""The report's chapters on training and on the photos that it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.wording import count, duration, number, share, size
+
+Chapter = dict[str, Any]
+MEASURES = {  # of a held-out photo: title, digits, which way is better
+    "psnr": ("PSNR (dB)", 2),
+    "psnr_cc": ("after colour fit (dB)", 2),
+    "ssim": ("SSIM", 3),
+    "ms_ssim": ("MS-SSIM", 3),
+    "gmsd": ("GMSD", 3),
+    "sharpness": ("sharpness", 3),
+}
+MOST_ROWS = 200  # of the table of held-out photos
+
+
+def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
+    """The plan, what came of it, and the curves; None where training was not reached.
+
+    Args:
+        holdings: What there is.
+        drawn: Whether to draw charts.
+    """
+    story = holdings.story.stages.get("train")
+    if "train" not in holdings.artifacts and (story is None or story.state == "not reached"):
+        return None
+    summary, history = holdings.summary("train"), holdings.read("train.history")
+    plan = holdings.read("train.plan") or holdings.read_unfinished("train", "plan.json")
+    told = {} if story is None else dict(story.told.progress)
+    planned = summary.get("planned_iterations") or plan.get("last_iteration") or told.get("total")
+    reached = summary.get("iterations") or (None if story is None else story.reached)
+    curves = _curves(holdings, history)
+    gaussians = summary.get("gaussians") or _last(curves.get("gaussians", {}))
+    options = plan.get("options") or {}
+    facts = [
+        ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
+        ("Gaussians", f"{count(gaussians)}, {count(plan.get('initial_gaussians'))} at the beginning"),
+        (
+            "Size of the photos",
+            f"{number(summary.get('train_megapixels') or plan.get('train_megapixels'), 2)} megapixels",
+        ),
+        ("Photos", f"{len(plan.get('train_views', []))} trained on, {len(plan.get('test_views', []))} held out"),
+        ("Last loss", number(summary.get("loss") or _last(curves.get("loss", {})), 4)),
+        ("Time", duration(summary.get("train_seconds") or (story.seconds if story else None))),
+        ("Memory", size(summary.get("peak_memory_bytes") or (story.memory_bytes if story else None))),
+        ("Device", " ".join(str(summary[name]) for name in ("device", "instruction_set") if summary.get(name))),
+        ("Seed", str(options.get("seed", _seed(holdings)))),
+    ]
+    if not plan:
+        facts = [fact for fact in facts if fact[0] != "Photos"]
+    chapter: Chapter = {
+        "facts": [fact for fact in facts if fact[1] and not fact[1].startswith("–")],
+        "finished": "train" in holdings.artifacts,
+        "plan": sorted((str(name), str(value)) for name, value in options.items()),
+        "charts": [],
+    }
+    if drawn:
+        chapter["charts"] = _curve_charts(curves, None if planned is None else float(planned))
+    return chapter
+
+
+def views_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
+    """The held-out photos, the worst first; None where evaluate did not finish."""
+    if "evaluate" not in holdings.artifacts:
+        return None
+    metrics = holdings.read("evaluate.metrics")
+    views = sorted(metrics["per_view"], key=lambda view: view["psnr"] if view.get("psnr") is not None else -1.0)
+    measures = [(name, *told) for name, told in MEASURES.items() if any(view.get(name) is not None for view in views)]
+    chapter: Chapter = {
+        "titles": [title for _, title, _ in measures],
+        "rows": [_row(view, measures) for view in views[:MOST_ROWS]],
+        "rows_more": max(0, len(views) - MOST_ROWS),
+        "mean": [number(metrics["mean"].get(name), digits) for name, _, digits in measures],
+        "count": len(views),
+        "floaters": _floaters(metrics.get("floaters") or {}),
+        "shown": [],
+        "charts": [],
+    }
+    if drawn and views:
+        chapter |= _views_drawn(holdings, views, measures)
+    return chapter
+
+
+def _views_drawn(
+    holdings: Holdings, views: Sequence[Mapping[str, Any]], measures: Sequence[tuple[str, str, int]]
+) -> Chapter:
+    from splatpipe.pipeline.app.report.charts import view_bars
+    from splatpipe.pipeline.app.report.pictures import chosen_views, view_pictures
+
+    folder = holdings.part("evaluate.views")
+    photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
+    turned = {str(photo["name"]): int(photo.get("orientation") or 1) for photo in photos}
+    shown = []
+    for view in chosen_views(views):
+        stem = str(view["file"])
+        pictures = None
+        if folder is not None and "/" not in stem and stem not in (".", ".."):
+            pictures = view_pictures(folder / stem, turned.get(str(view["name"]), 1))
+        if pictures is not None:
+            row = _row(view, measures)
+            figures = list(zip((title for _, title, _ in measures), row["values"], strict=True))
+            shown.append({"name": str(view["name"]), "pictures": pictures, "figures": figures})
+    bars = [(str(view["name"]), float(view["psnr"])) for view in views if view.get("psnr") is not None]
+    charts = [{"svg": view_bars(bars, "dB"), "text": "Every held-out photo, the worst first."}] if len(bars) > 1 else []
+    return {"shown": shown, "charts": charts}
+
+
+def _row(view: Mapping[str, Any], measures: Sequence[tuple[str, str, int]]) -> dict[str, Any]:
+    return {
+        "name": str(view["name"]),
+        "size": f"{count(view.get('width'))} × {count(view.get('height'))}",
+        "counted": share(view.get("counted")),
+        "values": [number(view.get(name), digits) for name, _, digits in measures],
+    }
+
+
+def _floaters(floaters: Mapping[str, Any]) -> list[tuple[str, str]]:
+    depth = floaters.get("depth_disagreement") or {}
+    return [
+        ("Opacity in the air", f"{share(floaters.get('free_space_opacity'), 3)} of all"),
+        ("Share of the views", f"{share(floaters.get('free_space_rendered'), 3)} of what they show hangs in the air"),
+        ("Depths of neighbouring views", f"differ by {share(depth.get('median'), 2)} (median)"),
+        ("Depths more than 5 % off", f"in {share(depth.get('share_above_5_percent'), 1)} of the pixels"),
+    ]
+
+
+def _curves(holdings: Holdings, history: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+    """Loss and Gaussians over the iterations: of the finished training, else as far as its events tell."""
+    points = history.get("curve") or []
+    if points:
+        names = ("loss", "gaussians")
+        return {
+            name: {float(p["iteration"]): float(p[name]) for p in points if p.get(name) is not None} for name in names
+        }
+    story = holdings.story.stages.get("train")
+    return {} if story is None else {name: dict(curve) for name, curve in story.told.metrics.items()}
+
+
+def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | None) -> list[dict[str, Any]]:
+    from splatpipe.pipeline.app.report.charts import training_curve
+
+    told = {
+        "loss": (
+            "loss (L1 + D-SSIM)",
+            True,
+            "The training photos' loss: it falls, and flattens where nothing is gained.",
+        ),
+        "gaussians": ("Gaussians", False, "How many Gaussians there were: density control adds and prunes them."),
+    }
+    charts = []
+    for name, (label, log, text) in told.items():
+        curve = {step: value for step, value in curves.get(name, {}).items() if value == value}
+        if len(curve) > 1:
+            charts.append({"svg": training_curve(label, curve, planned, log), "text": text})
+    return charts
+
+
+def _last(curve: Mapping[float, float]) -> float | None:
+    return curve[max(curve)] if curve else None
+
+
+def _why_earlier(summary: Mapping[str, Any]) -> str:
+    flat = summary.get("flat_at")
+    return f": the loss was flat after {count(flat)}" if flat else ""
+
+
+def _seed(holdings: Holdings) -> str:
+    return "" if holdings.config is None else str(holdings.config.train.seed)

@@ -1,0 +1,171 @@
+"""The report's last chapters: every stage with time and memory, versions, options, and the files that were made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import quote
+
+from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.wording import count, duration, moment, plural, size
+from splatpipe.stages.line import LINE
+
+Chapter = dict[str, Any]
+WHAT = {
+    "splat.ply": "the splat, for any viewer of Gaussian splats",
+    "splat.spz": "the splat, compressed, for viewer.html",
+    "viewer.html": "the splat to walk around and measure in, in any browser, offline",
+    "flythrough.webm": "a film through the scene",
+    "georef.json": "where the splat is: CRS, datum, matrices",
+    "cameras.json": "the cameras in the splat's frame",
+    "metrics.json": "every figure of this report, for programs",
+    "sparse.glb": "sparse points and cameras, for any 3D viewer",
+    "sky.ply": "the sky as a dome of Gaussians",
+}
+FIRST = ("viewer.html", "flythrough.webm", "splat.ply")  # what people want to open, so linked at the top, too
+FOLDERS = {
+    "undistort.dataset": "undistorted photos and cameras, as other trainers take them",
+    "evaluate.views": "held-out photos, renders and errors in full size",
+}
+RECORDS = {"config.toml": "all options", "events.jsonl": "what happened", "splatpipe.log": "what the libraries said"}
+
+
+def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
+    """How it was made: stages, machine, versions, seeds, options.
+
+    Args:
+        holdings: What there is.
+        drawn: Whether to draw charts.
+    """
+    rows = [_stage_row(holdings, stage.name) for stage in LINE]
+    rows = [row for row in rows if row["state"] != "not asked for" or row["made"]]
+    versions, machine = dict(holdings.story.versions), dict(holdings.story.machine)
+    for artifact in holdings.artifacts.values():
+        versions = versions or dict(artifact.manifest.get("versions", {}))
+        machine = machine or dict(artifact.manifest.get("machine", {}))
+    options = {} if holdings.config is None else holdings.config.model_dump(mode="json")
+    chapter: Chapter = {
+        "rows": rows,
+        "total": duration(sum(row["seconds"] or 0.0 for row in rows)),
+        "cpu_total": duration(sum(row["cpu_seconds"] or 0.0 for row in rows)),
+        "peak": size(max((row["memory"] or 0 for row in rows), default=0) or None),
+        "machine": _machine(machine),
+        "versions": sorted((str(name), str(value)) for name, value in versions.items()),
+        "otherwise": _made_otherwise(holdings, versions),
+        "seeds": [
+            (f"{name}.seed", str(section["seed"]))
+            for name, section in options.items()
+            if isinstance(section, Mapping) and "seed" in section
+        ],
+        "options": _options(options),
+        "charts": _charts(rows) if drawn else [],
+    }
+    return chapter
+
+
+def files_chapter(holdings: Holdings) -> Chapter:
+    """Links to what lies beside the report; what an earlier run left is told as that."""
+    files = [
+        {"href": quote(file.name), "name": file.name, "what": WHAT.get(file.name, ""), "size": size(file.size)}
+        | {"current": file.current}
+        for file in holdings.deliverables
+    ]
+    order = list(WHAT)
+    files.sort(key=lambda file: (not file["current"], order.index(file["name"]) if file["name"] in order else 99))
+    folders = []
+    for name, what in FOLDERS.items():
+        path = holdings.part(name)
+        if path is not None:
+            relative = path.relative_to(holdings.out).as_posix()
+            folders.append({"href": quote(relative) + "/", "name": relative, "what": what})
+    records = [
+        {"href": quote(name), "name": name, "what": what, "size": size((holdings.out / name).stat().st_size)}
+        for name, what in RECORDS.items()
+        if (holdings.out / name).is_file()
+    ]
+    found = {str(file["name"]): file for file in files if file["current"]}
+    first = [found[name] for name in FIRST if name in found]
+    return {
+        "first": first,
+        "files": files,
+        "folders": folders,
+        "records": records,
+        "stale": any(not file["current"] for file in files),
+    }
+
+
+def said_chapter(holdings: Holdings) -> Chapter:
+    """Warnings and notes of the run, stage by stage."""
+    stages = holdings.story.stages
+    warnings = [(name, *told) for name, stage in stages.items() for told in stage.told.warnings]
+    notes = [(name, told) for name, stage in stages.items() for told in stage.told.notes]
+    return {"warnings": warnings, "notes": notes}
+
+
+def _stage_row(holdings: Holdings, name: str) -> dict[str, Any]:
+    story, artifact = holdings.story.stages.get(name), holdings.artifacts.get(name)
+    manifest: Mapping[str, Any] = {} if artifact is None else artifact.manifest
+    state: str = "not asked for" if story is None else story.state
+    if story is None and artifact is not None:
+        state = "made before"
+    seconds = manifest.get("seconds", None if story is None else story.seconds)
+    memory = manifest.get("peak_memory_bytes", None if story is None else story.memory_bytes)
+    return {
+        "name": name,
+        "state": state,
+        "made": moment(manifest["finished_s"]) if manifest else "",
+        "reason": "" if story is None else story.reason,
+        "seconds": seconds,
+        "took": duration(seconds),
+        "cpu_seconds": manifest.get("cpu_seconds"),
+        "cpu": duration(manifest.get("cpu_seconds")),
+        "memory": memory,
+        "peak": size(memory),
+        "key": (str(manifest.get("key", "")) or ("" if story is None else story.key))[:16],
+    }
+
+
+def _made_otherwise(holdings: Holdings, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Stages that an earlier run made with other versions, and which."""
+    told = []
+    for name, artifact in holdings.artifacts.items():
+        other = artifact.manifest.get("versions", {})
+        differ = [f"{what} {value}" for what, value in other.items() if versions.get(what) != value]
+        if differ:
+            told.append((name, ", ".join(differ)))
+    return told
+
+
+def _machine(machine: Mapping[str, Any]) -> str:
+    told = [str(machine[name]) for name in ("system", "processor") if machine.get(name)]
+    if machine.get("cores"):
+        told.append(f"{count(machine['cores'])} cores")
+    if machine.get("threads"):
+        told.append(f"{plural(int(machine['threads']), 'thread')} used")
+    if machine.get("device") not in (None, "auto"):
+        told.append(f"device {machine['device']}")
+    return ", ".join(told)
+
+
+def _options(options: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [
+        (f"{section}.{name}", str(value))
+        for section, values in options.items()
+        if isinstance(values, Mapping)
+        for name, value in values.items()
+    ]
+
+
+def _charts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    from splatpipe.pipeline.app.report.charts import stage_bars
+
+    times = [(row["name"], row["seconds"]) for row in rows if row["seconds"] is not None]
+    memory = [(row["name"], row["memory"] / 1e9) for row in rows if row["memory"]]
+    charts = []
+    if times:
+        text = "Where the time went, by the clock; also of stages that an earlier run made."
+        charts.append({"svg": stage_bars(times, "seconds", "Time of the stages"), "text": text})
+    if memory:
+        text = "Memory at its peak."
+        charts.append({"svg": stage_bars(memory, "gigabytes", "Peak memory of the stages"), "text": text})
+    return charts

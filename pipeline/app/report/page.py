@@ -1,0 +1,140 @@
+"""Puts the report together: chapters from what there is, one template, one file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import importlib.metadata
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from splatpipe.pipeline.app.report.capture import capture_chapter, registration_chapter
+from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.learning import training_chapter, views_chapter
+from splatpipe.pipeline.app.report.making import files_chapter, making_chapter, said_chapter
+from splatpipe.pipeline.app.report.placing import placing_chapter
+from splatpipe.pipeline.app.report.verdict import judge
+from splatpipe.pipeline.app.report.wording import count, duration, length, moment, number
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.web import asset
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.app.report.geometry import Geometry
+
+TEMPLATES = Path(__file__).resolve().parent / "templates"
+
+
+def report_page(holdings: Holdings, *, drawn: bool) -> str:
+    """The report as one HTML text that needs nothing else.
+
+    Args:
+        holdings: What there is.
+        drawn: With charts and pictures; without, it is made within a moment.
+
+    Raises:
+        MachineError: if this installation lacks the page's script or style.
+    """
+    if not drawn:
+        return _render(holdings, None, None, drawn=False)
+    from splatpipe.pipeline.app.report.drawing import styled
+
+    geometry, trouble = _geometry(holdings)
+    with styled():
+        return _render(holdings, geometry, trouble, drawn=True)
+
+
+def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> str:
+    script, style = asset("report.js").replace("</", "<\\/"), asset("report.css").replace("</", "<\\/")
+    chapters = {
+        "capture": _guarded(lambda: capture_chapter(holdings, geometry, drawn=drawn) if _checked(holdings) else None),
+        "registration": _guarded(lambda: registration_chapter(holdings, geometry) if _matched(holdings) else None),
+        "placing": _guarded(lambda: placing_chapter(holdings, geometry)),
+        "training": _guarded(lambda: training_chapter(holdings, drawn=drawn)),
+        "views": _guarded(lambda: views_chapter(holdings, drawn=drawn)),
+        "making": _guarded(lambda: making_chapter(holdings, drawn=drawn)),
+        "files": _guarded(lambda: files_chapter(holdings)),
+        "said": _guarded(lambda: said_chapter(holdings)),
+    }
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html.j2").render(
+        name=holdings.out.resolve().name or str(holdings.out),
+        photos_dir="" if holdings.photos_dir is None else "/".join(holdings.photos_dir.parts[-2:]),
+        began=moment(holdings.story.began_s) if holdings.story.began_s else "",
+        version=importlib.metadata.version("splatpipe"),
+        verdict=judge(holdings),
+        key_figures=_guarded(lambda: {"cards": _cards(holdings)}),
+        drawn=drawn,
+        geometry_trouble=trouble,
+        script=Markup(script),
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        style=Markup(style),
+        **chapters,
+    )
+
+
+def _checked(holdings: Holdings) -> bool:
+    return "ingest" in holdings.artifacts
+
+
+def _matched(holdings: Holdings) -> bool:
+    return any(name in holdings.artifacts for name in ("features", "matches", "sparse"))
+
+
+def _guarded(build: Callable[[], dict[str, Any] | None]) -> dict[str, Any] | None:
+    """A chapter; where its artifact is damaged, or of another version, what is wrong with it."""
+    try:
+        return build()
+    except Exception as error:  # one damaged part may not cost the client the rest
+        return {"trouble": f"This part could not be read: {type(error).__name__}: {error}"}
+
+
+def _geometry(holdings: Holdings) -> tuple[Geometry | None, str | None]:
+    """The sparse model, placed if it is; or what is wrong with it."""
+    frame = holdings.part("georef.frame")
+    path = holdings.part("georef.model") if frame is not None else holdings.part("sparse.model")
+    if path is None:
+        return None, None
+    from splatpipe.pipeline.app.report.geometry import read_geometry
+
+    try:
+        return read_geometry(path, frame), None
+    except (OSError, ValueError, RuntimeError, KeyError, TypeError, SplatpipeError) as error:
+        return None, f"The sparse model could not be read, so there are no maps: {error}"
+
+
+def _cards(holdings: Holdings) -> list[tuple[str, str, str]]:
+    """Title, figure and explanation of what people ask for first."""
+    sparse, train, evaluate = (holdings.summary(name) for name in ("sparse", "train", "evaluate"))
+    accuracy = holdings.read("georef.accuracy") if "georef" in holdings.artifacts else {}
+    tables = accuracy.get("tables") or {}
+    cards = []
+    if sparse:
+        placed = f"{count(sparse.get('registered'))} of {count(sparse.get('photos'))}"
+        error = number(sparse.get("mean_reprojection_error_px"), 2)
+        cards += [("Photos placed", placed, ""), ("Reprojection error", f"{error} px", "mean")]
+    if accuracy.get("gsd_m"):
+        cards.append(("Ground sample distance", length(accuracy["gsd_m"]), "a photo's pixel, on the object"))
+    for name, title in (("check", "Check points"), ("control", "Control points")):
+        if tables.get(name):
+            found = tables[name]
+            cards.append((title, length(found.get("rmse_3d_m")), f"RMS of {count(found.get('count'))}, in 3D"))
+            break
+    if evaluate.get("psnr") is not None:
+        text = f"SSIM {number(evaluate.get('ssim'), 2)}, {count(evaluate.get('test_views'))} held-out photos"
+        cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text))
+    if train:
+        cards.append(("Gaussians", count(train.get("gaussians")), ""))
+    seconds = [float(artifact.manifest["seconds"]) for artifact in holdings.artifacts.values()]
+    if seconds:
+        cards.append(("Computed in", duration(sum(seconds)), "all stages, by the clock"))
+    return cards

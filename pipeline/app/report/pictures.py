@@ -1,0 +1,201 @@
+"""The report's pictures: held-out photos beside their renders, and a cut-out of the photo for each surveyor's mark."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from markupsafe import Markup
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.photos.photo_list import Photo, decode, load_photo_list
+
+VIEW_SIDE = 960  # pixels of the longer side of a held-out photo in the report
+VIEW_QUALITY = 82
+MOST_VIEWS = 12  # pictures of the worst, and of the best; the table has the figures of all
+CHIP_SIDE = 48  # photo pixels across a cut-out: a mark, its surroundings, and a reprojection that is far off
+WIDEST_CHIP = 768  # where the reprojection is further off than that
+CHIP_PIXELS = 96  # at most so many pixels in the report; the browser enlarges what has fewer
+CHIP_QUALITY = 80
+MOST_CHIPS = 600  # some two megabytes; then the worst of each point come first
+MOST_DECODED = 1_500_000_000  # pixels of photos decoded for them: some fifteen seconds on a core
+TURNS = {3: 180, 6: 90, 8: 270}  # degrees, clockwise, by EXIF orientation; mirrored ones are left as they are
+CODES = {180: cv2.ROTATE_180, 90: cv2.ROTATE_90_CLOCKWISE, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+
+@dataclass(frozen=True)
+class ViewPictures:
+    """A held-out photo, its render and the error between them, as data addresses; turned for people."""
+
+    photo: Markup
+    render: Markup
+    error: Markup
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Chip:
+    """A cut-out of a photo about a mark.
+
+    Attributes:
+        picture: As a data address; None where the photo could not be read.
+        turn_deg: Clockwise, for people.
+        marked: The mark in it, x and y as per cent of its side.
+        reprojected: Where the model has the point, likewise; None where that is not known.
+        side_px: Photo pixels across.
+    """
+
+    picture: Markup | None
+    turn_deg: int
+    marked: tuple[float, float]
+    reprojected: tuple[float, float] | None
+    side_px: int
+
+
+def view_pictures(stem: Path, orientation: int) -> ViewPictures | None:
+    """The pictures of one held-out view, small enough for a page; None if they are gone.
+
+    Args:
+        stem: Path of the pictures that `evaluate` left, without their endings.
+        orientation: EXIF's.
+    """
+    made = []
+    shape = (0, 0)
+    for kind in ("photo", "render", "error"):
+        try:
+            data = np.frombuffer(stem.with_name(f"{stem.name}.{kind}.png").read_bytes(), np.uint8)
+        except OSError:
+            return None
+        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        if pixels is None:
+            return None
+        shrunk = _turned(_shrunk(np.asarray(pixels, np.uint8)), orientation)
+        made.append(jpeg(shrunk, VIEW_QUALITY))
+        shape = (shrunk.shape[1], shrunk.shape[0])
+    photo, render, error = made
+    return ViewPictures(photo, render, error, *shape)
+
+
+def chosen_views(views: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Those to show of the views, the worst first: of many, the worst and the best."""
+    if len(views) <= MOST_VIEWS:
+        return list(views)
+    return [*views[: MOST_VIEWS - 1], views[-1]]
+
+
+def cut_chips(
+    points: Sequence[Mapping[str, Any]], photos_part: Path | None, photos_dir: Path | None
+) -> dict[tuple[int, int], Chip]:
+    """A cut-out for each observation of the surveyed points.
+
+    Args:
+        points: Of `control.json`.
+        photos_part: The part ``ingest.photos``; None leaves the pictures out.
+        photos_dir: The user's folder.
+
+    Returns:
+        By the point's and the observation's index; of too many the worst of each point, and those in the same photos.
+    """
+    photos = {} if photos_part is None else load_photo_list(photos_part).by_name()
+    by_photo: dict[str, list[tuple[int, int]]] = {}
+    for place in _worst_first(points)[:MOST_CHIPS]:
+        by_photo.setdefault(str(points[place[0]]["observations"][place[1]]["photo"]), []).append(place)
+    chips: dict[tuple[int, int], Chip] = {}
+    decoded = 0
+    for name, places in by_photo.items():  # the photos with the worst marks first
+        photo, pixels = photos.get(name), None
+        if photo is not None and photos_part is not None and photos_dir is not None:
+            decoded += photo.width * photo.height
+            if decoded > MOST_DECODED:
+                continue
+            pixels = _decoded(photo, photos_part, photos_dir)
+        for place in places:
+            seen = points[place[0]]["observations"][place[1]]
+            chips[place] = _chip(seen, pixels, 1 if photo is None else photo.orientation)
+    return chips
+
+
+def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> Markup:
+    """A picture as a data address.
+
+    Args:
+        pixels: BGR.
+        quality: JPEG's.
+    """
+    done, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError("a picture could not be coded as JPEG")
+    return Markup("data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode())
+
+
+def _decoded(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h w 3"] | None:
+    try:
+        return decode(photo, part, photos_dir)
+    except SplatpipeError:  # the user's folder may be gone by now
+        return None
+
+
+def _worst_first(points: Sequence[Mapping[str, Any]]) -> list[tuple[int, int]]:
+    """Every point's worst observation, then every point's second worst, and so on."""
+    ranked = []
+    for i, point in enumerate(points):
+        sizes = [(-_size(seen), j) for j, seen in enumerate(point.get("observations", []))]
+        ranked += [(rank, i, j) for rank, (_, j) in enumerate(sorted(sizes))]
+    return [(i, j) for _, i, j in sorted(ranked)]
+
+
+def _size(seen: Mapping[str, Any]) -> float:
+    residual = seen.get("residual_px")
+    return float(np.hypot(*residual)) if residual else 0.0
+
+
+def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, orientation: int) -> Chip:
+    mark = np.array(seen["pixel"], np.float64)
+    residual = seen.get("residual_px")
+    side = CHIP_SIDE
+    while residual and max(abs(residual[0]), abs(residual[1])) > 0.4 * side and side < WIDEST_CHIP:
+        side *= 2
+    corner = np.floor(mark - side / 2).astype(int)
+    picture = None
+    if pixels is not None and np.all(mark > -side) and np.all(mark < np.array(pixels.shape[1::-1]) + side):
+        cut = _cut(pixels, int(corner[0]), int(corner[1]), side)
+        if side > CHIP_PIXELS:
+            cut = np.asarray(cv2.resize(cut, (CHIP_PIXELS, CHIP_PIXELS), interpolation=cv2.INTER_AREA), np.uint8)
+        picture = jpeg(np.ascontiguousarray(cut[:, :, ::-1]), CHIP_QUALITY)
+    marked = (mark - corner) / side * 100.0
+    found = None
+    if residual:
+        x, y = (mark + residual - corner) / side * 100.0
+        found = (float(x), float(y)) if 0.0 <= x <= 100.0 and 0.0 <= y <= 100.0 else None
+    return Chip(picture, TURNS.get(orientation, 0), (float(marked[0]), float(marked[1])), found, side)
+
+
+def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> UInt8[np.ndarray, "side side 3"]:
+    """A square of a photo; grey where it reaches beyond."""
+    height, width = pixels.shape[:2]
+    square = np.full((side, side, 3), 128, np.uint8)
+    x0, x1, y0, y1 = max(left, 0), min(left + side, width), max(top, 0), min(top + side, height)
+    if x1 > x0 and y1 > y0:
+        square[y0 - top : y1 - top, x0 - left : x1 - left] = pixels[y0:y1, x0:x1]
+    return square
+
+
+def _shrunk(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+    height, width = pixels.shape[:2]
+    factor = VIEW_SIDE / max(width, height)
+    if factor >= 1.0:
+        return pixels
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _turned(pixels: UInt8[np.ndarray, "h w 3"], orientation: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    turn = TURNS.get(orientation)
+    return pixels if turn is None else np.asarray(cv2.rotate(pixels, CODES[turn]), np.uint8)

@@ -1,0 +1,217 @@
+"""The report's chapter on georeferencing: frame, accuracy tables, each surveyed point, and a cut-out of each mark."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from splatpipe.pipeline.app.report.holdings import Holdings, read_json
+from splatpipe.pipeline.app.report.wording import count, interval, length, metres, number
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.app.report.geometry import Geometry
+
+Chapter = dict[str, Any]
+GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
+MOST_POINTS = 200  # rows of the table; thousands are in metrics.json
+AXES = ("east", "north", "up", "horizontal", "3d")
+
+
+def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | None:
+    """Where the model is and how well that is known; None where georef did not finish.
+
+    Args:
+        holdings: What there is.
+        geometry: Of the model; None for a report without pictures.
+    """
+    if "georef" not in holdings.artifacts:
+        return None
+    frame, control, report = (holdings.read(f"georef.{name}") for name in ("frame", "control", "accuracy"))
+    points = list(control.get("points", []))
+    splat = _splat(holdings)
+    chapter: Chapter = {
+        "note": str(frame.get("note", "")),
+        "facts": _frame_facts(holdings, (frame, control, report), named=geometry is not None),
+        "tables": _tables(report.get("tables") or {}, splat.get("tables") or {}),
+        "flights": _flights(report.get("tables") or {}),
+        "left_out": [str(name) for name in frame.get("left_out", [])],
+        "points": [_point(point, splat) for point in points[:MOST_POINTS]],
+        "points_more": max(0, len(points) - MOST_POINTS),
+        "has_splat": bool(splat["points"]),
+        "marks": [],
+        "marks_left_out": 0,
+    }
+    if geometry is not None:
+        chapter |= _drawn(holdings, geometry, frame, points)
+    return chapter
+
+
+def _splat(holdings: Holdings) -> Mapping[str, Any]:
+    """What evaluate found of the splat's own accuracy; nothing where that is damaged, which its own chapter tells."""
+    with suppress(OSError, ValueError, AttributeError):
+        found = holdings.read("evaluate.metrics").get("accuracy", {}).get("splat")
+        if found:
+            return dict(found)
+    return {"tables": {}, "points": []}
+
+
+def _frame_facts(
+    holdings: Holdings, parts: tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], *, named: bool
+) -> list[tuple[str, str]]:
+    frame, control, report = parts
+    if frame.get("kind") != "enu":
+        return [("Frame", "z up; scale, place and heading are arbitrary: no metres")]
+    origin = frame["origin"]
+    place = f"{origin['latitude']:.7f}°, {origin['longitude']:.7f}°, {number(origin['height_m'])} m"
+    summary = holdings.summary("georef")
+    facts = [
+        ("Frame", "local east, north, up in metres"),
+        ("Origin", f"{place} (latitude, longitude, height)"),
+        ("CRS of the coordinates", _crs(holdings, frame)),
+        ("Vertical datum", _vertical(str(frame.get("vertical_datum", "unknown")), named=named)),
+        ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel"),
+    ]
+    told = (report.get("uncertainty") or {}).get("sentence")
+    if told:
+        facts.append(("By the positions alone", str(told)))
+    if control.get("file"):
+        told = f"{control['file']}, in {control.get('crs')}; marks taken to be good to {control.get('sigma_pixel')} px"
+        facts.append(("Control file", told))
+    bent = summary.get("model_bent")
+    if bent is not None:
+        moved = f"{number(summary.get('moved_px'), 3)} px"
+        told = f"bent the model by {moved}" if bent else f"fits it as it is (bending would move the photos by {moved})"
+        facts.append(("Control and the model", told if summary.get("moved_px") is not None else "not adjusted"))
+    return facts
+
+
+def _vertical(datum: str, *, named: bool) -> str:
+    """The datum by its name, or as the frame has it where there is no time to load pyproj."""
+    if not named:
+        return datum
+    from splatpipe.pipeline.survey.crs import describe_vertical
+
+    return describe_vertical(datum)
+
+
+def _crs(holdings: Holdings, frame: Mapping[str, Any]) -> str:
+    """As `georef.json` has it where it was written, else as the frame has it."""
+    path = holdings.part("export.georef")
+    told = read_json(path) if path is not None else {}
+    crs = told.get("crs") if isinstance(told, Mapping) else None
+    if not isinstance(crs, Mapping):
+        return str(frame.get("crs") or "the UTM zone of the origin")
+    operation = crs.get("operation", {})
+    accuracy = operation.get("accuracy_m")
+    good = "of unknown accuracy" if accuracy is None else f"good to {accuracy:g} m"
+    return f"{crs.get('id')} ({crs.get('name')}), by {operation.get('name')}, {good}"
+
+
+def _tables(model: Mapping[str, Any], splat: Mapping[str, Any]) -> list[dict[str, Any]]:
+    found = [(title, model.get(name)) for name, title in GROUPS.items()]
+    found += [(f"splat's surface at {GROUPS[name]}", splat.get(name)) for name in ("control", "check")]
+    rows = []
+    for title, table in found:
+        if table:
+            mean = [metres(value) for value in table.get("mean_m") or [None] * 3]
+            rows.append(
+                {
+                    "title": title,
+                    "count": count(table.get("count")),
+                    "rmse": [metres(table.get(f"rmse_{axis}_m")) for axis in AXES],
+                    "mean": ", ".join(mean),
+                    "horizontal": interval(table.get("interval_95_horizontal_m")),
+                    "vertical": interval(table.get("interval_95_vertical_m")),
+                }
+            )
+    return rows
+
+
+def _flights(tables: Mapping[str, Any]) -> list[str]:
+    flights = [flight for table in tables.values() if table for flight in table.get("flights", [])]
+    return [
+        f"Flight {flight['flight'] + 1}, {count(flight.get('photos'))} photos: all together "
+        "{} m east, {} m north, {} m up of where the model has them.".format(*map(metres, flight["offset_m"]))
+        for flight in flights
+    ]
+
+
+def _point(point: Mapping[str, Any], splat: Mapping[str, Any]) -> dict[str, Any]:
+    used = [seen for seen in point["observations"] if seen.get("used", True)]
+    own: Mapping[str, Any] = next((found for found in splat["points"] if found.get("name") == point["name"]), {})
+    nothing = [None, None, None]
+    return {
+        "name": str(point["name"]),
+        "role": str(point["role"]).replace("_", " "),
+        "why": str(point.get("why") or ""),
+        "photos": len(used),
+        "surveyed": [number(value) for value in point.get("surveyed_crs") or nothing],
+        "residual": [metres(value) for value in point.get("residual_m") or nothing],
+        "pixels": number(_rms_px(used), 2),
+        "splat": [metres(value) for value in own.get("residual_m") or nothing],
+    }
+
+
+def _rms_px(observations: Sequence[Mapping[str, Any]]) -> float | None:
+    squares = [x * x + y * y for x, y in (seen["residual_px"] for seen in observations if seen.get("residual_px"))]
+    return math.sqrt(math.fsum(squares) / len(squares)) if squares else None
+
+
+def _drawn(
+    holdings: Holdings, geometry: Geometry, frame: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
+) -> Chapter:
+    """The maps of residuals, and the cut-outs point by point."""
+    from splatpipe.pipeline.app.report.charts import residual_map
+    from splatpipe.pipeline.app.report.pictures import cut_chips
+
+    charts = []
+    if frame.get("kind") == "enu":
+        surveyed = _surveyed_residuals(points)
+        if surveyed:
+            text = "How far the surveyed points lie from where they were surveyed (estimated less surveyed)."
+            charts.append({"svg": residual_map(geometry, surveyed), "text": text})
+        photos = _photo_residuals(geometry, frame)
+        if photos:
+            text = "How far the photos' own positions are from where the model has the photos."
+            charts.append({"svg": residual_map(geometry, {"photo": photos}), "text": text})
+    chips = cut_chips(points, holdings.part("ingest.photos"), holdings.photos_dir)
+    total = sum(len(point["observations"]) for point in points)
+    shown = [_marks(i, point, chips) for i, point in enumerate(points)]
+    marks = [mark for mark in shown if mark["chips"]]
+    return {"charts": charts, "marks": marks, "marks_left_out": total - len(chips)}
+
+
+def _marks(index: int, point: Mapping[str, Any], chips: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
+    """A point's cut-outs, the worst first."""
+    entries = []
+    for j, seen in enumerate(point["observations"]):
+        chip = chips.get((index, j))
+        if chip is not None:
+            residual = seen.get("residual_px")
+            off = None if not residual else math.hypot(*residual)
+            told = {"chip": chip, "photo": str(seen["photo"]), "off": number(off, 2), "used": seen.get("used", True)}
+            entries.append((-(off or 0.0), j, told))
+    role = str(point["role"]).replace("_", " ")
+    return {
+        "name": str(point["name"]),
+        "role": role,
+        "chips": [entry for *_, entry in sorted(entries, key=lambda e: e[:2])],
+    }
+
+
+def _surveyed_residuals(points: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, list[float], list[float]]]]:
+    groups: dict[str, list[tuple[str, list[float], list[float]]]] = {}
+    for point in points:
+        place, residual = point.get("surveyed_m"), point.get("residual_m")
+        if place and residual and None not in place[:2] and None not in residual[:2]:
+            kind = {"control": "control", "check": "check"}.get(str(point["role"]), "left out")
+            groups.setdefault(kind, []).append((str(point["name"]), place, residual))
+    return groups
+
+
+def _photo_residuals(geometry: Geometry, frame: Mapping[str, Any]) -> list[tuple[str, list[float], list[float]]]:
+    found = (frame.get("residuals") or {}).get("photos") or {}
+    places = dict(zip(geometry.taken.names, geometry.taken.centres.tolist(), strict=True))
+    return [(name, places[name], list(residual)) for name, residual in found.items() if name in places]

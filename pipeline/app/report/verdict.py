@@ -1,0 +1,257 @@
+"""What is good about a run and what is doubtful, in plain words: the page's first lines.
+
+The bounds are the usual ones of the trade (Pix4D's quality report asks for 95 % of the photos and a focal length within
+5 %; surveyors expect check points within one to two ground sample distances horizontally and three vertically).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.wording import count, duration, length, moment, number, plural, share
+from splatpipe.stages.line import LINE
+
+Level = Literal["good", "doubt", "bad"]
+
+PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # share of the photos
+ERROR_GOOD_PX, ERROR_DOUBT_PX = 1.0, 2.0  # mean reprojection error
+FOCAL_GOOD = 0.05  # of the prior
+HORIZONTAL_GSDS, VERTICAL_GSDS = 2.0, 3.0  # root mean square at check points
+FEW_CHECKS = 3  # fewer prove little
+PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos, their exposure apart
+CAMERAS = "Cameras"
+CAMERAS_BAD = "The cameras are bad"
+FLOATING = 0.01  # share of what the views show
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the verdict."""
+
+    level: Level
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the page begins with."""
+
+    level: Level
+    headline: str
+    text: str
+    findings: Sequence[Finding]
+
+
+def judge(holdings: Holdings) -> Verdict:
+    """Judge a run by what there is of it; what cannot be read is passed over, and told where it belongs."""
+    findings: list[Finding] = []
+    for look in (_cameras, _photos, _reprojection, _focal, _place, _splat, _views, _floaters):
+        try:
+            findings += filter(None, [look(holdings)])
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+    ended, text = _ended(holdings)
+    told = sum(len(stage.told.warnings) for stage in holdings.story.stages.values())
+    if told:
+        stand = "it stands" if told == 1 else "they stand"
+        findings.append(Finding("doubt", "Warnings", f"The run gave {plural(told, 'warning')}; {stand} below."))
+    wrong = next((it for it in findings if it.title == CAMERAS and it.level == "bad"), None)
+    if ended is not None and (ended.level == "bad" or wrong is None):
+        return Verdict(ended.level, ended.title, ended.text, findings)
+    if wrong is not None:  # nothing that follows from them can be better
+        return Verdict("bad", CAMERAS_BAD, " ".join(filter(None, [text, ended.text if ended else ""])), findings)
+    doubtful = [finding for finding in findings if finding.level != "good"]
+    if any(finding.level == "bad" for finding in doubtful):
+        return Verdict("bad", "Finished, but with a serious shortcoming", text, findings)
+    if doubtful:
+        return Verdict("doubt", f"Finished; {plural(len(doubtful), 'point')} to look at", text, findings)
+    return Verdict("good", "Finished, and nothing looks doubtful", text, findings)
+
+
+def _ended(holdings: Holdings) -> tuple[Finding | None, str]:
+    """How the run ended, if not as it should; else when."""
+    story = holdings.story
+    when = f"{moment(story.ended_s)}, after {duration(story.ended_s - story.began_s)}"
+    if not story.stages:
+        return Finding("bad", "Nothing has run yet", "The folder has no record of a run that began."), ""
+    if story.complete:
+        last = [stage.name for stage in LINE if stage.name in holdings.artifacts][-1:]
+        if last == [LINE[-1].name]:
+            return None, f"The run ended on {when}."
+        gone = [name for name in story.stages if name not in holdings.artifacts]
+        if gone:
+            lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or cannot be read any more."
+            return Finding("bad", "Finished, but its results are damaged", f"{lost} The same command mends it."), ""
+        got = f"up to {last[0]}" if last else "without a result"
+        return Finding("doubt", f"The line was run {got}, as asked for", f"It ended on {when}."), ""
+    stage = story.culprit
+    where = f" in {stage.name}" if stage is not None else ""
+    kept = "What was finished is kept: the same command goes on from there."
+    if story.running:
+        return Finding("doubt", f"Still running{where}", f"{_far(holdings)} Events up to {moment(story.ended_s)}."), ""
+    if stage is not None and stage.state == "stopped":
+        return Finding("bad", f"Stopped{where} before it was finished", f"{_far(holdings)} {when}. {kept}"), ""
+    if stage is not None and stage.state == "failed":
+        said = " ".join(filter(None, [stage.message, stage.hint]))
+        return Finding("bad", f"Failed{where}", f"{said} ({when})"), ""
+    if story.message and story.exit_code:
+        return Finding("bad", f"Failed{where}", " ".join(filter(None, [story.message, story.hint])) + f" ({when})"), ""
+    lost = (
+        f"Its events end without a word: it was killed, or the machine went down. {_far(holdings)} Last heard {when}."
+    )
+    return Finding("bad", f"Broken off{where}", f"{lost} {kept}"), ""
+
+
+def _far(holdings: Holdings) -> str:
+    """How far the stage came in which it ended."""
+    stage = holdings.story.culprit
+    if stage is None or not stage.told.progress:
+        return ""
+    total, unit = stage.told.progress.get("total"), str(stage.told.progress.get("unit", ""))
+    return f"It had come to {count(stage.reached)} of {count(total)} {unit}."
+
+
+def _cameras(holdings: Holdings) -> Finding | None:
+    """What the mapping holds of its own answer."""
+    told = holdings.read("sparse.summary").get("verdict") or {"level": "good"}
+    if told["level"] == "good":
+        return None
+    worst = [reason for reason in told["reasons"] if reason["level"] == told["level"]]
+    text = " ".join(f"{reason['text']} {reason['hint']}".strip() for reason in worst)
+    return Finding(told["level"], CAMERAS, text)
+
+
+def _photos(holdings: Holdings) -> Finding | None:
+    sparse = holdings.summary("sparse")
+    if not sparse:
+        return None
+    photos, placed = int(sparse["photos"]), int(sparse["registered"])
+    level: Level = "good" if placed >= PLACED_GOOD * photos else "doubt" if placed >= PLACED_DOUBT * photos else "bad"
+    if placed == photos:
+        return Finding(level, "Photos", f"All {photos:,} photos were placed.")
+    lost = f"{photos - placed:,} of {photos:,} photos could not be placed ({share(1 - placed / photos)})"
+    return Finding(level, "Photos", f"{lost}: what only they show is missing.")
+
+
+def _reprojection(holdings: Holdings) -> Finding | None:
+    error = holdings.summary("sparse").get("mean_reprojection_error_px")
+    if error is None:
+        return None
+    level: Level = "good" if error <= ERROR_GOOD_PX else "doubt" if error <= ERROR_DOUBT_PX else "bad"
+    told = {"good": "points and what they were made of agree", "doubt": "more than usual"}
+    told["bad"] = "the cameras contradict each other"
+    return Finding(level, "Reprojection error", f"{error:.2f} pixels on average: {told[level]}.")
+
+
+def _focal(holdings: Holdings) -> Finding | None:
+    cameras = holdings.summary("sparse").get("cameras", [])
+    off = [
+        abs(camera["focal_px"] / camera["prior_focal_px"] - 1.0)
+        for camera in cameras
+        if camera["has_prior"] and camera["prior_focal_px"]
+    ]
+    if not off:
+        return None
+    if max(off) <= FOCAL_GOOD:
+        return Finding("good", "Focal length", f"Calibrated within {share(max(off), 1)} of what the photos state.")
+    return Finding("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from what the photos state.")
+
+
+def _place(holdings: Holdings) -> Finding | None:
+    if "georef" not in holdings.artifacts:
+        return None
+    frame = holdings.read("georef.frame")
+    if frame.get("kind") != "enu":
+        why = str(frame.get("note", "")).removeprefix("Arbitrary scale: ").partition(". Up is from")[0].rstrip(".")
+        text = f"The model has neither scale nor place: {why or 'nothing tells them'}, and no control places it."
+        return Finding("doubt", "Georeferencing", f"{text} Nothing in it can be measured in metres.")
+    report = holdings.read("georef.accuracy")
+    tables, gsd = report["tables"], report.get("gsd_m")
+    checks, control = tables.get("check"), tables.get("control")
+    if checks:
+        return _checked(checks, gsd)
+    if control:
+        fit = f"{length(control['rmse_horizontal_m'])} horizontally, {length(control['rmse_up_m'])} in height"
+        text = f"{plural(control['count'], 'control point')} fit by {fit}, but no check point proves it elsewhere."
+        return Finding("doubt", "Accuracy", text)
+    gps = tables.get("gps") or {}
+    off = (
+        f"they scatter by {length(gps.get('rmse_horizontal_m'))} horizontally, {length(gps.get('rmse_up_m'))} in height"
+    )
+    told = (report.get("uncertainty") or {}).get("sentence")
+    worth = f", {told}" if told else ""
+    text = f"Placed by the photos' own positions alone ({off}){worth}: no control or check point proves it."
+    return Finding("doubt", "Accuracy", text)
+
+
+def _checked(table: Mapping[str, Any], gsd: float | None) -> Finding:
+    horizontal, vertical = table["rmse_horizontal_m"], table["rmse_up_m"]
+    told = f"{plural(table['count'], 'check point')} {'are' if table['count'] > 1 else 'is'} off by "
+    told += f"{length(horizontal)} horizontally and {length(vertical)} in height (root mean square)"
+    if not gsd:
+        return Finding("doubt", "Accuracy", f"{told}.")
+    told += f", {number((horizontal or 0.0) / gsd, 1)} and {number((vertical or 0.0) / gsd, 1)} ground sample distances"
+    good = (horizontal or 0.0) <= HORIZONTAL_GSDS * gsd and (vertical or 0.0) <= VERTICAL_GSDS * gsd
+    if table["count"] < FEW_CHECKS:
+        return Finding("doubt", "Accuracy", f"{told}; so few prove little.")
+    bounds = f"{HORIZONTAL_GSDS:g} and {VERTICAL_GSDS:g}"
+    verdict = "as a careful survey has it" if good else f"more than the {bounds} that are usual"
+    return Finding("good" if good else "doubt", "Accuracy", f"{told}: {verdict}.")
+
+
+def _splat(holdings: Holdings) -> Finding | None:
+    accuracy = holdings.read("evaluate.metrics").get("accuracy", {})
+    splat, gsd = accuracy.get("splat"), accuracy.get("gsd_m")
+    if not splat or not gsd:
+        return None
+    points = [point for point in splat["points"] if point.get("residual_m")]
+    if not points:
+        return None
+    lengths = {point["name"]: sum(x * x for x in point["residual_m"] if x is not None) ** 0.5 for point in points}
+    far = sorted((name for name, off in lengths.items() if off > 2 * VERTICAL_GSDS * gsd), key=lambda n: -lengths[n])
+    if not far:
+        off = length(max(lengths.values()))
+        text = f"At {plural(len(points), 'surveyed point')} the splat's own surface is within {off}."
+        return Finding("good", "Surface", text)
+    text = f"The splat's own surface is off at {len(far)} of {plural(len(points), 'surveyed point')}: "
+    which = far[0] if len(far) == 1 else f"most of all {far[0]},"
+    return Finding("doubt", "Surface", text + f"{which} by {length(lengths[far[0]])}.")
+
+
+def _views(holdings: Holdings) -> Finding | None:
+    if "evaluate" not in holdings.artifacts:
+        return None
+    metrics = holdings.read("evaluate.metrics")
+    mean, views = metrics["mean"], metrics["per_view"]
+    if not views:
+        return Finding("doubt", "Held-out photos", "No photo was held out, so nothing tells how good the pictures are.")
+    worst_of = min(views, key=_likeness)
+    value, worst = _likeness(mean), _likeness(worst_of)
+    level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
+    told = {"good": "a good likeness", "doubt": "a fair likeness", "bad": "a poor likeness"}[level]
+    text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB "
+    text += f"({value:.1f} without what exposure did), SSIM {number(mean['ssim'], 2)}: {told}"
+    if level == "good" and worst < PSNR_DOUBT_DB:
+        return Finding(
+            "doubt", "Held-out photos", f"{text} on average, but not of {worst_of['name']} ({worst:.1f} dB)."
+        )
+    return Finding(level, "Held-out photos", f"{text}.")
+
+
+def _likeness(measures: Mapping[str, Any]) -> float:
+    """PSNR, what exposure did apart where that is known."""
+    return float(measures["psnr_cc"] if measures.get("psnr_cc") is not None else measures["psnr"])
+
+
+def _floaters(holdings: Holdings) -> Finding | None:
+    floaters = holdings.read("evaluate.metrics").get("floaters", {})
+    rendered = floaters.get("free_space_rendered")
+    if rendered is None:
+        return None
+    level: Level = "good" if rendered <= FLOATING else "doubt"
+    what = "Hardly anything hangs" if level == "good" else "Something hangs"
+    return Finding(level, "Floaters", f"{what} in the air: {share(rendered, 2)} of what the photos' views show.")

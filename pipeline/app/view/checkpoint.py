@@ -1,0 +1,204 @@
+"""The model of a training that runs, as far as it has come, and what our rasterizer shows of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from splatpipe.pipeline.app.view.opened import Opened
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.photos.images import reduced_view
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.rendering import as_trained, render_pixels
+from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.panorama import Panorama, read_panorama
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.train.smoothing import smoothed
+from splatpipe.pipeline.web.viewer import viewer_page
+from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, viewer_splat
+from splatpipe.stages.export import in_world
+
+CHECKPOINT = "checkpoint.npz"
+JPEG_QUALITY = 92
+SKY, FILTER = "sky.colours", "filter_sigmas"  # arrays of a checkpoint
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model that can be shown.
+
+    Attributes:
+        path: Its file.
+        kind: ``initial``, ``checkpoint`` or ``model`` (finished).
+        stamp: Changes with its content.
+        plan: The training's; None before there is one.
+        sky: The finished sky, beside a finished model.
+    """
+
+    path: Path
+    kind: str
+    stamp: str
+    plan: Path | None
+    sky: Path | None = None
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A model as it is drawn."""
+
+    gaussians: Gaussians
+    sky: Panorama | None
+    options: rasterizer.RenderOptions
+    megapixels: float | None
+    iteration: int
+
+
+def newest(opened: Opened) -> Source | None:
+    """The furthest that a training has come; None before it can begin."""
+    if "train.model" in opened.parts:
+        part = opened.parts["train.model"]
+        plan, sky = opened.parts["train.plan"].path, opened.parts["train.sky"].path
+        return Source(part.path, "model", part.digest[:16], plan, sky)
+    folder = opened.working.get("train")
+    if folder is not None:
+        try:
+            facts = (folder / CHECKPOINT).stat()
+            stamp = f"{facts.st_ino:x}-{facts.st_mtime_ns:x}"
+            return Source(folder / CHECKPOINT, "checkpoint", stamp, folder / "plan.json")
+        except OSError:
+            pass
+    if "initialize.splat" in opened.parts:
+        part = opened.parts["initialize.splat"]
+        begun = folder is not None and (folder / "plan.json").is_file()
+        return Source(part.path, "initial", part.digest[:16], folder / "plan.json" if folder and begun else None)
+    return None
+
+
+def iteration_of(source: Source) -> int | None:
+    """How far a model is; None where its file does not say."""
+    if source.kind == "initial":
+        return 0
+    try:
+        if source.kind == "checkpoint":
+            return int(_facts(source.path)["iteration"])
+        manifest = json.loads((source.path.parent / "manifest.json").read_text(encoding="utf-8"))
+        return int(manifest["summary"]["iterations"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def load(source: Source, opened: Opened) -> Shown:
+    """Read a model for drawing.
+
+    Raises:
+        SplatpipeError: if it cannot be read; a checkpoint that was replaced meanwhile is no longer there.
+    """
+    if source.kind == "checkpoint":
+        gaussians, sky = _from_checkpoint(source.path, opened)
+    else:
+        gaussians = read_splat(source.path)
+        sky = read_panorama(source.sky) if source.sky is not None else None
+    if source.plan is None:
+        return Shown(gaussians, sky, rasterizer.RenderOptions(sh_degree=gaussians.sh_degree), None, 0)
+    options, megapixels = as_trained(source.plan, gaussians)
+    return Shown(gaussians, sky, options, megapixels, iteration_of(source) or 0)
+
+
+def views_of(opened: Opened) -> tuple[View, ...]:
+    """The photos that are trained on and measured with; none before they are undistorted."""
+    part = opened.parts.get("undistort.dataset")
+    if part is None:
+        return ()
+    folder = part.path.resolve()  # an OUT from elsewhere may name pictures that lie elsewhere
+    return tuple(view for view in load_views(part.path) if view.image_path.resolve().is_relative_to(folder))
+
+
+def held_out_of(source: Source | None) -> Sequence[str]:
+    """Names of the photos that it is not trained on."""
+    if source is None or source.plan is None:
+        return ()
+    try:
+        return [str(name) for name in json.loads(source.plan.read_text(encoding="utf-8"))["test_views"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return ()
+
+
+def pictures(shown: Shown, view: View, threads: int) -> tuple[bytes, bytes]:
+    """JPEGs of a render and of its photo, both of the size that is trained on.
+
+    Raises:
+        SplatpipeError: if the photo cannot be read.
+    """
+    camera, photo, _ = reduced_view(view, shown.megapixels)
+    with same_bits(threads):
+        render = render_pixels((shown.gaussians, shown.sky), camera, shown.options)
+    return _jpeg(render), _jpeg(photo)
+
+
+def viewer(shown: Shown, source: Source, opened: Opened, name: str) -> tuple[str, bytes]:
+    """The 3D viewer's page of a model, and the splat that it loads from beside it, called ``SPLAT``.
+
+    Args:
+        shown: The model.
+        source: Where it is from.
+        opened: The run.
+        name: Of the run.
+
+    Raises:
+        SplatpipeError: if the run is not so far that a model lies anywhere, or cannot be read.
+    """
+    if source.plan is None or not {"georef.frame", "undistort.dataset"} <= set(opened.parts):
+        raise SplatpipeError("There is nothing to show in 3D yet.")
+    frame = load_frame(opened.parts["georef.frame"].path)
+    gaussians = in_world(shown.gaussians, frame)
+    look = look_of(shown.options, shown.sky)
+    dataset, held_out = opened.parts["undistort.dataset"].path, set(held_out_of(source))
+    title = f"{name}, iteration {shown.iteration:,}"
+    scene = viewer_scene(dataset, frame, look, held_out, len(gaussians), title)
+    return viewer_page(scene, SPLAT), viewer_splat(gaussians, scene.antialias)
+
+
+def _from_checkpoint(path: Path, opened: Opened) -> tuple[Gaussians, Panorama | None]:
+    """The Gaussians as they are rendered; of a large file, only what that takes is read."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            tensors = {name: torch.from_numpy(archive[name]) for name in PARAMETERS}
+            sigmas = torch.from_numpy(archive[FILTER]) if FILTER in archive.files else None
+            colours = torch.from_numpy(archive[SKY]) if SKY in archive.files else None
+        gaussians = Gaussians.from_tensors(tensors)
+    except Exception as error:  # the readers of zip, of headers and of arrays raise almost anything on broken files
+        raise SplatpipeError(f"The checkpoint cannot be read: {' '.join(str(error).split())[:120]}") from error
+    if sigmas is not None:
+        with torch.no_grad():
+            gaussians = smoothed(gaussians, sigmas)
+    gaussians = gaussians.select(gaussians.finite())
+    sky = None
+    if colours is not None and "georef.frame" in opened.parts:
+        # A checkpoint has no up of its own; the frame's is within a cell of it.
+        up = load_frame(opened.parts["georef.frame"].path).world_from_model.rotation[2]
+        sky = Panorama(np.asarray(up, np.float64), colours)
+    return gaussians, sky
+
+
+def _facts(checkpoint: Path) -> Mapping[str, int]:
+    with np.load(checkpoint, allow_pickle=False) as archive:
+        facts: Mapping[str, int] = json.loads(archive["facts"].tobytes())["facts"]
+    return facts
+
+
+def _jpeg(pixels: np.ndarray) -> bytes:
+    done, data = cv2.imencode(
+        ".jpg", np.ascontiguousarray(pixels[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    )
+    if not done:
+        raise SplatpipeError("A picture could not be coded as JPEG.")
+    return bytes(data.tobytes())

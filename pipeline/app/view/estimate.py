@@ -1,0 +1,335 @@
+"""What the marks made so far tell: where each point is, how well the frame is known, and where photos show the rest.
+
+It is georef's own fit, without its bundle adjustment: control and positions together, blunders named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.app.view.job import Job
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.geometry.joint_fit import JointFit, fit_jointly
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.survey.accuracy import Placed, accuracy_json
+from splatpipe.pipeline.survey.blunders import name_blunders, require_near
+from splatpipe.pipeline.survey.control_file import ControlFile
+from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.place import (
+    Site,
+    make_site,
+    observed_in,
+    require_fit,
+    start_similarity,
+    stations_of,
+)
+from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, SurveyPoint, locate, residual_px, with_roles
+
+Marks = Mapping[str, Mapping[str, tuple[float, float]]]
+UNKNOWN_HEIGHT_M = 5.0  # of a point that has no height, or while the heights' datum is not known
+LEAST_RADIUS_PX = 6.0
+SURFACE_RADIUS_M = 8.0  # around a point, of whose sparse points the height is taken
+LEAST_NEAR = 3  # sparse points that tell a height
+RAY_TOLERANCE = 1e-3  # of x/z; beyond it a lens model has folded back what it does not show
+BEYOND = np.array(
+    [0.5, 2.0]
+)  # of a photo's sparse points' depths, nearest and farthest: how far a mark's ray is followed
+LINE_STEPS = 48  # along it: a bent lens bends the line
+NEIGHBOURS = 30  # sparse points around a place: a photo that shows none of them most likely has something before it
+MOST_WITNESSES = 50_000  # sparse points among which they are looked for
+HELPFUL_MARKS = 4  # of a point: from there on more tell little
+
+
+@dataclass
+class Told:
+    """A reporter that keeps the warnings."""
+
+    warnings: list[str] = field(default_factory=list)
+
+    def progress(self, done: float, total: float, what: str, unit: str = "") -> None:
+        """Nobody waits for it."""
+
+    def metric(self, name: str, value: float, step: int | None = None) -> None:
+        """Nor for this."""
+
+    def note(self, message: str) -> None:
+        """Nor for this."""
+
+    def warning(self, message: str, hint: str = "") -> None:
+        self.warnings.append(f"{message} {hint}".strip())
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known of the points and of the frame.
+
+    Attributes:
+        survey: The points with their marks, roles and places in the model.
+        tables: As in `accuracy.json`; empty without a frame.
+        expected_m: Standard deviation of the frame, horizontally and vertically, the median over the model (without
+            control, what the positions state); None where it is not known.
+        heights_tied: Whether heights are the survey's: a control point that has one took part.
+        gsd_m: Ground sampling distance; None without a frame.
+        places: Of the points in the model, by their marks or else by the survey; NaN where nothing tells.
+        radius_m: How well they are known there, in the model's units; 0 where by their marks.
+        by_marks: Which are known by their marks.
+        residual_m: East, north, up of each point, found less surveyed; NaN where not known.
+        warnings: In sentences.
+    """
+
+    survey: Survey
+    tables: Mapping[str, JSON]
+    expected_m: tuple[float, float] | None
+    heights_tied: bool
+    gsd_m: float | None
+    places: Float64[np.ndarray, "n 3"]
+    radius_m: Float64[np.ndarray, " n"]
+    by_marks: Bool[np.ndarray, " n"]
+    residual_m: Float64[np.ndarray, "n 3"]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    site: Site
+    fit: JointFit
+    survey: Survey
+
+
+class Estimator:
+    """Estimates from marks; a point whose marks are as before is not looked for again.
+
+    Args:
+        job: What is marked.
+
+    Raises:
+        SplatpipeError: if the points lie elsewhere than the photos.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._index = {name: k for k, name in enumerate(job.model.names)}
+        self._located: dict[str, tuple[object, SurveyPoint]] = {}
+        self._stations = stations_of(job.model, job.positions, job.frame)
+        unmarked = [SurveyPoint(point, "control", "", ()) for point in job.points]
+        self._geodetic = require_near(self._survey(unmarked), job.config, self._stations)
+        self._gsd = job.model.gsd(1.0)  # of the model's units: it takes a while, and no mark changes it
+
+    def estimate(self, marks: Marks) -> Estimate:
+        """What some marks tell.
+
+        Args:
+            marks: Pixels by point and photo, (0, 0) the top-left corner of the first one.
+        """
+        job, told = self._job, Told()
+        points = [self._locate(k, marks.get(point.name, {})) for k, point in enumerate(job.points)]
+        survey = self._survey(points)
+        try:
+            fitted = self._fit(survey, told)
+        except (NoPlaceError, SplatpipeError) as error:
+            if marks_many(points):
+                told.warnings.append(str(error) if isinstance(error, SplatpipeError) else f"No frame yet: {error}.")
+            fitted = None
+        survey = fitted.survey if fitted is not None else survey
+        located = [point.found for point in survey.points]
+        by_marks = np.array([found is not None for found in located], dtype=bool)
+        places = np.array([np.full(3, np.nan) if found is None else found.xyz for found in located]).reshape(-1, 3)
+        radius, residual = np.zeros(len(points)), np.full((len(points), 3), np.nan)
+        if fitted is None:
+            return Estimate(survey, {}, None, False, None, places, radius, by_marks, residual, tuple(told.warnings))
+        site, similarity = fitted.site, fitted.fit.similarity
+        known = np.isfinite(site.targets.sigmas)
+        residual[by_marks] = np.where(
+            known[by_marks], similarity.apply(places[by_marks]) - site.targets.enu[by_marks], np.nan
+        )
+        places[~by_marks], radius[~by_marks] = self._expected(fitted, ~by_marks)
+        gsd = None if self._gsd is None else self._gsd * similarity.scale
+        placed = Placed(job.model, similarity, fitted.fit.offsets)
+        tables = accuracy_json(survey, site, placed, gsd)["tables"]
+        sigmas = self._sigmas(fitted)
+        tied = any(point.surveyed.z is not None for point in survey.of_role("control"))
+        return Estimate(survey, tables, sigmas, tied, gsd, places, radius, by_marks, residual, tuple(told.warnings))
+
+    def _locate(self, number: int, marks: Mapping[str, tuple[float, float]]) -> SurveyPoint:
+        job, point = self._job, self._job.points[number]
+        seen = tuple(Sighting(photo, marks[photo], self._index.get(photo)) for photo in sorted(marks))
+        before = self._located.get(point.name)
+        if before is not None and before[0] == seen:
+            return before[1]
+        found = locate(SurveyPoint(point, "control", "", seen), job.model, job.photos, job.config.mark_sigma_px)
+        self._located[point.name] = (seen, found)
+        return found
+
+    def _survey(self, points: list[SurveyPoint]) -> Survey:
+        job = self._job
+        file = ControlFile(job.crs.text, job.points, ())
+        return Survey(file, job.crs, job.text.path.name, tuple(with_roles(points, job.config.check_points)))
+
+    def _fit(self, survey: Survey, told: Told) -> _Fitted:
+        job, stations = self._job, self._stations
+        site = make_site(survey, self._geodetic, stations, job.frame, job.config)
+        start = start_similarity(site, survey, job.model, job.positions, job.frame)
+        if not survey.of_role("control"):
+            start = (self._lifted(start[0], site), start[1])
+        survey = name_blunders(survey, site, job.model, start, job.config, told)
+        observed = observed_in(site, survey, job.model, start[0].scale, job.config.mark_sigma_px)
+        fit = fit_jointly(start[0], observed, start[1])
+        require_fit(fit, observed, survey)
+        if not survey.of_role("control"):
+            fit = replace(fit, similarity=start[0])
+        return _Fitted(site, fit, survey)
+
+    def _lifted(self, similarity: Similarity, site: Site) -> Similarity:
+        """Before any mark: the model moved in height so that the points lie on it, whatever datum each is in."""
+        cloud = similarity.apply(self._job.model.points)
+        lifts = []
+        for place in site.targets.enu[np.isfinite(site.targets.sigmas[:, 2])]:
+            near = np.linalg.norm(cloud[:, :2] - place[:2], axis=1) < SURFACE_RADIUS_M
+            if near.sum() >= LEAST_NEAR:
+                lifts.append(place[2] - np.median(cloud[near, 2]))
+        lift = float(np.median(lifts)) if lifts else 0.0
+        return replace(similarity, translation=similarity.translation + np.array([0.0, 0.0, lift]))
+
+    def _expected(
+        self, fitted: _Fitted, wanted: Bool[np.ndarray, " n"]
+    ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
+        """Where the survey has points in the model, and how well that is known, in the model's units."""
+        similarity, enu = fitted.fit.similarity, fitted.site.targets.enu[wanted].copy()
+        unknown = ~np.isfinite(fitted.site.targets.sigmas[wanted, 2])
+        cloud = similarity.apply(self._job.model.points)
+        if len(cloud):
+            enu[unknown, 2] = np.median(cloud[:, 2])
+        places = similarity.inverse().apply(enu)
+        if not fitted.survey.of_role("control"):
+            return places, np.full(len(places), np.linalg.norm(self._stated_sigmas()) / similarity.scale)
+        sigmas = fitted.fit.sigmas_at(places) * max(fitted.fit.noise, 1.0)
+        sigmas[:, 2] = np.minimum(np.where(unknown, UNKNOWN_HEIGHT_M, sigmas[:, 2]), UNKNOWN_HEIGHT_M)
+        return places, np.linalg.norm(sigmas, axis=1) / similarity.scale
+
+    def _stated_sigmas(self) -> Float64[np.ndarray, " 3"]:
+        """Of the photos' positions, which share most of their errors: what these alone are worth."""
+        return np.asarray(np.median(self._stations.sigmas, axis=0))
+
+    def _sigmas(self, fitted: _Fitted) -> tuple[float, float]:
+        """Standard deviations of the frame, horizontally and vertically: the median over the model."""
+        if not fitted.survey.of_role("control"):
+            east, north, up = self._stated_sigmas().tolist()
+            return math.hypot(east, north), up
+        model = self._job.model
+        around = model.points if len(model.points) else model.centres
+        chosen = around[:: max(1, len(around) // 500)]
+        sigmas = fitted.fit.sigmas_at(chosen) * max(fitted.fit.noise, 1.0)
+        return float(np.median(np.hypot(sigmas[:, 0], sigmas[:, 1]))), float(np.median(sigmas[:, 2]))
+
+
+def marks_many(points: list[SurveyPoint]) -> bool:
+    """Whether enough is marked for a frame to be missed."""
+    return sum(point.found is not None for point in points) >= 3
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Where photos show the points.
+
+    Attributes:
+        pixels: Of each point in each photo of the model; NaN where that does not show it.
+        radius_px: Around it, where it is to be looked for.
+        depth: In the model's units.
+        doubtful: Whether it lies beyond the border, if only just, or something seems to hide it.
+    """
+
+    pixels: Float64[np.ndarray, "n m 2"]
+    radius_px: Float64[np.ndarray, "n m"]
+    depth: Float64[np.ndarray, "n m"]
+    doubtful: Bool[np.ndarray, "n m"]
+
+
+class Projector:
+    """Finds points in photos.
+
+    Args:
+        job: What is marked.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._cloud, self._shows = _cloud_of(job.model)
+
+    def project(self, places: Float64[np.ndarray, "n 3"], radius_m: Float64[np.ndarray, " n"]) -> Projection:
+        """Where photos show places of the model, known to some radius (its units)."""
+        count, photos = len(places), len(self._job.model.names)
+        pixels = np.full((count, photos, 2), np.nan)
+        radius, depth = np.full((count, photos), np.nan), np.full((count, photos), np.nan)
+        doubtful, witnessed = np.zeros((count, photos), dtype=bool), self._witnessed(places)
+        for index, name in enumerate(self._job.model.names):
+            photo = self._job.photos.get(name)
+            if photo is None:
+                continue
+            view = self._job.model.view(index, photo.width)
+            seen = places @ view.cam_from_model[:, :3].T + view.cam_from_model[:, 3]
+            ahead = np.flatnonzero(np.isfinite(seen).all(axis=1) & (seen[:, 2] > 0.0))
+            if len(ahead) == 0:
+                continue
+            shown = np.asarray(view.camera.img_from_cam(seen[ahead]), np.float64).reshape(-1, 2)
+            back = np.asarray(view.camera.cam_from_img(shown), np.float64).reshape(-1, 2)
+            true = np.abs(back - seen[ahead, :2] / seen[ahead, 2:]).max(axis=1) < RAY_TOLERANCE
+            shown = shown / view.scale
+            focal = view.camera.mean_focal_length() / view.scale
+            spread = np.maximum(LEAST_RADIUS_PX, focal * radius_m[ahead] / seen[ahead, 2])
+            margin = np.minimum(spread, 0.25 * photo.width)[:, None]
+            inside = true & ((shown >= -margin) & (shown <= np.array([photo.width, photo.height]) + margin)).all(axis=1)
+            rows = ahead[inside]
+            pixels[rows, index], radius[rows, index], depth[rows, index] = shown[inside], spread[inside], seen[rows, 2]
+            beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)
+            doubtful[rows, index] = beyond | ~witnessed[rows, index]
+        return Projection(pixels, radius, depth, doubtful)
+
+    def line(self, sighting: Sighting) -> Float64[np.ndarray, "steps m 2"]:
+        """Where photos may show what one photo shows at a mark: along its ray, NaN where they do not."""
+        assert sighting.index is not None
+        view = self._job.model.view(sighting.index, self._job.photos[sighting.photo].width)
+        pose = view.cam_from_model
+        depths = self._cloud[self._shows[:, sighting.index]] @ pose[2, :3] + pose[2, 3]
+        reach = np.percentile(depths, [5.0, 95.0]) * BEYOND if len(depths) else np.array([0.1, 10.0])
+        ray = np.append(view.ray(np.array(sighting.pixel)), 1.0)
+        near, far = np.maximum(reach, 1e-9).tolist()
+        places = (np.geomspace(near, far, LINE_STEPS)[:, None] * ray - pose[:, 3]) @ pose[:, :3]
+        return self.project(places, np.zeros(LINE_STEPS)).pixels
+
+    def _witnessed(self, places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n m"]:
+        """Which photos show a sparse point close to each place: what hides that is no hindrance, then."""
+        count = min(NEIGHBOURS, len(self._cloud))
+        if count == 0:
+            return np.ones((len(places), self._shows.shape[1]), dtype=bool)
+        witnessed = np.zeros((len(places), self._shows.shape[1]), dtype=bool)
+        for k in np.flatnonzero(np.isfinite(places).all(axis=1)):
+            away = ((self._cloud - places[k]) ** 2).sum(axis=1)
+            witnessed[k] = self._shows[np.argpartition(away, count - 1)[:count]].any(axis=0)
+        return witnessed
+
+
+def _cloud_of(model: SparseModel) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.ndarray, "k m"]]:
+    """Sparse points, evenly thinned where there are many, and which photos show each."""
+    every = sorted(model.reconstruction.points3D.items())
+    chosen = [point for _, point in every[:: max(1, len(every) // MOST_WITNESSES)]]
+    number = {image: k for k, image in enumerate(model.image_ids)}
+    shows = np.zeros((len(chosen), len(model.image_ids)), dtype=bool)
+    for row, point in enumerate(chosen):
+        seen = (number.get(element.image_id) for element in point.track.elements)
+        shows[row, [k for k in seen if k is not None]] = True
+    return np.array([point.xyz for point in chosen], dtype=np.float64).reshape(-1, 3), shows
+
+
+def residual_of(sighting: Sighting, point: SurveyPoint, job: Job) -> list[float] | None:
+    """What a photo shows of a point less the mark, pixels; None where that is not known."""
+    if point.found is None:
+        return None
+    found = residual_px(sighting, point.found.xyz, job.model, job.photos)
+    return None if found is None else found.tolist()

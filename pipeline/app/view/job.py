@@ -1,0 +1,174 @@
+"""What is to be marked: the points of a survey, the photos of a run, and the file that the marks go into."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from splatpipe.pipeline.app.view.opened import Run
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.source import AUTO, NONE, open_source
+from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
+from splatpipe.pipeline.survey.control_edit import ControlText
+from splatpipe.pipeline.survey.control_file import SAME_PLACE_M, SurveyedPoint, read_control_file, read_points_file
+from splatpipe.pipeline.survey.crs import Crs, parse_crs
+from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.gps import georeference, read_positions
+from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.survey.model import SparseModel, read_model
+from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.stages.line import GEOREF, LINE
+from splatpipe.stages.options import LineConfig
+
+LIST_NAME, CSV_NAME = "gcp_list.txt", "control.csv"
+CONTROL = "source.control"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What marking starts from.
+
+    Attributes:
+        points: Of the survey, with the coordinates as stated.
+        crs: Of them.
+        photos: Of the capture, by name.
+        photos_dir: Where they lie.
+        photos_part: What ingest left of them.
+        model: The one that georeferencing starts from.
+        positions: What the photos state.
+        frame: What these give; None where they give none.
+        config: georef's options, as the run has them.
+        text: The file that marks go into, as it was when the job began.
+        command: What makes a run take it.
+    """
+
+    points: tuple[SurveyedPoint, ...]
+    crs: Crs
+    photos: Mapping[str, Photo]
+    photos_dir: Path
+    photos_part: Path
+    model: SparseModel
+    positions: Positions
+    frame: Frame | None
+    config: GeorefConfig
+    text: ControlText
+    command: str
+
+    @property
+    def pixel_shift(self) -> float:
+        """What the file's pixels lack to ours, whose (0, 0) is the first one's top-left corner."""
+        return 0.5 if self.config.pixel_origin == "centre" else 0.0
+
+
+def open_job(run: Run, points_file: Path | None) -> Job:
+    """Read all that marking takes.
+
+    Args:
+        run: With a sparse model, at least.
+        points_file: Points to be marked besides those that the run's control file has.
+
+    Raises:
+        SplatpipeError: if the run is not so far, or there are no points, or they do not fit together.
+    """
+    photos_dir, config = run.config()
+    source = open_source(photos_dir, run.out, LINE, _without_missing_control(config))
+    opened = run.look()
+    missing = [name for name in ("ingest.photos", "ingest.positions", "sparse.model") if name not in opened.parts]
+    if missing:
+        raise UsageError(
+            f"{run.out} has no sparse model yet, and marking takes one to know where to look.",
+            hint=f"Run first: splatpipe run {photos_dir} {run.out} --until georef",
+        )
+    photos = load_photo_list(opened.parts["ingest.photos"].path).by_name()
+    text, points = _text_and_points(run, source.named.get(CONTROL), points_file, (source.folder, config.georef), photos)
+    crs = parse_crs(text.table.crs)
+    model = read_model(opened.parts["sparse.model"].path, photos)
+    positions = read_positions(opened.parts["ingest.positions"].path)
+    command = _command(run, text.path, config.georef.control, source.named.get(CONTROL))
+    places = (source.folder, opened.parts["ingest.photos"].path)
+    frame = _frame(model, positions, config.georef, photos)
+    return Job(points, crs, photos, *places, model, positions, frame, config.georef, text, command)
+
+
+def _without_missing_control(config: LineConfig) -> LineConfig:
+    """The options of a run whose control file was taken away: it is begun anew where it was."""
+    setting = config.georef.control
+    if setting in (AUTO, NONE) or Path(setting).is_file():
+        return config
+    return config.model_copy(update={"georef": config.georef.model_copy(update={"control": NONE})})
+
+
+def _frame(model: SparseModel, positions: Positions, config: GeorefConfig, photos: Mapping[str, Photo]) -> Frame | None:
+    try:
+        return georeference(model, positions, config.max_position_error_m, photos)[0]
+    except NoPlaceError:
+        return None
+
+
+def _text_and_points(
+    run: Run,
+    control: Path | None,
+    points_file: Path | None,
+    place: tuple[Path, GeorefConfig],
+    photos: Mapping[str, Photo],
+) -> tuple[ControlText, tuple[SurveyedPoint, ...]]:
+    """The file to write into, and the points of both files."""
+    folder, config = place
+    find = NameFinder(sorted(photos))
+    stated = read_points_file(points_file) if points_file is not None else None
+    as_csv = stated is not None and any(p.role is not None or p.sigma_m != (None, None) for p in stated.points)
+    path = control or _new_file(run, folder, config, CSV_NAME if as_csv else LIST_NAME)
+    if path.is_file():
+        text = ControlText.read(path, find)
+        known = (*(read_control_file(path).points if text.table.rows else ()), *text.unmarked)
+    elif stated is not None:
+        text, known = ControlText.begin(path, stated.crs, as_csv, find), ()
+    else:
+        raise UsageError(
+            "There are no points to mark: the run has no control file.",
+            hint="Give their names and coordinates: --points FILE, a first line with the CRS (EPSG:25832), then a CSV"
+            " with the header name,x,y,z.",
+        )
+    if stated is not None and parse_crs(stated.crs) != parse_crs(text.table.crs):
+        raise UsageError(
+            f"{points_file} is in {stated.crs}, and {text.path} in {text.table.crs}.",
+            hint="One control file has one CRS: bring the points into it.",
+        )
+    return text, _together(known, () if stated is None else stated.points, text.path)
+
+
+def _together(known: Sequence[SurveyedPoint], stated: Sequence[SurveyedPoint], path: Path) -> tuple[SurveyedPoint, ...]:
+    """The points of the control file, then those that it does not have yet."""
+    by_name = {point.name: point for point in known}
+    for point in stated:
+        mine = by_name.setdefault(point.name, replace(point, marks=()))
+        off = max(abs(mine.x - point.x), abs(mine.y - point.y), abs((mine.z or 0.0) - (point.z or 0.0)))
+        if off > SAME_PLACE_M:
+            raise UsageError(
+                f"{point.name} has other coordinates in {path} than in the file of points.",
+                hint="One name is one point: correct one of the two files.",
+            )
+    return tuple(by_name.values())
+
+
+def _new_file(run: Run, folder: Path, config: GeorefConfig, name: str) -> Path:
+    """Where a control file begins: with the photos or, where nobody may write there, in OUT."""
+    if config.control not in (AUTO, NONE):
+        return Path(config.control)
+    return (folder if os.access(folder, os.W_OK) else run.out) / name
+
+
+def _command(run: Run, path: Path, setting: str, control: Path | None) -> str:
+    """What takes the marks into the result; a file that the run finds by itself need not be named."""
+    named = GEOREF.files["control"].names
+    found = control is not None or (setting == AUTO and path.name in named and path.parent != run.out)
+    return f"splatpipe georef {_quoted(run.out)}" + ("" if found else f" --gcp {_quoted(path)}")
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))

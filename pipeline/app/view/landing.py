@@ -1,0 +1,119 @@
+"""What there is to see of a run, in a page: the way to the viewer, the report, the training, the files."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+from splatpipe.pipeline.app.view.files import NotThereError, open_inside
+from splatpipe.pipeline.app.view.log import RunLog
+from splatpipe.pipeline.app.view.opened import REPORT, Run
+from splatpipe.pipeline.engine.session import EVENTS_FILE
+from splatpipe.pipeline.engine.stage import JSON
+
+VIEWER = "viewer.html"
+LARGEST_METRICS = 64 << 20
+WHAT = {
+    REPORT: "what was done, and how good it is",
+    VIEWER: "the splat in 3D, in one page",
+    "splat.ply": "the splat, in the layout that every viewer reads",
+    "splat.spz": "the splat, compressed, as the viewer draws it",
+    "sky.ply": "the sky, as a dome of Gaussians",
+    "georef.json": "where the splat is: CRS, vertical datum, matrices",
+    "cameras.json": "the cameras, in the same frame",
+    "metrics.json": "every figure of quality",
+    "sparse.glb": "sparse points and camera frusta",
+    "flythrough.webm": "a flight through the scene",
+}
+SHOWN_IN_BROWSER = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
+
+
+def landing(run: Run, marking: bool) -> dict[str, Any]:
+    """What the landing page says.
+
+    Args:
+        run: The run.
+        marking: Whether control points can be marked here.
+    """
+    log = RunLog(run.out, EVENTS_FILE)
+    log.read()
+    names = run.deliverables()
+    at_work = run.is_at_work()
+    state = _state(log, at_work)
+    return {
+        "name": run.name,
+        "out": run.out,
+        "state": state,
+        "figures": _figures(_read_json(run, "metrics.json")) if "metrics.json" in names else [],
+        "ways": _ways(names, at_work, marking, has_log=bool(log.stages)),
+        "files": [_file(run, name) for name in names],
+    }
+
+
+def _state(log: RunLog, at_work: bool) -> dict[str, str]:
+    failed = next((stage for stage in log.stages.values() if stage.state == "failed"), None)
+    running = next((stage for stage in log.stages.values() if stage.state == "running"), None)
+    if at_work:
+        return {"kind": "running", "text": "At work" + (f": {running.name}." if running else ".")}
+    if failed is not None:
+        return {"kind": "failed", "text": f"Ended in {failed.name}: {failed.message}"}
+    if log.stages and all(stage.state in ("done", "reused") for stage in log.stages.values()):
+        return {"kind": "done", "text": "Finished."}
+    if running is not None:
+        return {"kind": "failed", "text": f"Ended in {running.name}. The same command goes on where it was."}
+    return {"kind": "done", "text": ""}
+
+
+def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> list[dict[str, Any]]:
+    ways = []
+    if marking:
+        ways.append(("/mark", "Mark control points", "Show where the photos have the surveyed points"))
+    if at_work:
+        ways.append(("/live", "Watch the training", "The latest checkpoint beside the photos, and the curves"))
+    if VIEWER in names:
+        ways.append((f"/{VIEWER}", "3D viewer", "Fly around, measure, read coordinates"))
+    if REPORT in names:
+        ways.append((f"/{REPORT}", "Report", "What was captured, what was done, how good it is"))
+    if "flythrough.webm" in names:
+        ways.append(("/flythrough.webm", "Film", "A flight through the scene"))
+    if not at_work and has_log:
+        ways.append(("/live", "Training", "Its curves, and its renders beside the photos"))
+    return [{"href": href, "title": title, "text": text, "first": k == 0} for k, (href, title, text) in enumerate(ways)]
+
+
+def _figures(metrics: Mapping[str, JSON]) -> list[dict[str, str]]:
+    """The figures that people ask for first."""
+    rows = (
+        ("photos placed", "registered", "{:,.0f}"),
+        ("Gaussians", "gaussians", "{:,.0f}"),
+        ("PSNR", "psnr", "{:.2f} dB"),
+        ("SSIM", "ssim", "{:.3f}"),
+    )
+    return [
+        {"title": title, "value": form.format(metrics[key])}
+        for title, key, form in rows
+        if isinstance(metrics.get(key), int | float)
+    ]
+
+
+def _read_json(run: Run, name: str) -> Mapping[str, JSON]:
+    try:
+        file = open_inside(run.out, name)
+        with os.fdopen(file.descriptor, "rb") as stream:
+            found = json.loads(stream.read(LARGEST_METRICS))
+    except (NotThereError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _file(run: Run, name: str) -> dict[str, Any]:
+    size = (run.out / name).lstat().st_size
+    shown = PurePosixPath(name).suffix in SHOWN_IN_BROWSER
+    return {"name": name, "size": _bytes(size), "text": WHAT.get(name, ""), "shown": shown}
+
+
+def _bytes(size: int) -> str:
+    return f"{size / 1e6:,.1f} MB" if size >= 1e6 else f"{size / 1e3:,.1f} kB"

@@ -1,0 +1,160 @@
+"""The training as it runs: how far it is, its curves, and its latest model beside the photos."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatpipe.pipeline.app.view.log import RunLog
+from splatpipe.pipeline.app.view.opened import Opened, Run
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.session import EVENTS_FILE
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.photos.dataset import View
+
+if TYPE_CHECKING:  # torch takes seconds to load, and marking does without
+    from splatpipe.pipeline.app.view.checkpoint import Shown, Source
+
+LOOK_EVERY_S = 2.0
+MOST_PICTURES = 64  # that are kept: pairs of JPEGs of some 100 kB
+RENDER_THREADS = 1  # the training wants the others
+CURVES = ("loss", "gaussians")
+
+
+class Live:
+    """What the live page shows.
+
+    Args:
+        run: The run.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._lock = threading.Lock()
+        self._log = RunLog(run.out, EVENTS_FILE)
+        self._opened = Opened({}, {}, {})
+        self._looked_s = -LOOK_EVERY_S
+        self._renderer = ThreadPoolExecutor(1, "render")  # one at a time
+        self._model: tuple[str, Shown] | None = None
+        self._viewer: tuple[str, bytes, bytes] | None = None
+        self._views: tuple[Path | None, tuple[View, ...]] = (None, ())
+        self._pictures: OrderedDict[tuple[str, int], tuple[bytes, bytes]] = OrderedDict()
+
+    def close(self) -> None:
+        """End the renderer."""
+        self._renderer.shutdown(wait=True, cancel_futures=True)
+
+    def state(self) -> dict[str, JSON]:
+        """How far the run is, for the page."""
+        from splatpipe.pipeline.app.view import checkpoint
+
+        with self._lock:
+            self._log.read()
+            opened, views = self._look()
+            log = self._log
+            source = checkpoint.newest(opened)
+            held_out = set(checkpoint.held_out_of(source))
+            model: JSON = None
+            if source is not None and views:
+                model = {"kind": source.kind, "stamp": source.stamp, "iteration": checkpoint.iteration_of(source)}
+                model["in_3d"] = source.plan is not None
+            return {
+                "name": self._run.name,
+                "at_work": self._run.is_at_work(),
+                "finished": log.finished,
+                "started_s": log.started_s,
+                "last_s": log.last_s,
+                "now_s": time.time(),
+                "stages": [stage.told() for stage in log.stages.values()],
+                "curves": {name: log.curves[name].points for name in CURVES if name in log.curves},
+                "notes": log.notes[-20:],
+                "model": model,
+                "views": [
+                    {
+                        "name": view.camera.name,
+                        "width": view.camera.width,
+                        "height": view.camera.height,
+                        "held_out": view.camera.name in held_out,
+                    }
+                    for view in views
+                ],
+            }
+
+    def picture(self, number: int, what: str) -> bytes | None:
+        """A JPEG of a view: its ``render`` by the latest model or its ``photo``; None where there is no such.
+
+        Raises:
+            SplatpipeError: if it cannot be made.
+        """
+        made = self._renderer.submit(self._make, number).result()
+        return None if made is None else made[0 if what == "render" else 1]
+
+    def viewer(self, what: str) -> bytes | None:
+        """The 3D viewer of the latest model: its ``page``, or the ``splat`` that it loads; None where there is none.
+
+        Raises:
+            SplatpipeError: if it cannot be made.
+        """
+        made = self._renderer.submit(self._make_viewer).result()
+        return None if made is None else made[0 if what == "page" else 1]
+
+    def _make_viewer(self) -> tuple[bytes, bytes] | None:
+        from splatpipe.pipeline.app.view import checkpoint
+
+        with self._lock:
+            opened, _ = self._look()
+        source = checkpoint.newest(opened)
+        if source is None:
+            return None
+        if self._viewer is None or self._viewer[0] != source.stamp:
+            page, splat = checkpoint.viewer(self._load(source, opened), source, opened, self._run.name)
+            self._viewer = source.stamp, page.encode(), splat
+        return self._viewer[1:]
+
+    def _load(self, source: Source, opened: Opened) -> Shown:
+        from splatpipe.pipeline.app.view import checkpoint
+
+        if self._model is None or self._model[0] != source.stamp:
+            self._model = None  # two of them may not fit
+            self._model = source.stamp, checkpoint.load(source, opened)
+        return self._model[1]
+
+    def _make(self, number: int) -> tuple[bytes, bytes] | None:
+        from splatpipe.pipeline.app.view import checkpoint
+
+        with self._lock:
+            opened, views = self._look()
+        source = checkpoint.newest(opened)
+        if source is None or not 0 <= number < len(views):
+            return None
+        if (source.stamp, number) in self._pictures:
+            return self._pictures[source.stamp, number]
+        shown = self._load(source, opened)
+        if shown.megapixels is None:
+            shown = replace(shown, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
+        made = checkpoint.pictures(shown, views[number], RENDER_THREADS)
+        self._pictures[source.stamp, number] = made
+        while len(self._pictures) > MOST_PICTURES:
+            self._pictures.popitem(last=False)
+        return made
+
+    def _look(self) -> tuple[Opened, tuple[View, ...]]:
+        """What there is, at most so old; called with the lock held."""
+        from splatpipe.pipeline.app.view import checkpoint
+
+        if time.monotonic() - self._looked_s >= LOOK_EVERY_S:
+            self._opened = self._run.look()
+            self._looked_s = time.monotonic()
+            part = self._opened.parts.get("undistort.dataset")
+            path = None if part is None else part.path
+            if path != self._views[0]:
+                try:
+                    self._views = path, checkpoint.views_of(self._opened)
+                except SplatpipeError:
+                    self._views = None, ()
+        return self._opened, self._views[1]

@@ -1,0 +1,176 @@
+"""What a run says of itself in ``events.jsonl``, read as it grows."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.app.view.files import NotThereError, open_inside
+from splatpipe.pipeline.engine.stage import JSON
+
+LONGEST_LINE = 1 << 18
+READ_AT_ONCE = 8 << 20
+MOST_POINTS = 2000  # of a curve: twice what a screen is wide
+MOST_NOTES = 200
+RATE_WINDOW_S = 60.0  # what the time left is judged by: iterations slow down as the model grows
+
+
+@dataclass
+class StageState:
+    """A stage of the run that is logged.
+
+    Attributes:
+        name: The stage's.
+        state: ``waiting``, ``running``, ``done``, ``reused`` or ``failed``.
+        seconds: That it took; None until then.
+        done: Progress.
+        total: Of it.
+        what: Is being done.
+        unit: Of progress.
+        trail: Times (seconds since the epoch) and progress, the last ``RATE_WINDOW_S``.
+        message: Of a failure.
+    """
+
+    name: str
+    state: str = "waiting"
+    seconds: float | None = None
+    done: float = 0.0
+    total: float = 0.0
+    what: str = ""
+    unit: str = ""
+    trail: list[tuple[float, float]] = field(default_factory=list)
+    message: str = ""
+
+    def progress(self, data: Mapping[str, JSON], time_s: float) -> None:
+        """Take an event of progress."""
+        what = str(data["what"])
+        if what != self.what:
+            self.trail.clear()
+        self.done, self.total = float(data["done"]), float(data["total"])
+        self.what, self.unit = what, str(data.get("unit", ""))
+        self.trail.append((time_s, self.done))
+        while len(self.trail) > 2 and self.trail[1][0] < time_s - RATE_WINDOW_S:
+            del self.trail[0]
+
+    @property
+    def seconds_left(self) -> float | None:
+        """At the pace of the last minute; None where nothing tells."""
+        if self.state != "running" or len(self.trail) < 2:
+            return None
+        (first_s, first), (last_s, last) = self.trail[0], self.trail[-1]
+        pace = (last - first) / max(last_s - first_s, 1e-9)
+        return max(0.0, self.total - last) / pace if pace > 0.0 else None
+
+    def told(self) -> dict[str, JSON]:
+        """For the page."""
+        kept = ("name", "state", "seconds", "done", "total", "what", "unit", "message")
+        return {name: getattr(self, name) for name in kept} | {"seconds_left": self.seconds_left}
+
+
+@dataclass
+class Curve:
+    """A metric over its steps, of which every second point goes where they become too many."""
+
+    points: list[tuple[int, float]] = field(default_factory=list)
+    stride: int = 1
+    seen: int = 0
+
+    def add(self, step: int, value: float) -> None:
+        """Take a point; a step that was there already begins anew from it (a run that went on from a checkpoint)."""
+        while self.points and self.points[-1][0] >= step:
+            self.points.pop()
+        self.seen += 1
+        if self.seen % self.stride:
+            return
+        self.points.append((step, value))
+        if len(self.points) > MOST_POINTS:
+            self.points = self.points[::2]
+            self.stride *= 2
+
+
+class RunLog:
+    """The last run in a log that grows.
+
+    Args:
+        out: The run's folder.
+        name: Of the log in it.
+    """
+
+    def __init__(self, out: Path, name: str) -> None:
+        self._out, self._name = out, name
+        self._inode, self._offset, self._rest = "", 0, b""
+        self._begin()
+
+    def _begin(self) -> None:
+        self.stages: dict[str, StageState] = {}
+        self.curves: dict[str, Curve] = {}
+        self.notes: list[dict[str, JSON]] = []
+        self.started_s: float | None = None
+        self.last_s: float | None = None
+        self.finished = False
+
+    def read(self) -> None:
+        """Take what was written since the last call; a log that was replaced or cut is read anew."""
+        try:
+            file = open_inside(self._out, self._name)
+        except NotThereError:
+            return
+        try:
+            inode = file.tag.partition("-")[0]
+            if inode != self._inode or file.size < self._offset:
+                self._inode, self._offset, self._rest = inode, 0, b""
+                self._begin()
+            while self._offset < file.size:
+                chunk = os.pread(file.descriptor, READ_AT_ONCE, self._offset)
+                if not chunk:
+                    break
+                self._offset += len(chunk)
+                *lines, self._rest = (self._rest + chunk).split(b"\n")
+                self._rest = self._rest[: LONGEST_LINE + 1]
+                for line in lines:
+                    self._take(line)
+        finally:
+            os.close(file.descriptor)
+
+    def _take(self, line: bytes) -> None:
+        """A line that is no event of ours is passed over: the log is for reading, not for believing."""
+        if len(line) > LONGEST_LINE:
+            return
+        try:
+            event: dict[str, Any] = json.loads(line)
+            self._event(str(event["kind"]), str(event["stage"]), event["data"], float(event["time_s"]))
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+            return
+
+    def _event(self, kind: str, stage: str, data: Mapping[str, JSON], time_s: float) -> None:
+        self.last_s = time_s
+        if kind == "run_started":
+            stages = {str(name): StageState(str(name)) for name in data["stages"]}
+            self._begin()
+            self.started_s, self.last_s, self.stages = time_s, time_s, stages
+        elif kind == "run_finished":
+            self.finished = True
+        elif kind == "metric":
+            value, step = float(data["value"]), data["step"]
+            if step is not None and math.isfinite(value):
+                self.curves.setdefault(str(data["name"]), Curve()).add(int(step), value)
+        elif kind in ("note", "warning"):
+            told = {"kind": kind, "stage": stage, "message": str(data["message"]), "hint": str(data.get("hint", ""))}
+            self.notes = [*self.notes, told][-MOST_NOTES:]
+        elif stage in self.stages:
+            self._stage_event(kind, self.stages[stage], data, time_s)
+
+    def _stage_event(self, kind: str, state: StageState, data: Mapping[str, JSON], time_s: float) -> None:
+        if kind == "progress":
+            state.progress(data, time_s)
+        elif kind == "stage_started":
+            state.state = "running"
+        elif kind in ("stage_finished", "stage_reused"):
+            state.state, state.seconds = kind.removeprefix("stage_").replace("finished", "done"), float(data["seconds"])
+        elif kind == "stage_failed":
+            state.state, state.message = "failed", f"{data['message']} {data.get('hint', '')}".strip()

@@ -1,0 +1,136 @@
+"""The page on which control points are marked, and what it asks the server."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from splatpipe.pipeline.app.view.marking import Change, Marking, State, WrongRequestError
+from splatpipe.pipeline.app.view.photo import shown_photo
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.app.view.server import Pages
+
+ACTIONS = ("mark", "unmark", "hide")
+
+
+class MarkPages:
+    """Marking over HTTP; points and photos go by their numbers.
+
+    Args:
+        marking: The session.
+        pages: The other pages.
+    """
+
+    def __init__(self, marking: Marking, pages: Pages) -> None:
+        self._marking, self._pages = marking, pages
+        self._names = [point.name for point in marking.job.points]
+
+    def routes(self) -> list[Route]:
+        """What is answered."""
+        return [
+            Route("/mark", self._page),
+            Route("/api/mark", self._overview),
+            Route("/api/mark/{number:int}", self._detail),
+            Route("/photo/{number:int}", self._photo),
+            Route("/api/mark/change", self._change, methods=["POST"]),
+            Route("/api/mark/undo", self._undo, methods=["POST"]),
+            Route("/api/mark/redo", self._redo, methods=["POST"]),
+        ]
+
+    def _page(self, request: Request) -> Response:
+        # Only a window of its own gets the secret: a page of the run has our origin and might ask for it.
+        if request.headers.get("sec-fetch-dest", "document") != "document":
+            raise HTTPException(403, "Open it in a window of its own.")
+        return self._pages.page("mark.html", {"name": self._pages.run.name, "token": self._pages.token})
+
+    def _overview(self, _request: Request) -> Response:
+        return JSONResponse(self._marking.overview())
+
+    def _detail(self, request: Request) -> Response:
+        number = request.path_params["number"]
+        if number >= len(self._names):
+            raise HTTPException(404)
+        return JSONResponse(self._marking.detail(self._names[number]))
+
+    def _photo(self, request: Request) -> Response:
+        job, number = self._marking.job, request.path_params["number"]
+        if number >= len(self._marking.photos):
+            raise HTTPException(404)
+        photo = job.photos[self._marking.photos[number]]
+        tag = f'"{photo.sha256}"'
+        headers = {"etag": tag, "cache-control": "private, no-cache"}
+        if request.headers.get("if-none-match") == tag:
+            return Response(status_code=304, headers=headers)
+        data, kind = shown_photo(photo, job.photos_part, job.photos_dir)
+        return Response(data, media_type=kind, headers=headers)
+
+    def _change(self, request: Request) -> Response:
+        asked = _body(request)
+        point, photo = _number(asked, "point", len(self._names)), _number(asked, "photo", len(self._marking.photos))
+        after = _state(asked)
+        try:
+            self._marking.change(
+                self._names[point], self._marking.photos[photo], after, nudge=asked.get("nudge") is True
+            )
+        except WrongRequestError as error:
+            raise HTTPException(400, str(error)) from error
+        return self._answer(point)
+
+    def _undo(self, request: Request) -> Response:
+        return self._turned(self._marking.undo(), request)
+
+    def _redo(self, request: Request) -> Response:
+        return self._turned(self._marking.redo(), request)
+
+    def _turned(self, change: Change | None, _request: Request) -> Response:
+        if change is None:
+            return JSONResponse({"overview": self._marking.overview()})
+        return self._answer(self._names.index(change.point), self._marking.photos.index(change.photo))
+
+    def _answer(self, point: int, photo: int | None = None) -> Response:
+        """All that a change changes; ``photo`` is where to look, after one that was taken back."""
+        overview, detail = self._marking.overview(), self._marking.detail(self._names[point])
+        return JSONResponse({"overview": overview, "detail": detail, "point": point, "photo": photo})
+
+
+def _body(request: Request) -> dict[str, Any]:
+    """The JSON object that was sent.
+
+    Raises:
+        HTTPException: if it is none.
+    """
+    try:
+        found = json.loads(request.scope["splatpipe.body"])
+    except (ValueError, RecursionError) as error:
+        raise HTTPException(400, "It takes JSON.") from error
+    if not isinstance(found, dict):
+        raise HTTPException(400, "It takes a JSON object.")
+    return found
+
+
+def _number(asked: dict[str, Any], name: str, count: int) -> int:
+    found = asked.get(name)
+    if type(found) is not int or not 0 <= found < count:
+        raise HTTPException(400, f"It takes a {name}.")
+    return found
+
+
+def _state(asked: dict[str, Any]) -> State:
+    action = asked.get("action")
+    if action not in ACTIONS:
+        raise HTTPException(400, "It takes an action: mark, unmark or hide.")
+    if action != "mark":
+        return "hidden" if action == "hide" else None
+    x, y = asked.get("x"), asked.get("y")
+    if type(x) not in (int, float) or type(y) not in (int, float):
+        raise HTTPException(400, "It takes x and y.")
+    try:
+        return float(x), float(y)  # type: ignore[arg-type]
+    except OverflowError as error:
+        raise HTTPException(400, "It takes x and y.") from error

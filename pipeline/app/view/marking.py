@@ -1,0 +1,316 @@
+"""A session of marking: every change is on the disk before it is acknowledged, and can be taken back."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.app.view.estimate import (
+    HELPFUL_MARKS,
+    Estimate,
+    Estimator,
+    Projection,
+    Projector,
+    residual_of,
+)
+from splatpipe.pipeline.app.view.job import Job
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.survey.control_edit import ControlText
+from splatpipe.pipeline.survey.control_file import SurveyedPoint
+
+MOST_UNDONE = 10_000
+WIDE_RAD = math.radians(60.0)  # between rays: more tells no more
+HELPFUL_PHOTOS = 20  # of a point, in the order in which they tell most; the rest by their distance
+DIGITS = 2  # of pixels, as they are written
+State = tuple[float, float] | Literal["hidden"] | None  # of a point in a photo: its mark, or that it is not visible
+
+
+class WrongRequestError(Exception):
+    """What the page asked for cannot be; the text says why."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of a point in a photo."""
+
+    point: str
+    photo: str
+    before: State
+    after: State
+
+
+class Marking:
+    """The marks, in memory as they are in the file.
+
+    Args:
+        job: What is marked.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self._lock = threading.Lock()
+        self._points = {point.name: point for point in job.points}
+        self._photos = tuple(sorted(job.photos))
+        self._estimator, self._projector = Estimator(job), Projector(job)
+        self._text = job.text
+        self._done: list[Change] = []
+        self._undone: list[Change] = []
+        self.revision = 0
+        self._estimated: tuple[int, Estimate, Projection] | None = None
+
+    @property
+    def photos(self) -> tuple[str, ...]:
+        """Names of all photos; their places in it are their numbers."""
+        return self._photos
+
+    def change(self, point: str, photo: str, after: State, nudge: bool = False) -> None:
+        """Mark a point in a photo, take the mark away, or say that the photo does not show it.
+
+        Args:
+            point: Its name.
+            photo: Its name.
+            after: What is to be.
+            nudge: Whether it goes on from the change before, to be undone with it.
+
+        Raises:
+            WrongRequestError: if there is no such point, photo or pixel.
+            SplatpipeError: if the file cannot be read or written; it is as before, then.
+        """
+        after = self._checked(point, photo, after)
+        with self._lock:
+            text = self._fresh()
+            before = self._state(text, point, photo)
+            if before == after:
+                return
+            self._write(text, Change(point, photo, before, after))
+            last = self._done[-1] if self._done else None
+            if nudge and last is not None and (last.point, last.photo, last.after) == (point, photo, before):
+                self._done[-1] = replace(last, after=after)
+            else:
+                self._done = [*self._done[-MOST_UNDONE:], Change(point, photo, before, after)]
+            self._undone.clear()
+
+    def undo(self) -> Change | None:
+        """Take the last change back; None where there is none."""
+        return self._turn(self._done, self._undone, back=True)
+
+    def redo(self) -> Change | None:
+        """Make the last change again that was taken back; None where there is none."""
+        return self._turn(self._undone, self._done, back=False)
+
+    def _turn(self, source: list[Change], target: list[Change], back: bool) -> Change | None:
+        with self._lock:
+            if not source:
+                return None
+            change = source[-1]
+            text = self._fresh()
+            now = self._state(text, change.point, change.photo)
+            self._write(text, replace(change, before=now, after=change.before if back else change.after))
+            target.append(source.pop())
+            return change
+
+    def _checked(self, point: str, photo: str, after: State) -> State:
+        if point not in self._points:
+            raise WrongRequestError("There is no such point.")
+        if photo not in self.job.photos:
+            raise WrongRequestError("There is no such photo.")
+        if not isinstance(after, tuple):
+            return after
+        x, y = (round(value, DIGITS) for value in after)
+        size = self.job.photos[photo]
+        if not (math.isfinite(x) and math.isfinite(y) and 0.0 <= x <= size.width and 0.0 <= y <= size.height):
+            raise WrongRequestError("The place lies outside of the photo.")
+        return x, y
+
+    def _fresh(self) -> ControlText:
+        """The file as it is now, with what somebody else wrote into it meanwhile; one taken away is written again."""
+        if self.job.text.path.is_file():
+            return ControlText.read(self.job.text.path, NameFinder(self._photos))
+        return self._text
+
+    def _state(self, text: ControlText, point: str, photo: str) -> State:
+        if (point, photo) in text.hidden:
+            return "hidden"
+        pixel = text.marks.get(point, {}).get(photo)
+        shift = self.job.pixel_shift
+        return None if pixel is None else (round(pixel[0] + shift, DIGITS), round(pixel[1] + shift, DIGITS))
+
+    def _write(self, text: ControlText, change: Change) -> None:
+        point, shift = self._points[change.point], self.job.pixel_shift
+        text = text.with_hidden(change.point, change.photo, hidden=change.after == "hidden")
+        if isinstance(change.after, tuple):
+            text = text.with_mark(point, change.photo, (change.after[0] - shift, change.after[1] - shift))
+        else:
+            text = text.without_mark(point, change.photo)
+        text.save()
+        self._text = text
+        self.revision += 1
+
+    def overview(self) -> dict[str, JSON]:
+        """All points, and what the marks tell: what the page shows beside the photo."""
+        with self._lock:
+            revision, estimate, projection = self._estimate()
+            marks, hidden = self._text.marks, self._text.hidden
+            can_undo, can_redo = bool(self._done), bool(self._undone)
+        points = [self._told_point(k, estimate, projection, marks, hidden) for k in range(len(self.job.points))]
+        return {
+            "revision": revision,
+            "file": str(self.job.text.path),
+            "exists": self.job.text.path.is_file(),
+            "command": self.job.command,
+            "crs": f"{self.job.crs.text} ({self.job.crs.name})",
+            "can_undo": can_undo,
+            "can_redo": can_redo,
+            "photos": [
+                {"name": name, "width": self.job.photos[name].width, "height": self.job.photos[name].height}
+                for name in self._photos
+            ],
+            "points": points,
+            "expected_m": estimate.expected_m,
+            "heights_tied": estimate.heights_tied,
+            "gsd_m": estimate.gsd_m,
+            "tables": {role: estimate.tables.get(role) for role in ("control", "check")},
+            "placed": self.job.frame is not None or bool(estimate.tables),
+            "warnings": estimate.warnings,
+        }
+
+    def detail(self, name: str) -> dict[str, JSON]:
+        """A point in all photos, those first that are likely to help.
+
+        Raises:
+            WrongRequestError: if there is no such point.
+        """
+        if name not in self._points:
+            raise WrongRequestError("There is no such point.")
+        with self._lock:
+            revision, estimate, projection = self._estimate()
+            marks, hidden = self._text.marks.get(name, {}), self._text.hidden
+        number = list(self._points).index(name)
+        shown = {s.photo: s for s in estimate.survey.points[number].sightings}
+        index = {photo: k for k, photo in enumerate(self.job.model.names)}
+        lines = self._lines(estimate, number)
+        rows = []
+        for photo in self._photos:
+            row = self._seen(photo, index.get(photo), number, projection)
+            sighting = shown.get(photo)
+            off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
+            row |= {
+                "mark": list(self._shifted(marks[photo])) if photo in marks else None,
+                "hidden": (name, photo) in hidden,
+                "agrees": sighting.agrees if sighting is not None else True,
+                "residual_px": off,
+                "line": None if lines is None or photo not in index else _listed(lines[:, index[photo]]),
+            }
+            rows.append(row)
+        rows.sort(key=lambda row: (row["predicted"] is None, row["doubtful"], row["rank"]))
+        sure = [row for row in rows if row["predicted"] is not None and not row["doubtful"]]
+        if sure:
+            centres = self.job.model.centres[[index[row["name"]] for row in sure]]
+            ranks = np.array([row["rank"] for row in sure])
+            order = helpful_order(estimate.places[number], centres, ranks)
+            rows[: len(sure)] = [sure[k] for k in order]
+        return {"revision": revision, "name": name, "by_marks": bool(estimate.by_marks[number]), "photos": rows}
+
+    def _lines(self, estimate: Estimate, number: int) -> Float64[np.ndarray, "steps m 2"] | None:
+        """Of a point that is marked in one photo: where the others may show it; None of any other."""
+        posed = [seen for seen in estimate.survey.points[number].sightings if seen.index is not None]
+        return self._projector.line(posed[0]) if len(posed) == 1 else None
+
+    def _shifted(self, pixel: tuple[float, float]) -> tuple[float, float]:
+        shift = self.job.pixel_shift
+        return round(pixel[0] + shift, DIGITS), round(pixel[1] + shift, DIGITS)
+
+    def _seen(self, photo: str, index: int | None, number: int, projection: Projection) -> dict[str, Any]:
+        """Where a photo shows a point; near ones, in whose middle it is, rank first."""
+        row: dict[str, Any] = {"photo": self._photos.index(photo), "name": photo, "predicted": None, "radius_px": None}
+        row |= {"doubtful": False, "rank": 0.0, "posed": index is not None}
+        if index is None or not math.isfinite(projection.depth[number, index]):
+            return row
+        x, y = projection.pixels[number, index].tolist()
+        size = self.job.photos[photo]
+        aside = max(abs(x / size.width - 0.5), abs(y / size.height - 0.5))  # beyond 0.5 it is outside
+        return row | {
+            "predicted": [round(x, DIGITS), round(y, DIGITS)],
+            "radius_px": round(float(projection.radius_px[number, index]), 1),
+            "doubtful": bool(projection.doubtful[number, index]),
+            "rank": float(projection.depth[number, index]) * (1.0 + aside),
+        }
+
+    def _estimate(self) -> tuple[int, Estimate, Projection]:
+        """For the marks as they are; called with the lock held."""
+        if self._estimated is None or self._estimated[0] != self.revision:
+            marks = {
+                name: {photo: self._shifted(pixel) for photo, pixel in seen.items()}
+                for name, seen in self._text.marks.items()
+            }
+            estimate = self._estimator.estimate(marks)
+            self._estimated = self.revision, estimate, self._projector.project(estimate.places, estimate.radius_m)
+        return self._estimated
+
+    def _told_point(
+        self,
+        number: int,
+        estimate: Estimate,
+        projection: Projection,
+        marks: Mapping[str, Mapping[str, tuple[float, float]]],
+        hidden: set[tuple[str, str]],
+    ) -> dict[str, JSON]:
+        point, stated = estimate.survey.points[number], self.job.points[number]
+        seen = marks.get(stated.name, {})
+        away = {photo for name, photo in hidden if name == stated.name}
+        likely = {
+            name
+            for k, name in enumerate(self.job.model.names)
+            if math.isfinite(projection.depth[number, k]) and not projection.doubtful[number, k]
+        }
+        residual = [None if math.isnan(value) else round(value, 4) for value in estimate.residual_m[number].tolist()]
+        wrong = sum(not sighting.agrees for sighting in point.sightings)
+        return {
+            "name": stated.name,
+            "role": point.role,
+            "why": point.why if seen else "",
+            "coordinates": _coordinates(stated),
+            "marks": len(seen),
+            "wrong": wrong,
+            "left": len(likely - away - set(seen)),
+            "enough": len(seen) - wrong >= HELPFUL_MARKS,
+            "residual_m": residual if any(value is not None for value in residual) else None,
+        }
+
+
+def helpful_order(
+    place: Float64[np.ndarray, " 3"], centres: Float64[np.ndarray, "n 3"], ranks: Float64[np.ndarray, " n"]
+) -> list[int]:
+    """An order in which photos tell where a point is: near ones that see it from elsewhere than those before.
+
+    Args:
+        place: The point.
+        centres: Of the cameras.
+        ranks: Their distances, ascending; greater for those that see the point less well.
+    """
+    directions = centres - place
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-300)
+    chosen, apart = [0], np.full(len(ranks), WIDE_RAD)
+    while len(chosen) < min(len(ranks), HELPFUL_PHOTOS):
+        apart = np.minimum(apart, np.arccos(np.clip(directions @ directions[chosen[-1]], -1.0, 1.0)))
+        score = apart / ranks
+        score[chosen] = -1.0
+        chosen.append(int(np.argmax(score)))
+    return [*chosen, *(k for k in range(len(ranks)) if k not in chosen)]
+
+
+def _listed(line: Float64[np.ndarray, "steps 2"]) -> list[list[float]] | None:
+    """The part of a line that a photo shows."""
+    shown = line[np.isfinite(line).all(axis=1)]
+    return np.round(shown, 1).tolist() if len(shown) > 1 else None
+
+
+def _coordinates(point: SurveyedPoint) -> list[float | None]:
+    return [point.x, point.y, point.z]

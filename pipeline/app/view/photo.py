@@ -1,0 +1,72 @@
+"""Photos as a browser shows them: in the stored grid, in which marks count, whatever way EXIF would turn them.
+
+A JPEG goes out as it is but for its metadata: a browser that sees no EXIF turns nothing, and not a pixel is lost. What
+a browser does not draw (TIFF, 16 bits) is converted without loss.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+from PIL import Image
+
+from splatpipe.pipeline.photos.photo_list import Photo, decode, open_picture, photo_path
+
+LARGEST_BYTES = 256 << 20
+SOI, SOS, APP0, APP1, APP15, COMMENT, APP2, APP14 = 0xD8, 0xDA, 0xE0, 0xE1, 0xEF, 0xFE, 0xE2, 0xEE
+KEPT = (APP0, APP14)  # what tells a decoder of colours; of APP2, the ICC profile alone
+ICC = b"ICC_PROFILE\0"
+PLAIN_MODES = ("RGB", "L")
+
+
+def shown_photo(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes, str]:
+    """A photo's bytes for a browser, and their media type.
+
+    Args:
+        photo: One of the capture's.
+        part: The folder of the part ``ingest.photos``.
+        photos_dir: The user's folder.
+
+    Raises:
+        SplatpipeError: if the file is gone or is no longer the one that was checked.
+    """
+    path = photo_path(photo, part, photos_dir)
+    try:
+        if path.stat().st_size <= LARGEST_BYTES:
+            with open_picture(path) as picture:
+                plain = picture.format == "JPEG" and picture.mode in PLAIN_MODES
+                plain = plain and picture.size == (photo.width, photo.height)
+            if plain:
+                return without_metadata(path.read_bytes()), "image/jpeg"
+    except (OSError, ValueError, SyntaxError):
+        pass  # told by the reader below
+    pixels = decode(photo, part, photos_dir)
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
+    return buffer.getvalue(), "image/png"
+
+
+def without_metadata(jpeg: bytes) -> bytes:
+    """A JPEG without EXIF, XMP, comments and what follows its picture.
+
+    Raises:
+        ValueError: if it is no JPEG.
+    """
+    if jpeg[:2] != bytes((0xFF, SOI)):
+        raise ValueError("no JPEG")
+    kept, at = [jpeg[:2]], 2
+    while True:
+        while jpeg[at : at + 2] == b"\xff\xff":  # fill bytes
+            at += 1
+        if len(jpeg) < at + 4 or jpeg[at] != 0xFF:
+            raise ValueError("a broken JPEG")
+        kind = jpeg[at + 1]
+        if kind == SOS:
+            return b"".join([*kept, jpeg[at:]])
+        end = at + 2 + int.from_bytes(jpeg[at + 2 : at + 4], "big")
+        segment = jpeg[at:end]
+        is_profile = kind == APP2 and segment[4:].startswith(ICC)
+        if not (APP0 <= kind <= APP15 or kind == COMMENT) or kind in KEPT or is_profile:
+            kept.append(segment)
+        at = end

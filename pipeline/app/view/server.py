@@ -1,0 +1,267 @@
+"""``splatpipe view``: the server, on 127.0.0.1 and nowhere else."""
+
+from __future__ import annotations
+
+import secrets
+import signal
+import socket
+import threading
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import jinja2
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp
+
+from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, NotThereError, open_inside
+from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, Guard
+from splatpipe.pipeline.app.view.landing import landing
+from splatpipe.pipeline.app.view.live import Live
+from splatpipe.pipeline.app.view.opened import Run, open_run
+from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, Stopped
+from splatpipe.pipeline.web import asset
+
+ADDRESS = "127.0.0.1"
+MARKING_PORT = (
+    8474  # if it is free: marks that a browser keeps belong to an address, and the next server has to have it
+)
+ASSETS = {
+    "landing.css": "text/css",
+    "live.css": "text/css",
+    "live.js": "text/javascript",
+    "mark.css": "text/css",
+    "mark.js": "text/javascript",
+}
+OF_RUN = {"content-security-policy": CSP_OF_RUN, "cache-control": "no-cache"}
+ALONE = {"cross-origin-opener-policy": "same-origin"}  # from the run's pages, which have our origin
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How to view.
+
+    Attributes:
+        port: Of the server; 0 for any that is free.
+        open_browser: Whether to open the page.
+        mark: Whether control points can be marked.
+        points: File of points to mark.
+    """
+
+    port: int = 0
+    open_browser: bool = True
+    mark: bool = False
+    points: Path | None = None
+
+
+def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
+    """Serve a run until Ctrl-C.
+
+    Args:
+        out: Its folder.
+        options: How.
+        say: Tells the user.
+
+    Raises:
+        SplatpipeError: if there is no run, or nothing to mark.
+        MachineError: if the port is taken.
+    """
+    run = open_run(out)
+    listening = _listen_for_marks() if options.mark and options.port == 0 else _listen(options.port)
+    live, token = Live(run), secrets.token_urlsafe(32)
+    pages = Pages(run, live, token)
+    try:
+        routes = [*(_marking(pages, options, say) if options.mark else ()), *pages.routes()]
+        start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
+        start += "mark" if options.mark else "live" if run.is_at_work() else ""
+        _take_signals_back()
+
+        def ready() -> None:
+            say(f"Open {start} (Ctrl-C ends it)")
+            if options.open_browser:
+                threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
+
+        _Server(_settings(make_app(routes, token)), ready).run(sockets=[listening])
+    except Stopped as stopped:
+        if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
+            raise
+    finally:
+        live.close()
+        listening.close()
+
+
+class _Server(uvicorn.Server):
+    """Says when it listens, and to signals as well."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._ready = ready
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to listen."""
+        await super().startup(sockets)
+        self._ready()
+
+
+def _take_signals_back() -> None:
+    """Put Python's handlers in place again: pyceres, once imported, takes SIGTERM for a crash and tells its stack."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.getsignal(number))
+
+
+def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> list[Route]:
+    """What marking adds."""
+    from splatpipe.pipeline.app.view.job import open_job
+    from splatpipe.pipeline.app.view.mark_routes import MarkPages
+    from splatpipe.pipeline.app.view.marking import Marking
+
+    marking = Marking(open_job(pages.run, options.points))
+    pages.marking = True
+    say(f"Marks go into {marking.job.text.path}")
+    return MarkPages(marking, pages).routes()
+
+
+def _settings(app: ASGIApp) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
+        http="h11",
+        ws="none",
+        lifespan="off",
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        limit_concurrency=64,
+    )
+
+
+def _listen_for_marks() -> socket.socket:
+    try:
+        return _listen(MARKING_PORT)
+    except MachineError:
+        return _listen(0)
+
+
+def _listen(port: int) -> socket.socket:
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((ADDRESS, port))
+    except OSError as error:
+        listening.close()
+        raise MachineError(
+            f"Port {port} of this machine cannot be used: {error.strerror}.", hint="Choose another: --port N."
+        ) from error
+    listening.listen(64)
+    return listening
+
+
+def make_app(routes: list[Route], token: str) -> ASGIApp:
+    """The application behind its guard."""
+    handlers: dict[Any, Any] = {SplatpipeError: _failed, HTTPException: _refused}
+    app = Starlette(routes=routes, exception_handlers=handlers)
+    app.router.redirect_slashes = False
+    return Guard(app, token)
+
+
+def _failed(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, SplatpipeError)
+    return JSONResponse({"message": error.message, "hint": error.hint}, 500)
+
+
+def _refused(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return PlainTextResponse(f"{error.detail}\n", error.status_code)
+
+
+class Pages:
+    """The pages that every view has.
+
+    Args:
+        run: The run.
+        live: Its training.
+        token: The secret that writing takes.
+    """
+
+    marking = False
+
+    def __init__(self, run: Run, live: Live, token: str) -> None:
+        self.run, self.live, self.token = run, live, token
+        folder = Path(__file__).parent / "pages"
+        self._templates = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True)
+
+    def routes(self) -> list[Route]:
+        """What is answered; the rest is a file of the run, or nothing."""
+        return [
+            Route("/", self._landing),
+            Route("/live", self._live),
+            Route("/api/live", self._state),
+            Route(
+                "/live/{stamp}/{number:int}/{what}.jpg", self._picture
+            ),  # the stamp is the page's: a new one, new pictures
+            Route("/live/{stamp}/viewer.html", self._viewer),
+            Route("/live/{stamp}/splat.spz", self._splat),
+            Route("/assets/{name}", self._asset),
+            Route("/{path:path}", self._file),
+        ]
+
+    def page(self, template: str, values: dict[str, Any]) -> Response:
+        """A page of ours."""
+        style = PurePosixPath(template).stem
+        text = self._templates.get_template(template).render(style=style, **values)
+        return HTMLResponse(text, headers=ALONE)
+
+    def _landing(self, _request: Request) -> Response:
+        return self.page("landing.html", landing(self.run, self.marking))
+
+    def _live(self, _request: Request) -> Response:
+        return self.page("live.html", {"name": self.run.name})
+
+    def _state(self, _request: Request) -> Response:
+        return JSONResponse(self.live.state())
+
+    def _picture(self, request: Request) -> Response:
+        given = request.path_params
+        if given["what"] not in ("render", "photo"):
+            raise HTTPException(404)
+        made = self.live.picture(given["number"], given["what"])
+        if made is None:
+            raise HTTPException(404)
+        return Response(made, media_type="image/jpeg", headers={"cache-control": "no-store"})
+
+    def _viewer(self, _request: Request) -> Response:
+        page = self.live.viewer("page")
+        if page is None:
+            raise HTTPException(404)
+        return Response(page, media_type="text/html", headers=OF_RUN)
+
+    def _splat(self, _request: Request) -> Response:
+        splat = self.live.viewer("splat")
+        if splat is None:
+            raise HTTPException(404)
+        return Response(splat, media_type="application/octet-stream", headers=OF_RUN)
+
+    def _asset(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in ASSETS:
+            raise HTTPException(404)
+        return Response(asset(name), media_type=ASSETS[name])
+
+    def _file(self, request: Request) -> Response:
+        """A file that the run delivers: its name is compared, and nothing is made of it."""
+        path = request.path_params["path"]
+        if path not in self.run.deliverables():
+            raise HTTPException(404)
+        try:
+            file = open_inside(self.run.out, path)
+        except NotThereError as error:
+            raise HTTPException(404) from error
+        kind = TYPES.get(PurePosixPath(path).suffix, "application/octet-stream")
+        return FileAnswer(file, kind, OF_RUN)

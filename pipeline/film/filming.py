@@ -1,0 +1,192 @@
+"""Films and stills of a trained model: its way through the scene, what a picture shows, and how it is written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float64
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.film.camera_path import Lens, angle_of
+from splatpipe.pipeline.film.clearance import Clearance, solid_places
+from splatpipe.pipeline.film.photo_route import Capture
+from splatpipe.pipeline.film.video import VideoWriter
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_views
+from splatpipe.pipeline.photos.images import Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.rendering import Model, as_trained, render_depth, render_normals, render_pixels
+from splatpipe.pipeline.splat.panorama import read_panorama
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.sky import WORK_MEGAPIXELS, SkyPhoto, up_of
+
+What = Literal["colour", "depth", "normals"]
+ASPECT = 16.0 / 9.0
+SAMPLED = 8  # cameras of a way whose depths tell the range of all
+RANGE = (0.01, 0.99)  # quantiles of depth between which colours go from near to far
+LEAST_SIDE, MOST_SIDE = 16, 8192  # pixels of a picture
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedScene:
+    """What is filmed.
+
+    Attributes:
+        model: The splat, and its sky if it has one.
+        options: How it was trained to be rendered.
+        cameras: Of the photos, at the size of training.
+        capture: The same as a way is looked for through it.
+    """
+
+    model: Model
+    options: rasterizer.RenderOptions
+    cameras: Sequence[Camera]
+    capture: Capture
+
+    def lens(self, size: tuple[int, int] | None) -> Lens:
+        """The photos' angle on a picture of some size; without one 16:9 with as many pixels as photos in training."""
+        if size is None:
+            pixels = float(np.median([camera.width * camera.height for camera in self.cameras]))
+            width = _even(math.sqrt(pixels * ASPECT))
+            size = (width, _even(width / ASPECT))
+        return Lens.of_angle(*size, angle_of(self.cameras))
+
+
+def _even(length: float) -> int:
+    return max(LEAST_SIDE, 2 * round(length / 2.0))
+
+
+def open_scene(parts: Mapping[str, Path], threads: int) -> TrainedScene:
+    """Read what training left.
+
+    Args:
+        parts: `train.model`, `train.plan`, `train.sky` and `undistort.dataset`.
+        threads: That read photos, where these have to tell which way is up.
+
+    Raises:
+        StageError: if one is broken.
+    """
+    gaussians = read_splat(parts["train.model"])
+    options, megapixels = as_trained(parts["train.plan"], gaussians)
+    sky = read_panorama(parts["train.sky"])
+    views = load_views(parts["undistort.dataset"])
+    points, tracks = load_points_and_tracks(parts["undistort.dataset"])
+    cameras = [reduced_camera(view.camera, megapixels) for view in views]
+    up = _up(views, cameras, points.xyz, threads) if sky is None else sky.up
+    seen = [tracks[camera.name] for camera in cameras]
+    capture = Capture(cameras, seen, points.xyz, up, Clearance(solid_places(gaussians)))
+    return TrainedScene((gaussians, sky), options, cameras, capture)
+
+
+def _up(
+    views: Sequence[View], cameras: Sequence[Camera], points: Float64[np.ndarray, "n 3"], threads: int
+) -> Float64[np.ndarray, " 3"]:
+    def photo(index: int) -> SkyPhoto:
+        camera, pixels, _ = reduced_view(views[index], WORK_MEGAPIXELS)
+        return SkyPhoto(camera, pixels)
+
+    return up_of(cameras, photo, points[np.isfinite(points).all(axis=1)], threads)
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Makes the pictures of a scene.
+
+    Attributes:
+        scene: What is shown.
+        what: Of it.
+        upright: Rotation from the model's frame to that in which normals are told.
+        scale: From the model's units to those in which depths are told.
+        depths: Nearest and farthest that have colours of their own, in those units.
+    """
+
+    scene: TrainedScene
+    what: What
+    upright: Float64[np.ndarray, "3 3"]
+    scale: float = 1.0
+    depths: tuple[float, float] = (1.0, 2.0)
+
+    def values(self, camera: Camera) -> Float[np.ndarray, "h w *k"] | None:
+        """Depths (h, w), 0 without a surface, or normals (h, w, 3), 0 without one, float32; None for colours."""
+        gaussians, _ = self.scene.model
+        if self.what == "depth":
+            return (self.scale * render_depth(gaussians, camera, self.scene.options)).astype(np.float32)
+        if self.what == "normals":
+            normals = render_normals(gaussians, camera, self.scene.options)
+            return np.asarray(normals @ self.upright.T.astype(np.float32), np.float32)
+        return None
+
+    def pixels(self, camera: Camera, values: Float[np.ndarray, "h w *k"] | None = None) -> Pixels:
+        """A picture to look at, (h, w, 3) RGB; of ``values`` where they are there already."""
+        values = self.values(camera) if values is None else values
+        if values is None:
+            return render_pixels(self.scene.model, camera, self.scene.options)
+        return coloured_depth(values, self.depths) if self.what == "depth" else coloured_normals(values)
+
+
+def depth_range(pictures: Pictures, cameras: Sequence[Camera]) -> tuple[float, float]:
+    """The depths that most of a way's pictures show, nearest and farthest."""
+    found = []
+    for index in np.unique(np.linspace(0, len(cameras) - 1, min(SAMPLED, len(cameras))).round().astype(int)):
+        values = pictures.values(cameras[index])
+        if values is not None and (values > 0.0).any():
+            found.append(values[values > 0.0])
+    if not found:
+        return 1.0, 2.0
+    nearest, farthest = np.quantile(np.concatenate(found), RANGE).tolist()
+    return nearest, max(farthest, 1.001 * nearest)
+
+
+def coloured_depth(depth: Float[np.ndarray, "h w"], depths: tuple[float, float]) -> Pixels:
+    """Depths as colours, even by ratio: red is near, blue far, black nothing; (h, w, 3) RGB."""
+    nearest, farthest = depths
+    share = np.log(np.maximum(depth, 1e-30) / nearest) / math.log(farthest / nearest)
+    steps = np.clip(255.5 - 255.0 * share, 0.0, 255.0).astype(np.uint8)
+    colours = np.asarray(cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, :, ::-1], np.uint8).copy()
+    colours[depth <= 0.0] = 0
+    return colours
+
+
+def coloured_normals(normals: Float[np.ndarray, "h w 3"]) -> Pixels:
+    """Normals as colours: red, green, blue grow with x, y, z; grey is nothing; (h, w, 3) RGB."""
+    return np.asarray(np.clip(127.5 * normals + 128.0, 0.0, 255.0), np.uint8)
+
+
+@dataclass(frozen=True)
+class FilmFile:
+    """Where a film goes, and how fast it runs.
+
+    Attributes:
+        path: A WebM or an MP4.
+        fps: Frames a second.
+    """
+
+    path: Path
+    fps: int
+
+
+def write_film(
+    file: FilmFile, cameras: Sequence[Camera], picture: Callable[[Camera], Pixels], report: Reporter
+) -> None:
+    """Render a way and write it.
+
+    Args:
+        file: Where to.
+        cameras: One a frame, all of one even size.
+        picture: Makes a frame.
+        report: Takes the progress.
+
+    Raises:
+        MachineError: if the file cannot be written.
+    """
+    size = (cameras[0].width, cameras[0].height)
+    with VideoWriter(file.path, size, file.fps) as film:
+        for done, camera in enumerate(cameras, start=1):
+            film.write(picture(camera))
+            report.progress(done, len(cameras), "filming", "frames")

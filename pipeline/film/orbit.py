@@ -1,0 +1,75 @@
+"""A circle around what a capture shows: one turn of a camera that looks at its middle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.film.camera_path import STEEP, Route, upright_route
+from splatpipe.pipeline.film.clearance import Clearance
+from splatpipe.pipeline.film.photo_route import Capture, followed_photos
+from splatpipe.pipeline.geometry.upright import rotation_to_up
+
+LOOKED_AT = 72  # places of a circle at which it has to be clear
+CLEAR = 0.25  # of its distance from the middle: from what is solid
+STEP_DEG = 5.0  # a circle that is not clear is raised by that
+HIGHEST_DEG = 70.0
+WIDER = (1.0, 1.25, 1.5, 2.0)  # times the photos' distance, should no height do
+OVER_A_MAP_DEG = 50.0  # elevation where all photos look down: walls that no photo shows stay out of sight
+LEAST_ELEVATION_DEG = 5.0
+
+
+def orbit(capture: Capture, frames: int) -> Route:
+    """One turn around the middle of what the photos show, at their distance and height; its end joins its beginning.
+
+    Where something is in the way the circle is raised, then widened.
+
+    Args:
+        capture: At least one photo.
+        frames: At least one.
+
+    Returns:
+        A route a frame, in the upright frame of ``capture.up``.
+
+    Raises:
+        UsageError: if the photos show nothing to go around.
+    """
+    kept, _ = followed_photos(capture)
+    if len(kept) == 0:
+        raise UsageError("No photo sees enough of the sparse points to tell what to go around.")
+    upright = rotation_to_up(capture.up)
+    targets = np.array([np.median(capture.points[capture.seen[index]], axis=0) for index in kept])
+    middle = np.median(targets @ upright.T, axis=0)
+    route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
+    oblique = route.pitches > STEEP
+    places = (route.places[oblique] if oblique.any() else route.places) - middle
+    distance = float(np.median(np.linalg.norm(places, axis=1)))
+    elevation = float(np.median(np.arctan2(places[:, 2], np.hypot(places[:, 0], places[:, 1]))))
+    lowest = max(elevation, math.radians(LEAST_ELEVATION_DEG)) if oblique.any() else math.radians(OVER_A_MAP_DEG)
+    distance, elevation = _clear(capture.clearance, (middle, distance, lowest), upright)
+    first = math.atan2(places[0, 1], places[0, 0])
+    return _circle(middle, distance, elevation, first + 2.0 * math.pi * np.arange(frames) / frames)
+
+
+def _clear(clearance: Clearance, wanted: tuple[np.ndarray, float, float], upright: np.ndarray) -> tuple[float, float]:
+    """Distance and elevation (radians) of the first circle that is clear; of the clearest where none is."""
+    middle, distance, lowest = wanted
+    angles = 2.0 * math.pi * np.arange(LOOKED_AT) / LOOKED_AT
+    tried: list[tuple[float, float, float]] = []
+    highest = max(lowest, math.radians(HIGHEST_DEG))
+    for factor in WIDER:
+        for elevation in np.arange(lowest, highest + 1e-9, math.radians(STEP_DEG)).tolist():
+            circle = _circle(middle, factor * distance, elevation, angles)
+            share = float(clearance.at(circle.places @ upright).min()) / (factor * distance)
+            if share >= CLEAR:
+                return factor * distance, elevation
+            tried.append((share, factor * distance, elevation))
+    return max(tried)[1:]
+
+
+def _circle(middle: np.ndarray, distance: float, elevation: float, angles: np.ndarray) -> Route:
+    flat, height = distance * math.cos(elevation), distance * math.sin(elevation)
+    around = np.column_stack((flat * np.cos(angles), flat * np.sin(angles), np.full(len(angles), height)))
+    return Route(middle + around, angles + math.pi, np.full(len(angles), -elevation), np.zeros(len(angles)))

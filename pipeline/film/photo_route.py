@@ -1,0 +1,232 @@
+"""Which of a capture's photos a film goes along, and in what order.
+
+The photos' names mostly tell how the drone flew, so that is the order unless another is much shorter. It breaks where
+the next photo is far away or something solid is between the two; strays stand alone there. Of what is left a film
+takes the stretch that fits its time at a comfortable speed and whose photos see the most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.film.camera_path import Route, evenly_timed, sampled, smoothed, upright_route
+from splatpipe.pipeline.film.clearance import Clearance
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.upright import rotation_to_up
+
+SPEED = 0.7  # comfortable, lengths of the way (see ``camera_path``) a second: around a building, 28° a second
+CORNER_S = 1.0  # standard deviation of the Gaussian that rounds corners, seconds at that speed
+CORNER_LEGS = 0.6  # the same in legs from photo to photo, where these are longer
+ALONE_LEGS, ALONE_LENGTH = 4.0, 0.5  # a stray's way to the nearest photo: in medians of that, and in lengths
+FEWEST_SEEN = 10  # sparse points; a photo that sees fewer hangs in the air
+ODD_DEPTH = 5.0  # times nearer or farther than the others': the ground at take-off, a test shot of the sky
+LONG_LEG = 5.0  # medians: no flight goes on there
+LONGEST_LEG = 2.0  # lengths; some 80° around a building
+DETOUR_TIMES, DETOUR_LEGS = 3.0, 1.5  # a photo aside: there and back over straight on; each over the median leg
+FEWEST_LEGS = 4  # to know what is aside
+LONGER = 1.6  # names are the order unless they make the way so many times longer
+CLEAR = 0.5  # of the photos' own distance from what is solid, all the way
+CLEAR_STEPS = 4.0  # looked at so many times within that distance
+MOST_COMPARED = 3000  # photos, each with each: tables of 72 MB
+SOFTER = 5  # halvings of the rounding, should a rounded corner come too near
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """What a film needs to know of a capture.
+
+    Attributes:
+        cameras: Of all photos, sorted by name.
+        seen: Of each, rows of the sparse points that it observes.
+        points: The sparse points, world units.
+        up: Against gravity, a unit vector.
+        clearance: From what is solid.
+    """
+
+    cameras: Sequence[Camera]
+    seen: Sequence[Int64[np.ndarray, " _"]]
+    points: Float64[np.ndarray, "n 3"]
+    up: Float64[np.ndarray, " 3"]
+    clearance: Clearance
+
+    def depths(self) -> Float64[np.ndarray, " m"]:
+        """Median depth of each photo's points, world units; NaN where it sees none."""
+        medians = np.full(len(self.cameras), np.nan)
+        for number, (camera, rows) in enumerate(zip(self.cameras, self.seen, strict=True)):
+            z = self.points[rows] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+            z = z[np.isfinite(z) & (z > 0.0)]
+            medians[number] = np.median(z) if len(z) else np.nan
+        return medians
+
+
+def photo_film(capture: Capture, frames: int, seconds: float) -> Route:
+    """A film along a capture's photos.
+
+    Args:
+        capture: At least two photos.
+        frames: At least one.
+        seconds: That they last.
+
+    Returns:
+        A route a frame, in the upright frame of ``capture.up``.
+
+    Raises:
+        UsageError: if there is no way between any two photos.
+    """
+    kept, distance = followed_photos(capture)
+    if len(kept) < 2:
+        raise UsageError("Fewer than two photos see the same things: there is no path between them.")
+    route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
+    kept = kept[_order(route, distance)]
+    kept = kept[_no_detours(upright_route([capture.cameras[int(index)] for index in kept], capture.up), distance)]
+    whole = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
+    legs = whole.steps(distance)
+    way, own = smoothed(whole, distance, CORNER_S * SPEED)  # photos taken to and fro come to no length
+    length = np.append(0.0, np.cumsum(way.steps(distance)))
+    lengths = np.diff(np.interp(own, np.arange(len(way)), length))
+    stretch = _stretch(capture, kept, legs, lengths, SPEED * seconds)
+    cameras = [capture.cameras[int(index)] for index in kept[stretch]]
+    chosen = slice(stretch.start, stretch.stop - 1)
+    detour = float(legs[chosen].sum()) / max(float(lengths[chosen].sum()), 1e-9)
+    speed = min(SPEED, float(lengths[chosen].sum()) / seconds)
+    width = max(detour * CORNER_S * speed, CORNER_LEGS * float(np.median(legs[chosen])))
+    way = _clear_way(capture, upright_route(cameras, capture.up), distance, width)
+    return sampled(way, evenly_timed(way, distance, frames, seconds))
+
+
+def _clear_way(capture: Capture, route: Route, distance: float, width: float) -> Route:
+    """A route smoothed as far as it stays away from what is solid."""
+    upright = rotation_to_up(capture.up)
+    wanted = CLEAR * float(capture.clearance.at(route.places @ upright).min())
+    way, _ = smoothed(route, distance, width)
+    for _ in range(SOFTER):
+        if bool((capture.clearance.at(way.places @ upright) >= wanted).all()):
+            break
+        width *= 0.5
+        way, _ = smoothed(route, distance, width)
+    return way
+
+
+def _no_detours(route: Route, distance: float) -> Int64[np.ndarray, " k"]:
+    """All but single photos from which the way leads back at once: a close-up, a shot of something else."""
+    legs = route.steps(distance)
+    if len(legs) < FEWEST_LEGS:
+        return np.arange(len(route))
+    past = np.array([route[index : index + 3 : 2].steps(distance)[0] for index in range(len(legs) - 1)])
+    there, back = legs[:-1], legs[1:]
+    odd = (there + back > DETOUR_TIMES * past) & (np.minimum(there, back) > DETOUR_LEGS * float(np.median(legs)))
+    return np.flatnonzero(~np.concatenate(([False], odd, [False])))
+
+
+def followed_photos(capture: Capture) -> tuple[Int64[np.ndarray, " k"], float]:
+    """The photos that are no strays, in name order, and how far away what they see is."""
+    depths = capture.depths()
+    enough = np.array([len(rows) >= FEWEST_SEEN for rows in capture.seen]) & np.isfinite(depths)
+    if enough.sum() < 2:
+        enough = np.isfinite(depths)
+    if not enough.any():
+        return np.zeros(0, np.int64), 1.0
+    distance = float(np.median(depths[enough]))
+    alike = enough & (depths <= ODD_DEPTH * distance) & (depths >= distance / ODD_DEPTH)
+    kept = np.flatnonzero(alike)
+    if 2 < len(kept) <= MOST_COMPARED:
+        route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
+        table = _table(route, distance)
+        np.fill_diagonal(table, np.inf)
+        nearest = table.min(axis=1)
+        kept = kept[nearest <= max(ALONE_LEGS * float(np.median(nearest)), ALONE_LENGTH)]
+    return kept, distance
+
+
+def _table(route: Route, distance: float) -> Float64[np.ndarray, "n n"]:
+    """Lengths of the ways between all pairs."""
+    places, views = route.places / distance, route.directions()
+    squares = (places**2).sum(axis=1)
+    moved2 = np.maximum(squares[:, None] + squares[None] - 2.0 * places @ places.T, 0.0)
+    return np.asarray(np.sqrt(moved2 + np.arccos(np.clip(views @ views.T, -1.0, 1.0)) ** 2))
+
+
+def _order(route: Route, distance: float) -> Int64[np.ndarray, " n"]:
+    """As the photos are sorted, or from each to the nearest that is left, where that is much shorter."""
+    named = np.arange(len(route))
+    if len(route) > MOST_COMPARED:
+        return named
+    table = _table(route, distance)
+    nearest, left = [0], np.ones(len(route), bool)
+    left[0] = False
+    while left.any():
+        nearest.append(int(np.argmin(np.where(left, table[nearest[-1]], np.inf))))
+        left[nearest[-1]] = False
+    other = np.array(nearest)
+
+    def typical(order: Int64[np.ndarray, " n"]) -> float:  # the mean without single jumps from flight to flight
+        legs = np.sort(table[order[:-1], order[1:]])
+        return float(legs[: max(1, -(-9 * len(legs) // 10))].sum())
+
+    return other if typical(named) > LONGER * typical(other) else named
+
+
+def _open(capture: Capture, photos: Int64[np.ndarray, " n"], legs: Float64[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Whether a film may go from each photo to the next."""
+    near = (legs <= LONG_LEG * max(float(np.median(legs)), 1e-9)) & (legs <= LONGEST_LEG)
+    places = np.array([capture.cameras[int(index)].centre() for index in photos])
+    own = capture.clearance.at(places)
+    for leg in np.flatnonzero(near):
+        wanted = CLEAR * min(own[leg], own[leg + 1])
+        if np.isfinite(wanted):
+            step = max(wanted / CLEAR_STEPS, 1e-9)
+            near[leg] = bool((capture.clearance.between(places[leg], places[leg + 1], step) >= wanted).all())
+    return near
+
+
+def _stretch(
+    capture: Capture,
+    photos: Int64[np.ndarray, " n"],
+    legs: Float64[np.ndarray, " m"],
+    lengths: Float64[np.ndarray, " m"],
+    longest: float,
+) -> slice:
+    """The photos, one after the other without a break, within a length, that see the most points.
+
+    Args:
+        capture: That they are of.
+        photos: In the order of the way.
+        legs: From each to the next.
+        lengths: The same of the smooth way.
+        longest: Of these together.
+
+    Raises:
+        UsageError: if no two are left.
+    """
+    is_open = _open(capture, photos, legs)
+    counts = np.zeros(len(capture.points), np.int64)
+    best, most = slice(0, 0), 0
+    start, length = 0, 0.0
+    counts[capture.seen[photos[0]]] += 1
+    seen = len(capture.seen[photos[0]])
+    for end in range(1, len(photos)):
+        rows = capture.seen[photos[end]]
+        seen += int((counts[rows] == 0).sum())
+        counts[rows] += 1
+        length += lengths[end - 1]
+        while start < end and (not is_open[end - 1] or length > longest):
+            if start == end - 1 and is_open[end - 1]:
+                break  # a single leg may take longer than is comfortable
+            rows = capture.seen[photos[start]]
+            counts[rows] -= 1
+            seen -= int((counts[rows] == 0).sum())
+            length -= lengths[start]
+            start += 1
+        if end > start and seen > most:
+            best, most = slice(start, end + 1), seen
+    if most == 0:
+        raise UsageError(
+            "No two neighbouring photos have a free way between them, so there is no path along them.",
+            hint="Take --path orbit, or a file of keyframes.",
+        )
+    return best

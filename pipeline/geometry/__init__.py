@@ -1,0 +1,1 @@
+"""Cameras, similarities and points: the geometry that everything else stands on."""

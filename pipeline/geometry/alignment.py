@@ -1,0 +1,389 @@
+"""The robust similarity between two sets of points of which some may be wrong, and how well they determine it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.geometry.correspondences import (
+    LEAST_NOISE_FACTOR,
+    REDUNDANT,
+    Correspondences,
+    DirectionPrior,
+    Limit,
+    Shared,
+    normed,
+)
+from splatpipe.pipeline.geometry.similarity import (
+    FREE,
+    SIMILARITY,
+    Similarity,
+    cross_matrix,
+    fit_similarity,
+    moved_similarity,
+    rotation_from_vector,
+    similarity_jacobian,
+    solve_step,
+)
+
+__all__ = [
+    "Correspondences",
+    "DirectionPrior",
+    "Shared",
+    "SimilarityFit",
+    "offset_step_sigmas",
+    "robust_similarity",
+    "turn_about_axis",
+]
+
+MAX_HYPOTHESES = 1000  # with half the points wrong, one triple in eight is right: missing it has odds of 1e-58
+REFINED_HYPOTHESES = 5
+LOCAL_ROUNDS = 5
+WEAK_ROTATION_RAD = math.radians(5.0)  # a rotation known less well takes a prior, where there is one
+IRLS_ROUNDS = 50
+IRLS_TOLERANCE = 1e-13  # of a step, in radians and relative to the extent
+CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
+MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
+OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors never are so large
+LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be found
+CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at some 1 in 10,000
+OUTLIER_SIGMAS = 3.0  # and an error within what the position states is none
+LEAST_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
+MOST_GROUPS = 20  # whose triples are tried: one good group is enough
+
+
+@dataclass(frozen=True)
+class SimilarityFit:
+    """A robust similarity and how well it is determined.
+
+    Attributes:
+        similarity: Source to target.
+        inliers: Which points agree with the fit. These took part in it, unless they are fewer than 3: then all did, and
+            there is no fit to speak of.
+        residuals: Transformed source less target, in the target's units; the groups' shared errors are taken off.
+        noise: Robust spread of the residuals over the stated sigmas: 1 where these are right.
+        sigma_scale: Standard deviation of the scale, relative; infinite where it is not determined.
+        sigma_rotation_rad: Standard deviation of the rotation about its weakest axis; infinite likewise.
+        used_prior: Whether the points left a rotation to the prior.
+        offsets: The error that each group shares (target less truth), in the target's units; empty without groups.
+    """
+
+    similarity: Similarity
+    inliers: Bool[np.ndarray, " n"]
+    residuals: Float64[np.ndarray, "n 3"]
+    noise: float
+    sigma_scale: float
+    sigma_rotation_rad: float
+    used_prior: bool
+    offsets: Float64[np.ndarray, "g 3"]
+
+
+def robust_similarity(
+    points: Correspondences, max_error: float | None, prior: DirectionPrior | None = None
+) -> SimilarityFit:
+    """Fit a similarity to points of which some may be wrong.
+
+    Triples give hypotheses (every triple of a small set, else 1000 from a fixed seed), scored by squared residuals cut
+    off at ``max_error`` and refined locally (MSAC: Torr and Zisserman 2000; LO-RANSAC: Chum, Matas and Kittler 2003).
+    From the best, reweighted least squares with the points' own sigmas and Cauchy's weights. Never a reflection, and
+    the same bits for the same input. Errors that groups share are estimated along, each with its sigma as its prior;
+    they are eliminated from the normal equations, so that what is said of accuracy holds with them.
+
+    Args:
+        points: At least 3, not all in one place.
+        max_error: Points further than this from the fit, in the target's units, are left out of it. None: those that
+            are off by far more than the noise of at least half of the points, which is found.
+        prior: Directions that take part where the points leave a rotation free by more than 5° (points on a line).
+
+    Raises:
+        ValueError: if there are fewer than 3 points or their source positions coincide.
+    """
+    if len(points) < 3:
+        raise ValueError("a similarity needs at least 3 points")
+    if not np.ptp(points.source, axis=0).any():
+        raise ValueError("all points of the source coincide")
+    hypotheses = _hypotheses(points)
+    if max_error is None:
+        fit, limit = _at_own_noise(points, hypotheses)
+    else:
+        limit = Limit(max_error)
+        fit = _refine(_consensus(points, limit, hypotheses), points, limit, None)
+    if prior is None or fit.sigma_rotation_rad <= WEAK_ROTATION_RAD:
+        return fit
+    chosen = points.only(fit.inliers) if fit.inliers.sum() >= 3 else points
+    _, axis = _weakest_rotation(_information(_Problem(chosen, fit.similarity), _sigma_weights(chosen), None))
+    start = turn_about_axis(fit.similarity, axis, chosen.target.mean(axis=0), prior)
+    return _refine(start, points, limit, prior)
+
+
+def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: int) -> Float64[np.ndarray, "g 3"]:
+    """Standard deviations of the differences between the groups' offsets and one group's.
+
+    Args:
+        fit: Of the points.
+        points: With shared errors.
+        reference: The group that the others are compared with.
+    """
+    assert points.shared is not None
+    chosen = points.only(fit.inliers).at_noise(fit.noise)
+    assert chosen.shared is not None
+    problem, weights = _Problem(chosen, fit.similarity), _sigma_weights(chosen)
+    membership = chosen.shared.membership()
+    own = membership @ weights + 1.0 / chosen.shared.sigmas**2
+    # An offset is the mean of what is left of its points, so it moves with the similarity by their mean Jacobian.
+    mean = np.einsum("gn,nk,nkp->gkp", membership, weights, problem.jacobian()) / own[:, :, None]
+    steps = mean - mean[reference]
+    covariance = np.linalg.pinv(_information(problem, weights, None), rcond=FREE, hermitian=True)
+    variances = np.einsum("gkp,pq,gkq->gk", steps, covariance, steps) + 1.0 / own + 1.0 / own[reference]
+    return np.asarray(max(fit.noise, LEAST_NOISE_FACTOR) * np.sqrt(np.maximum(variances, 0.0)))
+
+
+def turn_about_axis(
+    similarity: Similarity, axis: Float64[np.ndarray, " 3"], pivot: Float64[np.ndarray, " 3"], prior: DirectionPrior
+) -> Similarity:
+    """Turn the target side about an axis through a pivot so that the prior's directions agree best."""
+    across = np.eye(3) - np.outer(axis, axis)
+    have, want = prior.source @ similarity.rotation.T @ across, prior.target @ across
+    angle = math.atan2(float((np.cross(have, want) @ axis).sum()), float((have * want).sum()))
+    turn = rotation_from_vector(axis * angle)
+    return Similarity(similarity.scale, turn @ similarity.rotation, turn @ (similarity.translation - pivot) + pivot)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Least squares about a similarity: unknowns are a rotation vector, the scale's logarithm, the translation.
+
+    Coordinates are taken from the points' mean, which keeps the unknowns apart.
+    """
+
+    points: Correspondences
+    similarity: Similarity
+
+    @property
+    def arms(self) -> Float64[np.ndarray, "n 3"]:
+        """From the mean to each transformed point."""
+        source = self.points.source
+        return np.asarray(self.similarity.scale * ((source - source.mean(axis=0)) @ self.similarity.rotation.T))
+
+    def jacobian(self) -> Float64[np.ndarray, "n 3 7"]:
+        """Of the transformed points."""
+        return similarity_jacobian(self.similarity, self.points.source)
+
+    def moved(self, step: Float64[np.ndarray, " 7"]) -> Similarity:
+        """The similarity after a step of the unknowns."""
+        return moved_similarity(self.similarity, self.points.source, step)
+
+
+def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tuple[SimilarityFit, Limit]:
+    """The fit of the least limit that does not cut into the noise which it shows, with half of the points or more.
+
+    A limit below the noise leaves points within it, spread up to it; their spread, counted by the degrees of freedom
+    that the fit leaves, says so. From some times the noise on, what is outside is no noise.
+    """
+    limit = Limit(OUTLIER_SIGMAS, of_sigmas=True)
+    # Errors of all sizes have no noise that half of them share; a limit as wide as the target tells nothing.
+    widest = float(normed(points.target - points.target.mean(axis=0), points).max())
+    while True:
+        fit = _refine(_consensus(points, limit, hypotheses), points, limit, None)
+        used = int(fit.inliers.sum())
+        degrees = max(1, 3 * used - SIMILARITY)
+        spread = math.sqrt(3.0 * float((normed(fit.residuals, points)[fit.inliers] ** 2).sum()) / degrees)
+        settled = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
+        if settled or used == len(points) or limit.most > widest:
+            return fit, limit
+        limit = Limit(LIMIT_STEP * limit.most, of_sigmas=True)
+
+
+def _hypotheses(points: Correspondences) -> list[Similarity]:
+    """Similarities of triples, and of all points; accurate points count more."""
+    weights = (np.median(points.sigmas) / points.sigmas).mean(axis=1) ** 2
+    triples = _triples(points)
+    found = fit_similarity(points.source[triples], points.target[triples], weights[triples])
+    hypotheses = [Similarity(float(scale), r, t) for scale, r, t in zip(*found, strict=True) if scale > 0.0]
+    return [*hypotheses, _closed_form(points, weights)]
+
+
+def _consensus(points: Correspondences, limit: Limit, hypotheses: list[Similarity]) -> Similarity:
+    """The best hypothesis, refined."""
+    weights = (np.median(points.sigmas) / points.sigmas).mean(axis=1) ** 2
+    costs = _costs(points, limit, hypotheses)
+    best_cost, best = math.inf, hypotheses[-1]
+    for index in np.argsort(costs, kind="stable")[:REFINED_HYPOTHESES]:
+        candidate, cost = hypotheses[int(index)], float(costs[index])
+        for _ in range(LOCAL_ROUNDS):
+            if cost < best_cost:
+                best_cost, best = cost, candidate
+            settled = points.without(_median_offsets(candidate, points))
+            near = limit.near(_residuals(candidate, settled), points)
+            if near.sum() < 3:
+                break
+            candidate = _closed_form(settled.only(near), weights[near])
+            cost = float(_costs(points, limit, [candidate])[0])
+    return best
+
+
+def _costs(points: Correspondences, limit: Limit, hypotheses: list[Similarity]) -> Float64[np.ndarray, " h"]:
+    """The squares of the residuals, cut off at the limit; what groups share is taken off as their medians."""
+    turned = np.stack([hypothesis.scale * hypothesis.rotation for hypothesis in hypotheses])
+    residuals = np.einsum("hij,nj->hni", turned, points.source) - points.target
+    residuals += np.stack([hypothesis.translation for hypothesis in hypotheses])[:, None]
+    for group in range(0 if points.shared is None else len(points.shared.sigmas)):
+        assert points.shared is not None
+        members = points.shared.group == group
+        if members.any():
+            residuals[:, members] -= np.median(residuals[:, members], axis=1, keepdims=True)
+    return np.asarray(np.minimum(limit.squares(residuals, points), limit.most**2).sum(axis=1))
+
+
+def _refine(start: Similarity, points: Correspondences, limit: Limit, prior: DirectionPrior | None) -> SimilarityFit:
+    """Reweighted least squares on the points near the fit, until these stay the same."""
+    similarity = start
+    settled = points.without(_median_offsets(start, points))
+    inliers = limit.near(_residuals(start, settled), points)
+    if inliers.sum() < 3:
+        inliers = np.ones(len(points), dtype=bool)
+    near, noise, offsets = inliers, 1.0, np.zeros((0, 3))
+    for _ in range(LOCAL_ROUNDS):
+        similarity, noise, offsets = _reweighted(similarity, points.only(inliers), prior)
+        residuals = _residuals(similarity, points.without(offsets))
+        off = normed(residuals, points)
+        near = limit.near(residuals, points)
+        near &= off <= max(OUTLIER_SIGMAS, OUTLIER_NOISES * noise)
+        if near.sum() < 3 or (near == inliers).all():
+            break
+        inliers = near
+    chosen = points.only(inliers).at_noise(noise)
+    information = _information(_Problem(chosen, similarity), _sigma_weights(chosen), prior)
+    factor = max(noise, LEAST_NOISE_FACTOR) if len(chosen) >= REDUNDANT else max(noise, 1.0)
+    sigma_rotation, _ = _weakest_rotation(information)
+    return SimilarityFit(
+        similarity=similarity,
+        inliers=near,
+        residuals=_residuals(similarity, points.without(offsets)),
+        noise=noise,
+        sigma_scale=factor * _sigma_scale(information),
+        sigma_rotation_rad=factor * sigma_rotation,
+        used_prior=prior is not None,
+        offsets=offsets,
+    )
+
+
+def _reweighted(
+    similarity: Similarity, points: Correspondences, prior: DirectionPrior | None
+) -> tuple[Similarity, float, Float64[np.ndarray, "g 3"]]:
+    """Gauss-Newton with Cauchy's weights at the residuals' own spread; returns the noise and the offsets, too."""
+    noise = 1.0
+    offsets = _median_offsets(similarity, points)
+    stated = points
+    for _ in range(IRLS_ROUNDS):
+        off = normed(_residuals(similarity, points.without(offsets)), points)
+        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, LEAST_NOISE)
+        weights = _sigma_weights(points) / (1.0 + (off / (CAUCHY * noise)) ** 2)[:, None]
+        points = stated.at_noise(noise)
+        problem = _Problem(points, similarity)
+        offsets = _offsets(similarity, points, weights)
+        residuals = _residuals(similarity, points.without(offsets))
+        gradient = np.einsum("nk,nkp->p", weights * residuals, problem.jacobian())
+        if prior is not None:
+            turned = prior.source @ similarity.rotation.T
+            gradient[:3] += np.cross(turned, turned - prior.target).sum(axis=0) / prior.sigma_rad**2
+        step = -solve_step(_information(problem, weights, prior), gradient)
+        similarity = problem.moved(step)
+        extent = float(np.abs(problem.arms).max())
+        if np.abs(step[:4]).max() < IRLS_TOLERANCE and np.abs(step[4:]).max() < IRLS_TOLERANCE * extent:
+            break
+    return similarity, noise, _offsets(similarity, points, weights)
+
+
+def _information(
+    problem: _Problem, weights: Float64[np.ndarray, "n 3"], prior: DirectionPrior | None
+) -> Float64[np.ndarray, "7 7"]:
+    """The normal matrix: points by their weights, the prior by its sigma, shared errors eliminated."""
+    jacobian = problem.jacobian()
+    information = np.einsum("nkp,nk,nkq->pq", jacobian, weights, jacobian)
+    shared = problem.points.shared
+    if shared is not None:
+        coupled = np.einsum("gn,nk,nkp->gkp", shared.membership(), weights, jacobian)
+        own = shared.membership() @ weights + 1.0 / shared.sigmas**2
+        information -= np.einsum("gkp,gk,gkq->pq", coupled, 1.0 / own, coupled)
+    if prior is not None:
+        turned = cross_matrix(prior.source @ problem.similarity.rotation.T)
+        information[:3, :3] += (np.swapaxes(turned, 1, 2) @ turned).sum(axis=0) / prior.sigma_rad**2
+    return np.asarray(information)
+
+
+def _weakest_rotation(information: Float64[np.ndarray, "7 7"]) -> tuple[float, Float64[np.ndarray, " 3"]]:
+    """Standard deviation and axis of the least determined rotation, whatever scale and translation are."""
+    others = np.linalg.pinv(information[3:, 3:], hermitian=True)
+    left = information[:3, :3] - information[:3, 3:] @ others @ information[3:, :3]
+    values, vectors = np.linalg.eigh((left + left.T) / 2.0)
+    weakest = float(values[0])
+    return (1.0 / math.sqrt(weakest) if weakest > FREE * values[2] else math.inf), vectors[:, 0]
+
+
+def _sigma_scale(information: Float64[np.ndarray, "7 7"]) -> float:
+    rest = [0, 1, 2, 4, 5, 6]
+    others = np.linalg.pinv(information[np.ix_(rest, rest)], rcond=FREE, hermitian=True)
+    left = float(information[3, 3] - information[3, rest] @ others @ information[rest, 3])
+    return 1.0 / math.sqrt(left) if left > FREE * information[3, 3] else math.inf
+
+
+def _triples(points: Correspondences) -> np.ndarray:
+    """Of all points; where groups share errors, half within groups, which these errors leave alone."""
+    everyone = np.arange(len(points))
+    if points.shared is None:
+        return _triples_of(everyone, MAX_HYPOTHESES)
+    groups = [np.flatnonzero(members) for members in points.shared.membership()]
+    large = sorted((group for group in groups if len(group) >= 3), key=len, reverse=True)[:MOST_GROUPS]
+    share = MAX_HYPOTHESES // (2 * max(1, len(large)))
+    within = [_triples_of(group, share) for group in large]
+    return np.concatenate([*within, _triples_of(everyone, MAX_HYPOTHESES // 2)])
+
+
+def _triples_of(indices: np.ndarray, most: int) -> np.ndarray:
+    if math.comb(len(indices), 3) <= most:
+        return np.asarray(indices[np.array(list(itertools.combinations(range(len(indices)), 3)))])
+    generator = np.random.Generator(np.random.PCG64(0))
+    draws = [generator.choice(len(indices), 3, replace=False, shuffle=False) for _ in range(most)]
+    return np.asarray(indices[np.stack(draws)])
+
+
+def _closed_form(points: Correspondences, weights: Float64[np.ndarray, " n"]) -> Similarity:
+    scale, rotation, translation = fit_similarity(points.source, points.target, weights)
+    return Similarity(max(float(scale), 1e-300), rotation, translation)
+
+
+def _residuals(similarity: Similarity, points: Correspondences) -> Float64[np.ndarray, "n 3"]:
+    return np.asarray(similarity.apply(points.source) - points.target)
+
+
+def _median_offsets(similarity: Similarity, points: Correspondences) -> Float64[np.ndarray, "g 3"]:
+    """The error that each group shares, as the median of its points' (target less transformed source)."""
+    if points.shared is None:
+        return np.zeros((0, 3))
+    errors = -_residuals(similarity, points)
+    offsets = np.zeros_like(points.shared.sigmas)
+    for group in range(len(offsets)):
+        members = points.shared.group == group
+        if members.any():
+            offsets[group] = np.median(errors[members], axis=0)
+    return offsets
+
+
+def _offsets(
+    similarity: Similarity, points: Correspondences, weights: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "g 3"]:
+    """The same by least squares, drawn to zero by the groups' sigmas."""
+    if points.shared is None:
+        return np.zeros((0, 3))
+    membership = points.shared.membership()
+    sums = membership @ (-weights * _residuals(similarity, points))
+    return np.asarray(sums / (membership @ weights + 1.0 / points.shared.sigmas**2))
+
+
+def _sigma_weights(points: Correspondences) -> Float64[np.ndarray, "n 3"]:
+    return 1.0 / points.sigmas**2

@@ -1,0 +1,1 @@
+"""Depths of photos by many views."""

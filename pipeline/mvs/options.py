@@ -1,0 +1,23 @@
+"""Options of the stages that start the splat. Light to import."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from splatpipe.pipeline.engine.ranges import PositiveInt
+from splatpipe.pipeline.engine.stage import StageConfig
+
+
+class InitializeConfig(StageConfig):
+    max_gaussians: PositiveInt = 1_000_000
+    """At most this many sparse points become Gaussians, those seen in most photos first."""
+    opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
+    """Opacity at the start. Published: 0.1, from which walls stay a fog whose depth lies behind its front."""
+    max_angle: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+    """Cap on a Gaussian's size for outliers, as a share of its distance to the nearest camera."""
+    dense: Literal["off", "sweep"] = "off"
+    """`sweep` adds points where the sparse ones are thin, by a plane sweep between neighbouring photos."""
+    dense_points: PositiveInt = 50_000
+    """At most this many are added, evenly spread. Stay well below `train.max_gaussians`: a full start cannot grow."""

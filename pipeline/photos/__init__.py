@@ -1,0 +1,1 @@
+"""Photos: what their metadata say, the checked list, and the undistorted dataset."""

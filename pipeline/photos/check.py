@@ -1,0 +1,282 @@
+"""Checks one photo: read once, hashed, decoded whole, its metadata taken."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped
+from PIL import Image
+
+from splatpipe.pipeline.photos.exif import Exif, read_exif
+from splatpipe.pipeline.photos.photo_list import load_stored, open_picture
+from splatpipe.pipeline.photos.scan import Candidate, LeftOut
+from splatpipe.pipeline.photos.xmp import find_packet, parse_xmp
+
+MAX_FILE_BYTES = 2 << 30
+LARGE_PIXELS = 40_000_000  # pictures beyond are decoded one at a time: some hundred megabytes each
+DRAFT = 8  # libjpeg reads every coefficient of a JPEG whatever the scale it then computes pixels at
+FINGERPRINT_STEP = 8
+TAG_ORIENTATION = 274
+TAG_BITS_PER_SAMPLE = 258
+TAG_DNG_VERSION = 50706
+DEEP_GREY_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
+COLOUR_MODES = ("RGB", "RGBA")
+READ_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *DEEP_GREY_MODES)
+RANGE_QUANTILES = (0.001, 0.999)  # of a deep picture's values: hot and dead pixels must not set the range
+_one_large_at_a_time = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a picture may measure: ``min_side`` (the longer side, pixels) and ``max_pixels``."""
+
+    min_side: int
+    max_pixels: int
+
+
+@dataclass(frozen=True)
+class CheckedPhoto:
+    """A photo that was decoded to its end.
+
+    Attributes:
+        name: As in the scan.
+        path: Where it is.
+        sha256: Of the file.
+        width: Of the stored grid, pixels.
+        height: Likewise.
+        fingerprint: Equal for pictures with equal pixels, and hardly ever otherwise.
+        plain: An 8-bit RGB or grey picture that every reader takes as it is.
+        transparent: Has pixels that are more transparent than not.
+        deep_range: Lowest and highest value of a picture with more than 8 bits a channel, else None.
+        exif: Its EXIF.
+        xmp: Its XMP properties.
+    """
+
+    name: str
+    path: Path
+    sha256: str
+    width: int
+    height: int
+    fingerprint: str
+    plain: bool
+    transparent: bool
+    deep_range: tuple[float, float] | None
+    exif: Exif
+    xmp: Mapping[str, str]
+
+
+def check_photo(candidate: Candidate, limits: Limits) -> CheckedPhoto | LeftOut:
+    """Read, hash and decode a file whole.
+
+    Args:
+        candidate: The file.
+        limits: What a picture may measure.
+
+    Returns:
+        The photo, or why it is left out.
+    """
+    try:
+        data, sha256 = _read_once(candidate.path)
+    except OSError as error:
+        return LeftOut(candidate.name, f"cannot be read ({error.strerror or error})")
+    except ValueError as error:
+        return LeftOut(candidate.name, str(error))
+    try:
+        picture = open_picture(BytesIO(data))
+    except Exception as error:  # Pillow's readers raise almost anything on broken pictures
+        return LeftOut(candidate.name, _why_broken(error))
+    with picture:
+        reason = _refusal(picture, limits)
+        return LeftOut(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
+
+
+def deep_pixels(data: bytes, picture: Image.Image, orientation: int) -> Shaped[np.ndarray, "h w *channels"] | None:
+    """The values of a picture with more than 8 bits a channel, in the stored grid.
+
+    Args:
+        data: The file.
+        picture: The file, opened and not yet loaded.
+        orientation: EXIF's, 1 to 8.
+
+    Returns:
+        (h, w) grey, or (h, w, 3 or 4) RGB or RGBA; None for a picture of 8 bits, or one that Pillow alone can read.
+    """
+    if picture.mode in DEEP_GREY_MODES:
+        return np.asarray(load_stored(picture, orientation))
+    if picture.mode not in COLOUR_MODES or _bits(data, picture) <= 8:
+        return None
+    # Pillow keeps the upper byte of 16-bit colours. OpenCV keeps both, but fails on TIFFs that ask to be turned.
+    encoded = np.frombuffer(_without_turn(data) if picture.format == "TIFF" else data, np.uint8)
+    pixels: Any = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype == np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        return None
+    order = [2, 1, 0, 3][: pixels.shape[2]]
+    return np.ascontiguousarray(pixels[:, :, order])
+
+
+def stored_orientation(exif: Exif, picture: Image.Image) -> int:
+    """The orientation that Pillow goes by when it loads a TIFF (its own tag alone), else EXIF's."""
+    if picture.format != "TIFF":
+        return exif.orientation
+    value = _tiff_tag(picture, TAG_ORIENTATION, 1)
+    return int(value) if value in range(1, 9) else 1
+
+
+def _read_once(path: Path) -> tuple[bytes, str]:
+    sha = hashlib.sha256()
+    with path.open("rb") as file:
+        data = file.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise ValueError(f"is larger than {MAX_FILE_BYTES >> 30} GiB")
+    sha.update(data)
+    return data, sha.hexdigest()
+
+
+def _refusal(picture: Image.Image, limits: Limits) -> str:
+    """Why an opened picture is not to be decoded; empty when it is."""
+    width, height = picture.size
+    if width * height > limits.max_pixels:
+        return f"claims {width} × {height} pixels, more than ingest.max_megapixels={limits.max_pixels / 1e6:g} allows"
+    if max(width, height) < limits.min_side or 8 * min(width, height) < limits.min_side:
+        return f"is only {width} × {height} pixels, less than ingest.min_size={limits.min_side}"
+    if picture.format == "TIFF" and _tiff_tag(picture, TAG_DNG_VERSION, None) is not None:
+        return "is a camera's raw file (DNG): develop it to JPEG or TIFF"
+    if picture.mode not in READ_MODES:
+        return f"has colours of a kind that is not read ({picture.mode}): convert it to 8-bit RGB"
+    return ""
+
+
+def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image) -> CheckedPhoto | LeftOut:
+    exif = read_exif(picture)
+    xmp = parse_xmp(find_packet(_xmp_bytes(picture)) or find_packet(data))
+    if xmp.get("GPano:ProjectionType"):
+        return LeftOut(candidate.name, "is a stitched panorama: give the single pictures it was made of")
+    orientation = stored_orientation(exif, picture)
+    width, height = picture.size
+    turned = picture.format == "TIFF" and orientation != 1
+    if turned and orientation >= 5:
+        width, height = height, width
+    large = _one_large_at_a_time if width * height > LARGE_PIXELS else contextlib.nullcontext()
+    with large:
+        try:
+            loaded = _load(data, picture, orientation)
+        except MemoryError:
+            return LeftOut(candidate.name, "is too large for this machine's memory")
+        except Exception as error:  # as above
+            return LeftOut(candidate.name, _why_broken(error))
+        pixels = _deep_facts(loaded) if isinstance(loaded, np.ndarray) else _plain_facts(loaded, (width, height))
+    if pixels is None:
+        return LeftOut(candidate.name, "has no pixel with a value")
+    return CheckedPhoto(
+        name=candidate.name,
+        path=candidate.path,
+        sha256=sha256,
+        width=width,
+        height=height,
+        fingerprint=pixels.fingerprint,
+        plain=picture.mode in ("RGB", "L") and pixels.deep_range is None and not turned,
+        transparent=pixels.transparent,
+        deep_range=pixels.deep_range,
+        exif=exif,
+        xmp=xmp,
+    )
+
+
+@dataclass(frozen=True)
+class _Facts:
+    fingerprint: str
+    transparent: bool
+    deep_range: tuple[float, float] | None
+
+
+def _load(data: bytes, picture: Image.Image, orientation: int) -> np.ndarray | Image.Image:
+    """Decode the whole file: values of a deep picture, or a picture of 8 bits, a JPEG at a reduced scale."""
+    deep = deep_pixels(data, picture, orientation)
+    if deep is not None:
+        return deep
+    picture.draft(None, (max(1, picture.width // DRAFT), max(1, picture.height // DRAFT)))
+    return load_stored(picture, orientation)
+
+
+def _deep_facts(values: np.ndarray) -> _Facts | None:
+    """None where no pixel has a value (a float picture of NaN)."""
+    sample = values[::FINGERPRINT_STEP, ::FINGERPRINT_STEP]
+    finite = sample[..., :3][np.isfinite(sample[..., :3])] if values.ndim == 3 else sample[np.isfinite(sample)]
+    if finite.size == 0:
+        return None
+    low, high = np.quantile(finite, RANGE_QUANTILES)
+    transparent = False
+    if values.ndim == 3 and values.shape[2] == 4:
+        transparent = bool((values[:, :, 3] < np.iinfo(values.dtype).max // 2).any())
+    return _Facts(_fingerprint(str(values.dtype), values.shape, sample), transparent, (float(low), float(high)))
+
+
+def _plain_facts(loaded: Image.Image, size: tuple[int, int]) -> _Facts:
+    transparent = False
+    if loaded.has_transparency_data:
+        transparent = bool((np.asarray(loaded.convert("RGBA"))[:, :, 3] < 128).any())
+    step = FINGERPRINT_STEP if loaded.size == size else 1  # a JPEG comes at a reduced scale
+    sample = np.asarray(loaded)[::step, ::step]
+    return _Facts(_fingerprint(loaded.mode, size, sample), transparent, None)
+
+
+def _fingerprint(kind: str, size: tuple[int, ...], pixels: np.ndarray) -> str:
+    return hashlib.sha256(f"{kind} {size} ".encode() + np.ascontiguousarray(pixels).tobytes()).hexdigest()
+
+
+def _bits(data: bytes, picture: Image.Image) -> int:
+    if picture.format == "PNG":
+        return data[24]  # IHDR: 8 bytes signature, 8 chunk head, 8 size, then the bit depth
+    if picture.format == "TIFF":
+        bits = _tiff_tag(picture, TAG_BITS_PER_SAMPLE, (8,))
+        return max(int(value) for value in bits) if isinstance(bits, tuple) else int(bits)
+    return 8
+
+
+def _tiff_tag(picture: Image.Image, tag: int, default: Any) -> Any:
+    tags: Mapping[int, Any] = getattr(picture, "tag_v2", {})
+    try:
+        return tags.get(tag, default)
+    except Exception:  # Pillow decodes a tag when it is asked for, and raises almost anything on hostile ones
+        return default
+
+
+def _without_turn(data: bytes) -> bytes:
+    """A classic TIFF's bytes with the orientation of its first directory set to 1."""
+    order = "little" if data[:2] == b"II" else "big"
+
+    def number(start: int, size: int) -> int:
+        return int.from_bytes(data[start : start + size], order)  # type: ignore[arg-type]
+
+    start = number(4, 4)
+    if number(2, 2) != 42:
+        return data
+    for entry in range(start + 2, start + 2 + 12 * number(start, 2), 12):
+        if number(entry, 2) == TAG_ORIENTATION:
+            one = (1).to_bytes(2, order)  # type: ignore[arg-type]
+            return data[: entry + 8] + one + data[entry + 10 :]
+    return data
+
+
+def _xmp_bytes(picture: Image.Image) -> bytes:
+    packet = picture.info.get("xmp", b"")
+    return packet if isinstance(packet, bytes) else str(packet).encode()
+
+
+def _why_broken(error: Exception) -> str:
+    text = str(error)
+    if "truncated" in text.lower() or isinstance(error, EOFError):
+        return "is cut off: it ends before its last pixel; copy it again from the camera"
+    if "cannot identify" in text:
+        return "is damaged: its header cannot be read"
+    detail = " ".join(text.split())[:120]
+    return f"is damaged and cannot be decoded ({detail or type(error).__name__})"

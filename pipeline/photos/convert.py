@@ -1,0 +1,97 @@
+"""Turns photos that are not plain 8-bit RGB or grey into PNGs that every reader takes."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped, UInt8
+from PIL import Image
+
+from splatpipe.pipeline.photos.check import CheckedPhoto, deep_pixels, stored_orientation
+from splatpipe.pipeline.photos.photo_list import load_stored, open_picture
+
+PNG_LEVEL = 1  # zlib's fastest: half the size at ten times the time is no bargain for an intermediate file
+FULL_RANGE = 65535.0
+NARROW_RANGE = FULL_RANGE / 4  # 16-bit files that use less hold 10 to 14 bits, or temperatures
+
+
+def scale_of(ranges: list[tuple[float, float]]) -> tuple[float, float]:
+    """The values that become black and white in all photos of one camera, so that their brightness stays comparable.
+
+    Args:
+        ranges: Lowest and highest value of each photo.
+
+    Returns:
+        0 and 65535 for photos that use the 16 bits; else the lowest and the highest value of all.
+    """
+    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+    if low >= 0.0 and high <= FULL_RANGE and high - low >= NARROW_RANGE:
+        return 0.0, FULL_RANGE
+    return low, high
+
+
+def read_8bit(
+    photo: CheckedPhoto, scale: tuple[float, float] | None
+) -> tuple[np.ndarray, UInt8[np.ndarray, "h w"] | None]:
+    """Decode a photo of any kind to 8 bits, in the stored grid.
+
+    Args:
+        photo: One that was checked.
+        scale: Of a deep photo: the values that become 0 and 255.
+
+    Returns:
+        (h, w, 3) RGB or (h, w) grey, uint8; and the opacity, 0 to 255, or None for an opaque picture.
+    """
+    data = photo.path.read_bytes()
+    with open_picture(BytesIO(data)) as picture:
+        orientation = stored_orientation(photo.exif, picture)
+        if scale is not None:
+            deep = deep_pixels(data, picture, orientation)
+            if deep is not None:
+                return _scaled(deep, scale)
+        stored = load_stored(picture, orientation)
+    if stored.has_transparency_data:
+        rgba = np.asarray(stored.convert("RGBA"))
+        return rgba[:, :, :3], rgba[:, :, 3]
+    return np.asarray(stored.convert("L" if stored.mode in ("1", "L") else "RGB")), None
+
+
+def convert_photo(
+    photo: CheckedPhoto, scale: tuple[float, float] | None, target: Path
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Write a photo's 8-bit PNG.
+
+    Args:
+        photo: One that is not plain.
+        scale: Of a deep photo: the values that become 0 and 255.
+        target: The PNG; its folder is made.
+
+    Returns:
+        Its mask from transparency, 0 where more transparent than not, else 255; None for an opaque photo.
+    """
+    pixels, opacity = read_8bit(photo, scale)
+    save_png(pixels, target)
+    if opacity is None or not photo.transparent:
+        return None
+    return np.where(opacity < 128, 0, 255).astype(np.uint8)
+
+
+def save_png(pixels: UInt8[np.ndarray, "h w *channels"], target: Path) -> None:
+    """Write a PNG without any metadata; makes its folder."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(target, format="PNG", compress_level=PNG_LEVEL)
+
+
+def _scaled(
+    deep: Shaped[np.ndarray, "h w *channels"], scale: tuple[float, float]
+) -> tuple[np.ndarray, UInt8[np.ndarray, "h w"] | None]:
+    low, high = scale
+    colours = deep[..., :3] if deep.ndim == 3 else deep
+    values = (colours.astype(np.float32) - np.float32(low)) * np.float32(255.0 / max(high - low, 1e-30))
+    values = np.nan_to_num(values, nan=0.0, posinf=255.0, neginf=0.0)
+    opacity = None
+    if deep.ndim == 3 and deep.shape[2] == 4:
+        opacity = (deep[:, :, 3] >> 8).astype(np.uint8)
+    return np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8), opacity

@@ -1,0 +1,44 @@
+"""Photos that are there twice: they would count double in matching and put a test photo among the trained ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.convert import read_8bit
+from splatpipe.pipeline.photos.scan import LeftOut
+
+
+def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], list[LeftOut]]:
+    """Keep the first of equal photos.
+
+    Args:
+        photos: Sorted by name.
+
+    Returns:
+        The photos that stay, and the others with the twin's name.
+    """
+    kept: list[CheckedPhoto] = []
+    left_out: list[LeftOut] = []
+    by_sha: dict[str, CheckedPhoto] = {}
+    by_fingerprint: dict[str, CheckedPhoto] = {}
+    for photo in photos:
+        twin = by_sha.get(photo.sha256)
+        if twin is not None:
+            left_out.append(LeftOut(photo.name, f"is the same file as {twin.name}"))
+            continue
+        by_sha[photo.sha256] = photo
+        twin = by_fingerprint.get(photo.fingerprint)
+        if twin is not None and _equal_pixels(photo, twin):
+            left_out.append(LeftOut(photo.name, f"has the same pixels as {twin.name}"))
+            continue
+        by_fingerprint.setdefault(photo.fingerprint, photo)
+        kept.append(photo)
+    return kept, left_out
+
+
+def _equal_pixels(first: CheckedPhoto, second: CheckedPhoto) -> bool:
+    scale = first.deep_range
+    return np.array_equal(read_8bit(first, scale)[0], read_8bit(second, scale)[0])

@@ -1,0 +1,187 @@
+"""Masks: which pixels of a photo do not count. Found by name, brought into the stored grid at full size."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.exif import read_exif
+from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, unturn
+from splatpipe.pipeline.photos.scan import MASK_FOLDER, PHOTO_SUFFIXES
+
+ASPECT_TOLERANCE = 0.01
+IMAGE_FOLDER = "images"
+FEW_LABELS = 128  # a lossless mask with no value from here on holds labels (0 and 1, or classes): all but 0 count
+HALF = 128
+QUARTER_TURNS = (5, 6, 7, 8)
+
+
+class MaskError(Exception):
+    """A mask that cannot be used; the text says why and ends a sentence that starts with its name."""
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """A file below a ``masks/`` or ``sky_masks/`` folder.
+
+    Attributes:
+        label: How to call it in a message.
+        key: The name that it stands for, without the last suffix: a photo's name with or without its own suffix.
+        path: Where it is.
+    """
+
+    label: str
+    key: str
+    path: Path
+
+
+def find_masks(root: Path, called: str = MASK_FOLDER) -> list[MaskFile]:
+    """Every file below a ``masks/`` folder inside or beside the photo folder.
+
+    ``masks/a/x.png`` inside or beside it and ``a/masks/x.png`` inside it stand for the photo ``a/x``.
+
+    Args:
+        root: The photo folder, whose names it follows.
+        called: The name of the folders.
+    """
+    found: list[MaskFile] = []
+    beside = root.parent / called
+    if beside.is_dir() and beside != root:
+        found += _mask_files(beside, PurePosixPath(), "../")
+    for folder, folders, _ in os.walk(root):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in [name for name in folders if name.casefold() == called]:
+            folders.remove(name)
+            above = PurePosixPath(Path(folder).relative_to(root).as_posix())
+            found += _mask_files(Path(folder) / name, above, "" if str(above) == "." else f"{above}/")
+    return found
+
+
+def match_masks(masks: Sequence[MaskFile], names: Sequence[str]) -> tuple[dict[str, MaskFile], list[MaskFile]]:
+    """Which mask is whose.
+
+    Args:
+        masks: As found.
+        names: Of all photos, also of those left out.
+
+    Returns:
+        Mask by the photo's name, and the masks that no photo is found for. ``NAME.ext.png`` goes before ``NAME.png``.
+        A mask that is no photo's so is that of ``images/NAME``, as in COLMAP's folders.
+    """
+    by_key: dict[str, MaskFile] = {}
+    for mask in masks:
+        by_key.setdefault(mask.key, mask)
+    matched = {name: by_key[key] for name in names if (key := _key(name, by_key)) is not None}
+    used = {mask.path for mask in matched.values()}
+    free = {key: mask for key, mask in by_key.items() if mask.path not in used}
+    for name in names:
+        short = _beside_images(name)
+        if name not in matched and short is not None and (key := _key(short, free)) is not None:
+            matched[name] = free[key]
+    used = {mask.path for mask in matched.values()}
+    return matched, [mask for mask in masks if mask.path not in used]
+
+
+def _key(name: str, by_key: Mapping[str, MaskFile]) -> str | None:
+    return next((key for key in (name, str(PurePosixPath(name).with_suffix(""))) if key in by_key), None)
+
+
+def _beside_images(name: str) -> str | None:
+    """A photo's name without the last folder called ``images``: as masks beside that folder call it."""
+    *folders, last = PurePosixPath(name).parts
+    places = [place for place, folder in enumerate(folders) if folder.casefold() == IMAGE_FOLDER]
+    if not places:
+        return None
+    return str(PurePosixPath(*folders[: places[-1]], *folders[places[-1] + 1 :], last))
+
+
+def read_mask(mask: MaskFile, photo: CheckedPhoto, max_pixels: int) -> UInt8[np.ndarray, "h w"]:
+    """Decode a mask and bring it into its photo's stored grid at full size.
+
+    A mask may be drawn in the stored grid or in the one that EXIF turns it to; its shape tells, and where both have one
+    shape (a half turn, a square) it counts as stored unless it has an orientation of its own.
+
+    Args:
+        mask: The file.
+        photo: Its photo.
+        max_pixels: Refuse a larger mask.
+
+    Returns:
+        0 where ignored, else 255.
+
+    Raises:
+        MaskError: if it cannot be decoded or has another shape than the photo.
+    """
+    try:
+        with open_picture(mask.path, max_pixels=max_pixels) as picture:
+            exif = read_exif(picture)
+            lossless = picture.format in ("PNG", "TIFF")
+            grey = _grey(load_stored(picture, exif.orientation))
+    except Exception as error:  # Pillow's readers raise almost anything on broken pictures
+        raise MaskError(f"cannot be read ({' '.join(str(error).split())[:120]})") from error
+    drawn = grey if exif.orientation == photo.exif.orientation else _to_stored(grey, exif.orientation, photo)
+    if not _same_shape(drawn.size, (photo.width, photo.height)):
+        raise MaskError(f"has another shape ({grey.width} × {grey.height}) than its photo")
+    values = np.asarray(drawn)
+    threshold = 1 if lossless and int(values.max()) < FEW_LABELS else HALF
+    binary = Image.fromarray(np.where(values >= threshold, 255, 0).astype(np.uint8))
+    return np.asarray(binary.resize((photo.width, photo.height), Image.Resampling.NEAREST))
+
+
+def _to_stored(grey: Image.Image, own_orientation: int, photo: CheckedPhoto) -> Image.Image:
+    """From the mask's own grid to the photo's stored one."""
+    size = (photo.width, photo.height)
+    orientation = photo.exif.orientation
+    turned = size[::-1] if orientation in QUARTER_TURNS else size
+    if own_orientation != 1:  # it says how people are to see it, and they see it as they see the photo
+        upright = _turn(grey, own_orientation)
+        if _same_shape(upright.size, turned):
+            return unturn(upright, orientation)
+    if not _same_shape(grey.size, size) and _same_shape(grey.size, turned):
+        return unturn(grey, orientation)
+    return grey
+
+
+def _turn(picture: Image.Image, orientation: int) -> Image.Image:
+    inverse = {6: 8, 8: 6}.get(orientation, orientation)
+    return unturn(picture, inverse)
+
+
+def _same_shape(first: tuple[int, int], second: tuple[int, int]) -> bool:
+    """Equal ratios of the sides, but for the rounding to whole pixels of the smaller one."""
+    scale = first[0] / second[0]
+    return abs(first[1] - scale * second[1]) <= max(1.0, ASPECT_TOLERANCE * first[1])
+
+
+def _grey(picture: Image.Image) -> Image.Image:
+    """Brightness over black: what is transparent is ignored."""
+    if picture.mode.startswith("I") or picture.mode == "F":
+        values = np.nan_to_num(np.asarray(picture).astype(np.float64))
+        factor = 255.0 / 65535.0 if values.max() > 255.0 else 1.0
+        return Image.fromarray(np.clip(np.ceil(values * factor), 0, 255).astype(np.uint8))
+    if picture.has_transparency_data:
+        rgba = picture.convert("RGBA")
+        picture = Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba)
+    if picture.mode == "L":
+        return picture
+    rgb = np.asarray(picture.convert("RGB"))
+    return Image.fromarray(rgb.max(axis=2))  # any colour counts: only black is ignored
+
+
+def _mask_files(folder: Path, above: PurePosixPath, shown: str) -> Iterator[MaskFile]:
+    for inner, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(files):
+            path = Path(inner) / name
+            if name.startswith(".") or path.suffix.casefold() not in PHOTO_SUFFIXES or not path.is_file():
+                continue
+            relative = PurePosixPath(path.relative_to(folder).as_posix())
+            label = os.fsencode(f"{shown}{folder.name}/{relative}").decode("utf-8", errors="backslashreplace")
+            yield MaskFile(label, str((above / relative).with_suffix("")), path)

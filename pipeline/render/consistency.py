@@ -1,0 +1,130 @@
+"""Whether neighbouring views agree on how far the surface is: the disagreement of their median depths.
+
+Haze that was fitted to one photo is a surface along that photo's rays alone: the neighbour, which sees the same place
+from beside, looks through it. So the pixels of a view are placed in space by its median depth and looked up in the
+neighbour's depth map, as the consistency checks of multi-view stereo do (Schönberger et al.: "Pixelwise View Selection
+for Unstructured Multi-View Stereo", ECCV 2016).
+
+What the neighbour sees nearer says nothing: something may hide the place from it, as corners do. What it sees farther
+is a contradiction: it looks through what the other calls a surface. The check is one-sided, and runs in both
+directions: haze before the neighbour is a hidden place in one direction and a contradiction in the other. One pixel is
+allowed: of the nine around, the depth that agrees best counts, or the outline of everything real would be a
+contradiction. A solid floater that both views see in the same place is none; ``free_space`` finds those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+
+from splatpipe.pipeline.geometry.camera import Camera
+
+AGREEMENT = 0.05  # of the depth: far more than a pixel's step on slanted ground, far less than a floater's distance
+SAMPLE_EVERY = 4  # pixels, both ways: thousands are left of the smallest picture
+NO_SURFACE = 1.0  # stands for the infinite difference where the neighbour sees through everything, and caps the others
+PAIRS = 12  # of neighbours: enough for the median, and a few seconds of rendering
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """How far median depths of neighbouring views are apart.
+
+    Attributes:
+        median: Of the differences' magnitudes, a share of the depth; None without pixels.
+        share: Of the pixels where the neighbour sees more than `AGREEMENT` farther; None without pixels.
+        pixels: How many were compared.
+    """
+
+    median: float | None
+    share: float | None
+    pixels: int
+
+
+def neighbouring_pairs(seen: Sequence[Int64[np.ndarray, " _"]], most: int = PAIRS) -> list[tuple[int, int]]:
+    """Pairs of views that share sparse points: evenly chosen views, each with the one that shares most with it.
+
+    Args:
+        seen: Rows of the points that each view observes.
+        most: Pairs at most.
+
+    Returns:
+        Pairs of indices, the smaller first, each once, in order.
+    """
+    usable = [index for index, rows in enumerate(seen) if rows.size]
+    if len(usable) < 2 or most < 1:
+        return []
+    points = 1 + max(int(seen[index].max()) for index in usable)
+    pairs = set()
+    for place in np.unique(np.linspace(0, len(usable) - 1, min(most, len(usable))).round().astype(int)):
+        here = usable[place]
+        marked = np.zeros(points, np.bool_)
+        marked[seen[here]] = True
+        shared = [0 if index == here else int(marked[np.unique(seen[index])].sum()) for index in usable]
+        best = int(np.argmax(shared))
+        if shared[best] > 0:
+            pairs.add((min(here, usable[best]), max(here, usable[best])))
+    return sorted(pairs)
+
+
+def depth_differences(
+    camera: Camera, depth: Float[np.ndarray, "h w"], neighbour: Camera, neighbour_depth: Float[np.ndarray, "nh nw"]
+) -> Float64[np.ndarray, " k"]:
+    """How much farther a neighbour sees than where a view says that the surface is, pixel by pixel.
+
+    Args:
+        camera: The view's, in its depth map's grid.
+        depth: Its median depth, world units along the view axis; 0 or not finite where it has none.
+        neighbour: The neighbour's, in its depth map's grid.
+        neighbour_depth: The same for it; where it has none, it sees through.
+
+    Returns:
+        (neighbour's depth - the place's) / the place's, `NO_SURFACE` at most, of every few pixels: those that the
+        view gives a depth, that fall into the neighbour's picture, and that nothing nearer hides from it.
+    """
+    rows, columns = np.mgrid[
+        SAMPLE_EVERY // 2 : camera.height : SAMPLE_EVERY, SAMPLE_EVERY // 2 : camera.width : SAMPLE_EVERY
+    ]
+    rows, columns = rows.ravel(), columns.ravel()
+    z = depth[rows, columns].astype(np.float64)
+    usable = np.isfinite(z) & (z > 0.0)
+    rows, columns, z = rows[usable], columns[usable], z[usable]
+    rays = np.stack(((columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(z))), 1)
+    world = (z[:, None] * rays - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
+    there = world @ neighbour.cam_from_world[2, :3] + neighbour.cam_from_world[2, 3]
+    front = there > 0.0
+    world, there = world[front], there[front]
+    pixels = neighbour.project(world)
+    inside = ((pixels >= 0.0) & (pixels < [neighbour.width, neighbour.height])).all(axis=1)
+    best = _best_around(pixels[inside].astype(np.int64), there[inside], neighbour_depth)
+    return best[best >= -AGREEMENT]
+
+
+def _best_around(
+    pixels: Int64[np.ndarray, "k 2"], z: Float64[np.ndarray, " k"], depth: Float[np.ndarray, "h w"]
+) -> Float64[np.ndarray, " k"]:
+    """Of the nine pixels around each, the relative difference of least magnitude."""
+    h, w = depth.shape
+    best = np.full(len(z), NO_SURFACE)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            found = depth[np.clip(pixels[:, 1] + down, 0, h - 1), np.clip(pixels[:, 0] + right, 0, w - 1)]
+            surface = np.isfinite(found) & (found > 0.0)
+            there = np.where(surface, found, np.inf).astype(np.float64)
+            difference = np.minimum(there / z - 1.0, NO_SURFACE)
+            best = np.where(np.abs(difference) < np.abs(best), difference, best)
+    return best
+
+
+def disagreement(differences: Sequence[Float64[np.ndarray, " _"]]) -> Disagreement:
+    """The figures of all compared pixels.
+
+    Args:
+        differences: Of ``depth_differences``, of both directions of each pair.
+    """
+    every = np.concatenate([np.empty(0), *differences])
+    if every.size == 0:
+        return Disagreement(None, None, 0)
+    return Disagreement(float(np.median(np.abs(every))), float(np.mean(every > AGREEMENT)), int(every.size))

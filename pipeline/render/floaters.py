@@ -1,0 +1,84 @@
+"""What evaluation says of floaters: the part of the splat in free space, and whether neighbouring views agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import load_points_and_tracks
+from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.consistency import depth_differences, disagreement, neighbouring_pairs
+from splatpipe.pipeline.splat.free_space import free_space, near_or_free, share_of_opacity
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.sh import rgb_to_dc
+
+LARGEST_MEGAPIXELS = 0.5  # of a depth map: what floats is larger than its pixels, and figures of all sizes compare
+
+
+def measure_floaters(
+    gaussians: Gaussians, cameras: Sequence[Camera], dataset: Path, options: rasterizer.RenderOptions
+) -> dict[str, Any]:
+    """The figures of `floaters` in metrics.json; None where the sparse model does not tell.
+
+    All registered photos take part, the held-out ones, too: they are not compared with the model, but their points and
+    places say where the air is, and what hangs before them is what a visitor meets.
+
+    Args:
+        gaussians: The model.
+        cameras: Of all registered photos, at the size that the model is evaluated at.
+        dataset: Their dataset, with the sparse points.
+        options: How the model is rendered.
+    """
+    points, tracks = load_points_and_tracks(dataset)
+    seen = [tracks[camera.name] for camera in cameras]
+    space = free_space(cameras, points.xyz, seen)
+    chosen = near_or_free(gaussians, space)
+    pairs = neighbouring_pairs(seen)
+    places = sorted({place for pair in pairs for place in pair})
+    small = {place: reduced_camera(cameras[place], LARGEST_MEGAPIXELS) for place in places}
+    flagged, depths, light = _flagged(gaussians, chosen), {}, np.zeros(2)
+    for place in places:
+        depths[place], of_view = _look(flagged, small[place], options)
+        light += of_view
+    both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
+    apart = disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
+    return {
+        "free_space_opacity": _rounded(share_of_opacity(gaussians, chosen)) if space.known else None,
+        "free_space_gaussians": int(chosen.sum()) if space.known else None,
+        "free_space_rendered": _rounded(light[0] / light[1]) if space.known and light[1] > 0.0 else None,
+        "depth_disagreement": {
+            "median": _rounded(apart.median),
+            "share_above_5_percent": _rounded(apart.share),
+            "pairs": len(pairs),
+            "pixels": apart.pixels,
+        },
+    }
+
+
+def _flagged(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> Gaussians:
+    """The same Gaussians, the chosen white and the others black: a render is the part of the light that they give."""
+    colours = rgb_to_dc(chosen.to(torch.float32)[:, None].expand(-1, 3))
+    return replace(gaussians, sh=colours[:, None].contiguous())
+
+
+def _look(
+    flagged: Gaussians, camera: Camera, options: rasterizer.RenderOptions
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, " 2"]]:
+    """A view's median depth, and the light that reaches it: from the chosen Gaussians, and from all."""
+    with torch.no_grad():
+        rendered = rasterizer.render(flagged, camera, options.for_depths())
+    light = [part.numpy().sum(dtype=np.float64) for part in (rendered.colour[..., 0], rendered.alpha)]
+    return rendered.median_depth.numpy(), np.array(light)
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(float(value), 6)

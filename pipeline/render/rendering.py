@@ -1,0 +1,93 @@
+"""A trained model as it was trained to be rendered: its colours before its sky, its depths, its normals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.reference import project
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import Panorama, laid_over
+from splatpipe.pipeline.splat.sh import rgb_to_dc
+
+Model = tuple[Gaussians, Panorama | None]
+SURFACE = 0.5  # least alpha of a pixel that shows one, as for the median depth
+
+
+def as_trained(plan: Path, gaussians: Gaussians) -> tuple[rasterizer.RenderOptions, float | None]:
+    """How the model was trained to be rendered, and the megapixels that photos were reduced to, from `plan.json`.
+
+    Raises:
+        StageError: if the plan is not one.
+    """
+    try:
+        fields = json.loads(plan.read_text(encoding="utf-8"))
+        white = fields["options"]["background"] == "white"
+        options = rasterizer.RenderOptions(
+            sh_degree=gaussians.sh_degree,
+            background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
+            antialias=bool(fields["options"]["antialias"]),
+            near=float(fields["near"]),
+            depth=False,
+        )
+        return options, None if fields["megapixels"] is None else float(fields["megapixels"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StageError("Training's plan.json cannot be read.", hint="Run again with --rerun-from train.") from error
+
+
+def render_pixels(model: Model, camera: Camera, options: rasterizer.RenderOptions) -> Pixels:
+    """Render a camera's view, with the sky if there is one, to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
+    gaussians, sky = model
+    with torch.no_grad():
+        rendered = rasterizer.render(gaussians, camera, options)
+        colour = rendered.colour
+        if sky is not None:
+            behind = sky.behind(camera, options.background)
+            colour = laid_over(colour, rendered.alpha, options.background, behind)
+        return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
+
+
+def render_depth(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w"]:
+    """A camera's median depth, world units along the view axis; 0 where the model has none."""
+    with torch.no_grad():
+        rendered = rasterizer.render(gaussians, camera, options.for_depths())
+    return np.asarray(rendered.median_depth.cpu().numpy())
+
+
+def render_normals(
+    gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions
+) -> Float[np.ndarray, "h w 3"]:
+    """Normals of the surface that a camera sees, unit vectors in the model's frame towards it; 0 where nothing is.
+
+    From the rasterizer's own sums: a Gaussian's normal is that of the plane on which rays are deepest in it (the one
+    that the depths come from: Zhang et al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting", 2024), and takes the
+    place of its colour. The median depth's gradient would have a step wherever one Gaussian takes over from the next.
+    """
+    with torch.no_grad():
+        splats = project(gaussians, camera, options)
+        slopes = splats.depth_slopes * splats.means.new_tensor([camera.fx, camera.fy]) / splats.depths[:, None]
+        rays = (splats.means - splats.means.new_tensor([camera.cx, camera.cy])) / splats.means.new_tensor(
+            [camera.fx, camera.fy]
+        )
+        normals = torch.cat([slopes, -1.0 - (slopes * rays).sum(1, keepdim=True)], dim=1)
+        normals = normals / torch.linalg.vector_norm(normals, dim=1, keepdim=True)
+        normals = normals @ normals.new_tensor(camera.cam_from_world[:3, :3])
+        coloured = replace(
+            gaussians, sh=rgb_to_dc(0.5 + 0.5 * torch.where(splats.usable[:, None], normals, 0.0))[:, None]
+        )
+        plain = replace(options.for_depths(), depth=False)
+        rendered = rasterizer.render(coloured, camera, plain)
+        alpha = rendered.alpha[..., None]
+        summed = 2.0 * rendered.colour - alpha
+        length = torch.linalg.vector_norm(summed, dim=2, keepdim=True)
+        seen = (alpha >= SURFACE) & (length > 0.0)
+        return np.asarray(torch.where(seen, summed / length.clamp_min(1e-12), 0.0).cpu().numpy())

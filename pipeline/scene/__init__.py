@@ -1,1 +1,0 @@
-"""What is reconstructed: cameras, photos, Gaussians, frames and the measures of their quality."""

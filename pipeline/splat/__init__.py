@@ -1,0 +1,1 @@
+"""The splat: Gaussians, their files, what is behind them, and measures of likeness."""

@@ -1,0 +1,176 @@
+"""The scene: 3D Gaussians with their raw optimised parameters, as 3D Gaussian splatting trains and stores them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatpipe.pipeline.splat.sh import MAX_DEGREE, check_rotation, coefficient_count, multiply_rows, rotate_sh
+
+PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh")
+"""The parameters' names, in the order of the fields."""
+
+
+@dataclass(eq=False)
+class Gaussians:
+    """n Gaussians. Covariance R(quat) diag(exp(log_scale))² R(quat)ᵀ, opacity sigmoid(opacity_logit).
+
+    Attributes:
+        means: Centres, world frame and units.
+        log_scales: Natural logarithms of the standard deviations along the Gaussian's own axes, world units.
+        quats: Rotations world from Gaussian (w, x, y, z), not necessarily of unit length.
+        opacity_logits: Logits of the opacities.
+        sh: Spherical harmonics, k = (degree + 1)² coefficients of red, green and blue; see ``scene.sh``.
+    """
+
+    means: Float[Tensor, "n 3"]
+    log_scales: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    opacity_logits: Float[Tensor, " n"]
+    sh: Float[Tensor, "n k 3"]
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        expected = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,)}
+        for name, shape in expected.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"{name} is {tuple(getattr(self, name).shape)}, not {shape}")
+        k = self.sh.shape[1] if self.sh.ndim == 3 else 0
+        if tuple(self.sh.shape) != (n, k, 3) or k not in {(d + 1) ** 2 for d in range(MAX_DEGREE + 1)}:
+            raise ValueError(f"sh is {tuple(self.sh.shape)}, not ({n}, (degree + 1)², 3) of a degree 0..3")
+
+    @classmethod
+    def empty(cls, n: int, sh_degree: int, dtype: torch.dtype = torch.float32) -> Gaussians:
+        """n Gaussians at the origin: zeros, with the identity for a rotation."""
+        quats = torch.zeros(n, 4, dtype=dtype)
+        quats[:, 0] = 1.0
+        zeros = torch.zeros(n, 3, dtype=dtype)
+        sh = torch.zeros(n, coefficient_count(sh_degree), 3, dtype=dtype)
+        return cls(zeros, zeros.clone(), quats, torch.zeros(n, dtype=dtype), sh)
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
+        """The inverse of ``tensors()``; other keys are ignored."""
+        return cls(**{name: tensors[name] for name in PARAMETERS})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The parameters by name, not copied."""
+        return {name: getattr(self, name) for name in PARAMETERS}
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0..3."""
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
+        """On another device or in another dtype; differentiable, shared where nothing changes."""
+        return self._map(lambda tensor: tensor.to(device=device, dtype=dtype))
+
+    def detach(self) -> Gaussians:
+        """The same values outside any graph, shared."""
+        return self._map(torch.Tensor.detach)
+
+    def clone(self) -> Gaussians:
+        """A copy, contiguous."""
+        return self._map(lambda tensor: tensor.clone(memory_format=torch.contiguous_format))
+
+    def select(self, index: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> Gaussians:
+        """The Gaussians of an index or a mask, in its order, copied."""
+        return self._map(lambda tensor: tensor[index])
+
+    @staticmethod
+    def concat(parts: Sequence[Gaussians]) -> Gaussians:
+        """One after another; all of one SH degree.
+
+        Raises:
+            ValueError: if there are none, or their SH degrees differ.
+        """
+        if not parts or len({part.sh_degree for part in parts}) != 1:
+            raise ValueError("concat needs Gaussians of one SH degree")
+        return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in PARAMETERS))
+
+    def requires_grad_(self, requires_grad: bool = True) -> Gaussians:
+        """Mark every parameter (a leaf) for autograd, in place."""
+        for tensor in self.tensors().values():
+            tensor.requires_grad_(requires_grad)
+        return self
+
+    def finite(self) -> Bool[Tensor, " n"]:
+        """Which Gaussians have only finite parameters."""
+        rows = [torch.isfinite(tensor.detach()[..., None]).flatten(1).all(1) for tensor in self.tensors().values()]
+        return torch.stack(rows).all(0)
+
+    def transformed(self, scale: float, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"]) -> Gaussians:
+        """In another frame, x_new = scale · rotation @ x + translation; means are computed in float64.
+
+        Args:
+            scale: New units a unit, > 0.
+            rotation: New frame from this one.
+            translation: Where this frame's origin lies in the new one, new units.
+
+        Returns:
+            New Gaussians that look the same from a camera that moved along, SH included.
+
+        Raises:
+            ValueError: if the scale is not positive and finite, or ``rotation`` is not a rotation.
+        """
+        if not (scale > 0.0 and math.isfinite(scale)):
+            raise ValueError(f"scale {scale} is not positive")
+        matrix = check_rotation(rotation)
+        device, dtype = self.means.device, self.means.dtype
+        means = multiply_rows(scale * matrix, self.means.to(torch.float64))
+        means = means + translation.to(device=device, dtype=torch.float64)
+        turn = quat_from_rotation(matrix).to(device=device, dtype=torch.float64)
+        quats = multiply_quats(turn, self.quats.to(torch.float64))
+        return Gaussians(
+            means.to(dtype),
+            self.log_scales + math.log(scale),
+            quats.to(dtype),
+            self.opacity_logits.clone(),
+            rotate_sh(self.sh, matrix),
+        )
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Gaussians:
+        return Gaussians(*(change(tensor) for tensor in self.tensors().values()))
+
+
+def multiply_quats(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
+    """Hamilton product a b, (w, x, y, z): the rotation b, then a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
+
+
+def quat_from_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
+    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
+
+    q qᵀ is linear in the matrix; its column with the largest diagonal entry is the best conditioned multiple of q.
+    """
+    m = rotation
+    outer = 0.25 * torch.stack(
+        [
+            torch.stack([1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
+            torch.stack([m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]),
+            torch.stack([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1]]),
+            torch.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2]]),
+        ]
+    )
+    quat: Tensor = outer[int(torch.argmax(torch.diagonal(outer)))]
+    quat = quat / torch.linalg.vector_norm(quat)
+    return -quat if quat[0] < 0 else quat

@@ -1,0 +1,157 @@
+"""What is behind a scene, by viewing direction alone: a small panorama, and how a render is laid over it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64, Int64
+from torch import Tensor
+
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.archives import read_archive
+from splatpipe.pipeline.splat.sky import directions, horizontal_axes
+
+ROWS = 32  # from straight down to straight up, cells of 5.6°: gradients and large clouds, no building
+COLUMNS = 2 * ROWS
+FULL_FROM_DEG = -2.0  # over the horizon: there the panorama covers all, as the search for the sky allows
+NOTHING_UP_TO_DEG = -6.0  # below, it covers nothing: holes in the ground stay holes
+STEP_PX = 8  # a picture's directions are looked up so far apart and interpolated: a cell is wider than that
+LARGEST_FILE_BYTES = 1 << 20
+
+
+@dataclass
+class Panorama:
+    """Colours by elevation and azimuth; bilinear between the cells' centres.
+
+    Attributes:
+        up: The panorama's pole, a unit vector in the model's frame.
+        colours: Of the cells, row by row from straight down, 0..1; a leaf of autograd while it is trained.
+    """
+
+    up: Float64[np.ndarray, " 3"]
+    colours: Float[Tensor, "cells 3"]
+
+    def behind(self, camera: Camera, background: tuple[float, float, float]) -> Float[Tensor, "h w 3"]:
+        """What a camera sees where nothing is: the panorama, and below the horizon the background.
+
+        Args:
+            camera: The camera.
+            background: Red, green, blue, 0..1.
+        """
+        nodes = directions(camera, STEP_PX)
+        below = self.colours.new_tensor(background)
+        share = torch.from_numpy(cover(nodes, self.up)).to(self.colours.dtype)[:, :, None]
+        return between_nodes(share * self.at(nodes) + (1.0 - share) * below, camera)
+
+    def at(self, rays: Float64[np.ndarray, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
+        """The colours in some directions of any length."""
+        cells, weights = cells_of(rays.reshape(-1, 3), self.up)
+        mixed = self.colours[torch.from_numpy(cells)] * torch.from_numpy(weights).to(self.colours.dtype)[:, :, None]
+        return mixed.sum(dim=1).reshape(rays.shape)
+
+
+def laid_over(
+    colour: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    background: tuple[float, float, float],
+    behind: Float[Tensor, "h w 3"],
+) -> Float[Tensor, "h w 3"]:
+    """A render with something else behind it; differentiable by all tensors.
+
+    Args:
+        colour: Rendered over ``background``.
+        alpha: The render's.
+        background: What it has behind it.
+        behind: What takes its place.
+    """
+    return colour + (1.0 - alpha)[:, :, None] * (behind - behind.new_tensor(background))
+
+
+def between_nodes(values: Float[Tensor, "rows columns 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
+    """Interpolate bilinearly from the nodes to every pixel."""
+    down, right = (
+        torch.from_numpy(_between(size, count)).to(values.dtype)
+        for size, count in ((camera.height, values.shape[0]), (camera.width, values.shape[1]))
+    )
+    across = right @ values.transpose(0, 1).reshape(values.shape[1], -1)  # two plain products: a fifth of batched ones
+    lines = across.reshape(camera.width, -1, 3).transpose(0, 1).reshape(values.shape[0], -1)
+    return (down @ lines).reshape(camera.height, camera.width, 3)
+
+
+def cover(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"]) -> Float32[np.ndarray, "*shape"]:
+    """How much of what is behind a scene is the panorama: 1 above the horizon, 0 well below."""
+    sine = rays @ up / np.linalg.norm(rays, axis=-1)
+    elevation = np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
+    share = (elevation - NOTHING_UP_TO_DEG) / (FULL_FROM_DEG - NOTHING_UP_TO_DEG)
+    return np.asarray(np.clip(share, 0.0, 1.0).astype(np.float32))
+
+
+def cells_of(
+    rays: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"]
+) -> tuple[Int64[np.ndarray, "n 4"], Float32[np.ndarray, "n 4"]]:
+    """The four cells around each direction, and their bilinear weights; around the poles there is one row only."""
+    east, north = horizontal_axes(up)
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    row = (np.arcsin(np.clip(rays @ up, -1.0, 1.0)) / math.pi + 0.5) * ROWS - 0.5
+    column = (np.arctan2(rays @ north, rays @ east) / (2.0 * math.pi) + 0.5) * COLUMNS - 0.5
+    row = np.clip(row, 0.0, ROWS - 1.0)
+    above, left = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
+    by_row, by_column = row - above, column - left
+    rows = np.minimum(np.stack([above, above, above + 1, above + 1], axis=1), ROWS - 1)
+    columns = np.stack([left, left + 1, left, left + 1], axis=1) % COLUMNS
+    share = np.stack(
+        [(1 - by_row) * (1 - by_column), (1 - by_row) * by_column, by_row * (1 - by_column), by_row * by_column], axis=1
+    )
+    return rows * COLUMNS + columns, share.astype(np.float32)
+
+
+def write_panorama(path: Path, panorama: Panorama | None) -> None:
+    """Write a panorama; without one, a file that says so."""
+    up = np.zeros(3) if panorama is None else panorama.up
+    colours = np.zeros((0, 3), np.float32) if panorama is None else panorama.colours.detach().numpy()
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, up=up, colours=colours)
+
+
+def read_panorama(path: Path) -> Panorama | None:
+    """Read ``write_panorama``'s file back; None where it says that there is none.
+
+    Raises:
+        StageError: if it is not such a file.
+    """
+    try:
+        if path.stat().st_size > LARGEST_FILE_BYTES:
+            raise ValueError("too large")
+        arrays = read_archive(path)
+        up, colours = arrays["up"], arrays["colours"]
+        if colours.shape == (0, 3):
+            return None
+        return panorama_of(up, colours)
+    except (OSError, ValueError, KeyError) as error:
+        raise StageError(
+            f"The sky of the training cannot be read: {error}.", hint="Run again with --rerun-from train."
+        ) from error
+
+
+def panorama_of(up: np.ndarray, colours: np.ndarray) -> Panorama:
+    """A panorama from a file's arrays.
+
+    Raises:
+        ValueError: if they are not one's.
+    """
+    if up.shape != (3,) or up.dtype != np.float64 or not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
+        raise ValueError("its pole is no direction")
+    if colours.shape != (ROWS * COLUMNS, 3) or colours.dtype != np.float32 or not np.isfinite(colours).all():
+        raise ValueError("its colours are not those of its cells")
+    return Panorama(up, torch.from_numpy(colours))
+
+
+def _between(size: int, count: int) -> Float32[np.ndarray, "size count"]:
+    """Weights of the nodes for each pixel along one side."""
+    place = np.arange(size) / STEP_PX
+    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(count)[None])).astype(np.float32)

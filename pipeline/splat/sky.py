@@ -1,0 +1,336 @@
+"""Where the sky is in photos of known cameras, without learned weights; when in doubt, no sky.
+
+A pixel is sky where all of this holds, each of which is known from photos and the sparse model alone: its surroundings
+are smooth; its colour is a sky's (bluish, or a bright grey); its ray does not point below the horizon; no triangulated
+point lies on its ray, whichever photos saw that; it is connected to the border of the picture that gravity has on top;
+and other photos that look the same way see sky there, too (a sky is the same from everywhere, a wall is not).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.upright import up_without_orientation
+
+WORK_MEGAPIXELS = 0.1  # at which photos are looked at: noise and distant texture are averaged away, edges stay
+SMOOTH_SLOPE = 0.03  # change of a channel over a pixel, of 1: haze and soft clouds are below, edges and leaves above
+BLUE_STEP = 0.03  # by which a bluish sky's blue is at least above its red and at most below its green
+CLEARLY_BLUE = 0.1  # blue over red, from which on it is no grey that shade or haze made bluish
+LEAST_BLUE_LIGHT = 0.3  # of the blue of a sky, of 1
+LEAST_GREY_LIGHT = 0.75  # of the darkest channel of a grey one: clouds, haze, overexposed
+GREY_OUTSHINES = 0.7  # share of the rest of the picture: walls in the sun stand beside shade
+BLUE_OUTSHINES = (
+    0.4  # a deep blue sky is darker than that wall; far trees in haze and shadows are bluish and darker still
+)
+HORIZON_MARGIN_DEG = 2.0  # below the horizon: error of the estimated up, dip of the horizon for a drone
+ZENITH_DEG = 85.0
+TOP_COSINE = 0.5  # between up and the way out of the picture over its top border: a corner up has two top borders
+POINT_CLEARANCE_PX = 3  # around a triangulated point nothing is sky
+CORE_PX = 5  # from a region's edge on, points are no longer those of the roof under it
+MOST_SPREAD = 0.2  # of a region's core near points, over the share of the rest: spires, outliers, birds, clouds
+LEAST_SHARE = 0.002  # of the picture: smaller patches are not worth the risk
+LEAST_CONTACT = 0.5  # of a region's width at the top over the root of its area: a sky is open, a road or a wall narrow
+GROW_STEPS = 3  # pixels by which the slope's window keeps regions from edges
+GROW_COLOUR = 0.06  # most distance, in any channel, from the mean of the sky close by
+GROW_WINDOW = 7
+DIRECTION_ROWS = 64  # of the grid of directions, elevation by azimuth: cells of 2.8°
+LEAST_WITNESSES = 2  # other photos that look the same way, before their word counts
+LEAST_AGREEMENT = 0.15  # of what they see that way: buildings rightly hide much of one's sky from another
+
+
+@dataclass(frozen=True)
+class SkyPhoto:
+    """A photo as the search sees it, at most ``WORK_MEGAPIXELS``.
+
+    Attributes:
+        camera: At the size of ``pixels``.
+        pixels: RGB.
+        ignored: True where the user's mask leaves pixels out; None without a mask.
+        drawn: The sky, where the user drew it; None where it is to be found.
+    """
+
+    camera: Camera
+    pixels: UInt8[np.ndarray, "h w 3"]
+    ignored: Bool[np.ndarray, "h w"] | None = None
+    drawn: Bool[np.ndarray, "h w"] | None = None
+
+
+@dataclass(frozen=True)
+class SkyMask:
+    """Where a photo shows the sky, an eighth of a byte a pixel.
+
+    Attributes:
+        bits: ``np.packbits`` of the mask.
+        shape: Its height and width, those of the ``SkyPhoto``.
+    """
+
+    bits: UInt8[np.ndarray, " n"]
+    shape: tuple[int, int]
+
+    @staticmethod
+    def packed(mask: Bool[np.ndarray, "h w"]) -> SkyMask:
+        """Pack a mask."""
+        return SkyMask(np.packbits(mask), (mask.shape[0], mask.shape[1]))
+
+    def unpacked(self) -> Bool[np.ndarray, "h w"]:
+        """The mask, True where the sky is."""
+        flat = np.unpackbits(self.bits, count=self.shape[0] * self.shape[1])
+        return flat.reshape(self.shape).astype(bool)
+
+    def emptied(self) -> SkyMask:
+        """One of the same size without sky."""
+        return SkyMask(np.zeros_like(self.bits), self.shape)
+
+    def any(self) -> bool:
+        """Whether there is sky at all."""
+        return bool(self.bits.any())
+
+
+@dataclass(frozen=True)
+class Votes:
+    """The cells of the grid of directions that a photo sees, and those of them that are sky to it."""
+
+    seen: Int64[np.ndarray, " s"]
+    sky: Int64[np.ndarray, " k"]
+
+
+def find_skies(
+    cameras: Sequence[Camera],
+    photo: Callable[[int], SkyPhoto],
+    points: Float64[np.ndarray, "m 3"],
+    up: Float64[np.ndarray, " 3"],
+    threads: int = 1,
+) -> list[SkyMask]:
+    """The sky in each photo of a capture: as it is drawn, else found.
+
+    Args:
+        cameras: Of the photos, in one world frame, of any size.
+        photo: Loads one of them; called from several threads.
+        points: Triangulated points in that frame; leave out those of few photos or a large error.
+        up: Against gravity, of ``up_of``.
+        threads: That load and search.
+    """
+
+    def search(index: int) -> tuple[SkyMask, Votes, bool]:
+        seen = photo(index)
+        mask = find_sky(seen, points_in(seen.camera, points), up) if seen.drawn is None else seen.drawn
+        return SkyMask.packed(mask), votes_of(seen.camera, mask, up), seen.drawn is not None
+
+    searched = list(ordered_map(search, range(len(cameras)), threads))
+    kept = agreed([votes for _, votes, _ in searched])
+    return [mask if keep or drawn else mask.emptied() for (mask, _, drawn), keep in zip(searched, kept, strict=True)]
+
+
+def up_of(
+    cameras: Sequence[Camera], photo: Callable[[int], SkyPhoto], points: Float64[np.ndarray, "m 3"], threads: int = 1
+) -> Float64[np.ndarray, " 3"]:
+    """Unit vector against gravity, from the cameras alone: datasets hold no EXIF orientation.
+
+    Args:
+        cameras: At least one.
+        photo: As for ``find_skies``; called only where the photos seem to be turned.
+        points: As for ``find_skies``.
+        threads: That load.
+    """
+    rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])
+    centres = np.stack([camera.centre() for camera in cameras])
+
+    def brighter() -> Float64[np.ndarray, "n 2"]:
+        light = ordered_map(lambda index: _brighter(photo(index).pixels), range(len(cameras)), threads)
+        return np.stack(list(light))
+
+    return up_without_orientation(rotations, centres, points, brighter).up
+
+
+def find_sky(
+    photo: SkyPhoto, points_px: Float64[np.ndarray, "n 2"], up: Float64[np.ndarray, " 3"]
+) -> Bool[np.ndarray, "h w"]:
+    """The sky in one photo, True where it is, by all but the agreement with other photos.
+
+    What the user's mask leaves out counts as looking like sky; rays, points and the top of the picture still decide.
+
+    Args:
+        photo: The photo.
+        points_px: Where triangulated points project to, seen in this photo or hidden in it, pixels of ``pixels``.
+        up: Against gravity, in the world; a unit vector.
+    """
+    colour = photo.pixels.astype(np.float32) / np.float32(255.0)
+    elevation = elevations_deg(photo.camera, up)
+    near = _near_points(points_px, elevation.shape)
+    clear = (elevation > -HORIZON_MARGIN_DEG) & ~near
+    alike = (_slopes(colour) < SMOOTH_SLOPE) & _sky_coloured(colour)
+    if photo.ignored is not None:
+        alike |= photo.ignored
+    regions = _regions(alike & clear, _top(elevation))
+    kept = [region for region in regions if _is_sky(region, colour, near, photo.ignored)]
+    sky = np.logical_or.reduce(kept) if kept else np.zeros(elevation.shape, bool)
+    return _grown(sky, colour, clear)
+
+
+def elevations_deg(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "h w"]:
+    """Angle of each pixel's ray over the horizon, degrees."""
+    rays = directions(camera)
+    sine = rays @ up / np.linalg.norm(rays, axis=2)
+    return np.asarray(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
+
+
+def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
+    """Rays of pixels in the world, 1 long along the camera's axis.
+
+    Args:
+        camera: The camera.
+        step: Only every so many pixels, from the first; the last one is the last pixel's or a little outside.
+    """
+    x = (step * np.arange(-((1 - camera.width) // step) + 1) + 0.5 - camera.cx) / camera.fx
+    y = (step * np.arange(-((1 - camera.height) // step) + 1) + 0.5 - camera.cy) / camera.fy
+    rotation = camera.cam_from_world[:3, :3]
+    return np.asarray(x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2])
+
+
+def points_in(camera: Camera, points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n 2"]:
+    """Where points in front of a camera project to, those within its picture, pixels."""
+    in_front = points[points @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3] > 0.0]
+    if len(in_front) == 0:
+        return np.zeros((0, 2))
+    places = camera.project(in_front)
+    inside = np.isfinite(places).all(axis=1) & (places >= 0.0).all(axis=1)
+    return np.asarray(places[inside & (places < [camera.width, camera.height]).all(axis=1)])
+
+
+def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarray, " 3"]) -> Votes:
+    """What a photo says about directions: a cell is sky where most of what the photo sees of it is."""
+    cell = direction_cells(camera, up)
+    cells = 2 * DIRECTION_ROWS * DIRECTION_ROWS
+    count = np.bincount(cell.ravel(), minlength=cells)
+    return Votes(np.flatnonzero(count), np.flatnonzero(2 * np.bincount(cell[mask], minlength=cells) > count))
+
+
+def agreed(votes: Sequence[Votes]) -> list[bool]:
+    """Whether each photo's sky is one; False where the others that look the same way see something else there."""
+    seen, sky = np.zeros((2, 2 * DIRECTION_ROWS * DIRECTION_ROWS))
+    for vote in votes:
+        seen[vote.seen] += 1.0
+        sky[vote.sky] += 1.0
+    kept = []
+    for vote in votes:
+        witnesses, agreeing = seen[vote.sky] - 1.0, sky[vote.sky] - 1.0
+        asked = witnesses >= LEAST_WITNESSES
+        heard = 2 * int(asked.sum()) > len(vote.sky)
+        kept.append(not heard or float(agreeing[asked].sum()) >= LEAST_AGREEMENT * float(witnesses[asked].sum()))
+    return kept
+
+
+def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Int64[np.ndarray, "h w"]:
+    """The cell of the grid of directions that each pixel looks at."""
+    rays = directions(camera)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    east, north = horizontal_axes(up)
+    azimuth = np.arctan2(rays @ north, rays @ east) / (2.0 * math.pi) + 0.5  # of a turn
+    height = np.arcsin(np.clip(rays @ up, -1.0, 1.0)) / math.pi + 0.5
+    columns = 2 * DIRECTION_ROWS
+    row = np.minimum((height * DIRECTION_ROWS).astype(np.int64), DIRECTION_ROWS - 1)
+    return np.asarray(row * columns + (azimuth * columns).astype(np.int64) % columns)
+
+
+def horizontal_axes(up: Float64[np.ndarray, " 3"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
+    """Two unit vectors that make a right-handed frame with ``up``; which ones is of no matter, but always the same."""
+    axis = np.eye(3)[int(np.argmin(np.abs(up)))]
+    east = np.cross(axis, up)
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
+
+
+def _brighter(pixels: UInt8[np.ndarray, "h w 3"]) -> Float64[np.ndarray, " 2"]:
+    """Right half less left half, lower half less upper half, of the mean brightness."""
+    light = pixels.mean(axis=2)
+    rows, columns = light.mean(axis=1), light.mean(axis=0)
+    return np.array([np.diff([half.mean() for half in np.array_split(line, 2)])[0] for line in (columns, rows)])
+
+
+def _slopes(colour: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+    """Largest change over a pixel of any channel."""
+    along_x = cv2.Sobel(colour, cv2.CV_32F, 1, 0, ksize=3, scale=0.125, borderType=cv2.BORDER_REPLICATE)
+    along_y = cv2.Sobel(colour, cv2.CV_32F, 0, 1, ksize=3, scale=0.125, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(np.hypot(along_x, along_y).max(axis=2), np.float32)
+
+
+def _sky_coloured(colour: Float32[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+    red, green, blue = colour[:, :, 0], colour[:, :, 1], colour[:, :, 2]
+    bluish = (blue > red + BLUE_STEP) & (blue > green - BLUE_STEP) & (blue > LEAST_BLUE_LIGHT)
+    return np.asarray(bluish | (colour.min(axis=2) > LEAST_GREY_LIGHT))
+
+
+def _near_points(points_px: Float64[np.ndarray, "n 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    hit = np.zeros(shape, np.uint8)
+    columns, rows = points_px.astype(np.int64).T
+    hit[rows, columns] = 1
+    size = 2 * POINT_CLEARANCE_PX + 1
+    return np.asarray(cv2.dilate(hit, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0)
+
+
+def _top(elevation: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels at the border over which gravity's up leads out of the picture; around the zenith where that is inside."""
+    down, right = np.gradient(elevation)
+    steepness = TOP_COSINE * np.maximum(np.hypot(down, right), 1e-12)
+    top = elevation > ZENITH_DEG
+    top[0] |= -down[0] > steepness[0]
+    top[-1] |= down[-1] > steepness[-1]
+    top[:, 0] |= -right[:, 0] > steepness[:, 0]
+    top[:, -1] |= right[:, -1] > steepness[:, -1]
+    return top
+
+
+def _regions(candidates: Bool[np.ndarray, "h w"], top: Bool[np.ndarray, "h w"]) -> list[Bool[np.ndarray, "h w"]]:
+    """Connected regions that are open to the top and not tiny."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates.astype(np.uint8), connectivity=4)
+    contact = np.bincount(labels[top & candidates], minlength=count)
+    area = stats[:, cv2.CC_STAT_AREA]
+    wide = (contact >= LEAST_CONTACT * np.sqrt(area)) & (area >= LEAST_SHARE * candidates.size)
+    return [labels == label for label in range(1, count) if wide[label]]
+
+
+def _is_sky(
+    region: Bool[np.ndarray, "h w"],
+    colour: Float32[np.ndarray, "h w 3"],
+    near: Bool[np.ndarray, "h w"],
+    ignored: Bool[np.ndarray, "h w"] | None,
+) -> bool:
+    """Whether a smooth region is sky and no wall: almost no points within, and grey only where it outshines the rest.
+
+    What counts is how far points are spread: a spire has many in one place.
+    """
+    window = np.ones((2 * CORE_PX + 1, 2 * CORE_PX + 1), np.uint8)
+    filled = np.pad(cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, window), 1)  # points made holes in it
+    core = cv2.distanceTransform(filled, cv2.DIST_L2, 3)[1:-1, 1:-1] > CORE_PX
+    if core.any() and near[core].mean() > MOST_SPREAD * near[~core].mean():
+        return False
+    seen = region if ignored is None else region & ~ignored
+    rest = ~region if ignored is None else ~region & ~ignored
+    if not seen.any() or not rest.any():
+        return bool(rest.any())  # nothing but what a mask left out beside something seen
+    red, green, blue = np.median(colour[seen], axis=0)
+    least = BLUE_OUTSHINES if blue > red + CLEARLY_BLUE and blue > green else GREY_OUTSHINES
+    light = np.median(colour[seen].mean(axis=1))
+    return bool((colour[rest].mean(axis=1) < light).mean() > least)
+
+
+def _grown(
+    sky: Bool[np.ndarray, "h w"], colour: Float32[np.ndarray, "h w 3"], clear: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """The sky up to the edges that the slope's window kept it from: neighbours of the colour of the sky close by."""
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for _ in range(GROW_STEPS):
+        weight = sky.astype(np.float32)
+        total = cv2.boxFilter(weight, -1, (GROW_WINDOW, GROW_WINDOW), normalize=False)
+        mean = cv2.boxFilter(colour * weight[:, :, None], -1, (GROW_WINDOW, GROW_WINDOW), normalize=False)
+        near = np.abs(colour - mean / np.maximum(total, 1.0)[:, :, None]).max(axis=2) < GROW_COLOUR
+        sky = sky | ((cv2.dilate(sky.astype(np.uint8), cross) > 0) & near & clear)
+    return sky

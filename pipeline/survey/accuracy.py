@@ -1,0 +1,131 @@
+"""How well a model lies where control, check points and positions say: ``control.json`` and ``accuracy.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.place import Site
+from splatpipe.pipeline.survey.residuals import accuracy_table
+from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, residual_px
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A model in the world.
+
+    Attributes:
+        model: The one that goes on down the line.
+        world_from_model: Where it lies.
+        offsets: Of the flights' positions: stated less true, metres.
+    """
+
+    model: SparseModel
+    world_from_model: Similarity
+    offsets: Float64[np.ndarray, "k 3"]
+
+
+def no_control() -> JSON:
+    """``control.json`` of a capture without control."""
+    return {"points": []}
+
+
+def control_json(survey: Survey, site: Site, placed: Placed, photos: Mapping[str, Photo], mark_sigma_px: float) -> JSON:
+    """What ``control.json`` holds: every point of the survey, where it was found, and its marks; local metres.
+
+    Residuals are what is estimated less what is surveyed; of pixels, what the model shows less the mark.
+    """
+    points = []
+    for k, point in enumerate(survey.points):
+        known = np.isfinite(site.targets.sigmas[k])
+        place = None if point.found is None else placed.world_from_model.apply(point.found.xyz[None])[0]
+        residual = None if place is None else _listed(place - site.targets.enu[k], known)
+        stated = point.surveyed
+        points.append(
+            {
+                "name": point.name,
+                "role": point.role,
+                "why": point.why,
+                "surveyed_m": _listed(site.targets.enu[k], known),
+                "sigma_m": [float(site.targets.sigmas[k, 0]), float(site.targets.sigmas[k, 2]) if known[2] else None],
+                "surveyed_crs": [stated.x, stated.y, stated.z],
+                "estimated_m": None if place is None else place.tolist(),
+                "residual_m": residual,
+                "observations": [
+                    _observation(sighting, None if point.found is None else point.found.xyz, placed.model, photos)
+                    for sighting in point.sightings
+                ],
+            }
+        )
+    return {
+        "crs": survey.crs.text,
+        "vertical": survey.crs.vertical,
+        "file": survey.name,
+        "sigma_pixel": mark_sigma_px,
+        "points": points,
+    }
+
+
+def accuracy_json(
+    survey: Survey | None, site: Site | None, placed: Placed, gsd: float | None, uncertainty: JSON = None
+) -> JSON:
+    """What ``accuracy.json`` holds: the errors of positions, control and check points apart; absent groups are null.
+
+    Args:
+        survey: The surveyed points.
+        site: The world.
+        placed: The model in it.
+        gsd: Ground sampling distance.
+        uncertainty: How well positions alone place the model; null where control does.
+    """
+    tables: dict[str, JSON] = {"gps": None, "control": None, "check": None}
+    if site is not None and len(site.stations):
+        stations = site.stations
+        centres = placed.world_from_model.apply(placed.model.centres[stations.indices])
+        table = accuracy_table(centres + placed.offsets[stations.group] - site.station_enu)
+        flights = [
+            {"flight": number, "photos": int((stations.group == k).sum()), "offset_m": placed.offsets[k].tolist()}
+            for k, number in enumerate(stations.flights)
+        ]
+        tables["gps"] = None if table is None else {**table, "flights": flights}
+    if survey is not None and site is not None:
+        for role in ("control", "check"):
+            errors = [
+                np.where(
+                    np.isfinite(site.targets.sigmas[k]),
+                    placed.world_from_model.apply(point.found.xyz[None])[0] - site.targets.enu[k],
+                    np.nan,
+                )
+                for k, point in enumerate(survey.points)
+                if point.role == role and point.found is not None
+            ]
+            tables[role] = accuracy_table(np.array(errors, dtype=np.float64).reshape(-1, 3))
+    return {"gsd_m": gsd, "tables": tables, "uncertainty": uncertainty}
+
+
+def _listed(values: Float64[np.ndarray, " 3"], known: Sequence[bool] | np.ndarray) -> list[float | None]:
+    return [float(value) if is_known else None for value, is_known in zip(values, known, strict=True)]
+
+
+def _observation(
+    sighting: Sighting, place: Float64[np.ndarray, " 3"] | None, model: SparseModel, photos: Mapping[str, Photo]
+) -> JSON:
+    residual = None if place is None else residual_px(sighting, place, model, photos)
+    ray = None
+    if sighting.index is not None:
+        found = model.view(sighting.index, photos[sighting.photo].width).ray(np.array(sighting.pixel))
+        ray = found.tolist() if np.isfinite(found).all() else None
+    return {
+        "photo": sighting.photo,
+        "pixel": list(sighting.pixel),
+        "ray": ray,
+        "residual_px": None if residual is None else residual.tolist(),
+        "used": bool(sighting.agrees and sighting.index is not None),
+    }

@@ -1,0 +1,296 @@
+"""Bundle adjustment with control, positions and priors of the lens: COLMAP's problem with blocks of our own in it.
+
+COLMAP builds the reprojection errors of the features; marks, control and positions join them through pyceres. All is in
+the world's metres, and in one order, on one thread: the same bits for the same input. Residuals of features stay in
+pixels, so that everything else is in units of their standard deviation.
+
+A flight's common error is an unknown of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyceres
+import pycolmap
+import pycolmap.cost_functions
+from jaxtyping import Float64
+
+from splatpipe.pipeline.geometry.similarity import Similarity, cross_matrix, fit_similarity
+from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
+from splatpipe.pipeline.sfm.lens_blocks import hold, keep_shape
+from splatpipe.pipeline.survey.place import Stations
+
+LEAST_SIGMA_PX = 1.0  # of features: they err together, in one photo, by lens and shutter; control should not
+UNBOUND_M = 1e4  # sigma of a height that nobody measured
+FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
+DISTORTION_SIGMA = 0.2  # of a distortion coefficient about what SfM found
+ROUNDS = 10  # of reweighting
+
+
+@dataclass(frozen=True)
+class Target:
+    """A control point in the adjustment.
+
+    Attributes:
+        place: Where it is surveyed, world; height anything where it is not known.
+        sigmas: Standard deviations; infinite where it is not known.
+        start: Where it is found.
+        marks: COLMAP's image id and pixel in the model's camera.
+        mark_sigmas_px: Of the marks, in the model's pixels.
+    """
+
+    place: Float64[np.ndarray, " 3"]
+    sigmas: Float64[np.ndarray, " 3"]
+    start: Float64[np.ndarray, " 3"]
+    marks: Sequence[tuple[int, Float64[np.ndarray, " 2"]]]
+    mark_sigmas_px: Float64[np.ndarray, " m"]
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What an adjustment found.
+
+    Attributes:
+        reconstruction: In the world's metres.
+        places: Of the targets.
+        normed: Root mean square of each target's distance to where it is surveyed, over its sigmas.
+        offsets: Of the flights' positions: stated less true.
+        feature_sigma_px: That the features were given.
+        focal_sigmas: Standard deviation of each camera's focal length, relative, by COLMAP's camera id, as the photos
+            and control tell it.
+        held: Cameras whose focal length nothing tells, so that it stays near its prior.
+        usable: Whether the adjustment found a solution.
+    """
+
+    reconstruction: pycolmap.Reconstruction
+    places: Float64[np.ndarray, "n 3"]
+    normed: Float64[np.ndarray, " n"]
+    offsets: Float64[np.ndarray, "k 3"]
+    feature_sigma_px: float
+    focal_sigmas: Mapping[int, float]
+    held: tuple[int, ...]
+    usable: bool
+
+
+def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
+    """Whether every photo has a pose of its own (no rigs) and there is something to adjust."""
+    images = [reconstruction.images[number] for number in reconstruction.reg_image_ids()]
+    return reconstruction.num_points3D() > 0 and all(image.is_ref_in_frame() for image in images)
+
+
+def adjust(
+    reconstruction: pycolmap.Reconstruction,
+    world_from_model: Similarity,
+    targets: Sequence[Target],
+    stations: tuple[Stations, Float64[np.ndarray, "n 3"], Sequence[int]],
+    focal_priors: Mapping[int, float],
+    lenses_held: bool = False,
+) -> Adjusted:
+    """Adjust a model to control.
+
+    Args:
+        reconstruction: In the model's frame; left as it is.
+        world_from_model: Where it lies, nearly.
+        targets: Control points.
+        stations: The photos' positions, in the world, and COLMAP's ids of these photos.
+        focal_priors: Focal lengths in the model's pixels by camera id, where the metadata know them.
+        lenses_held: Leave the lenses as they are.
+    """
+    model = pycolmap.Reconstruction(reconstruction)
+    model.transform(
+        pycolmap.Sim3d(
+            world_from_model.scale, pycolmap.Rotation3d(world_from_model.rotation), world_from_model.translation
+        )
+    )
+    sigma = feature_sigma(model)
+    adjuster = _features(model)
+    problem = adjuster.problem
+    blocks = _Blocks(problem, sigma)
+    places = np.array([target.start for target in targets], dtype=np.float64).reshape(-1, 3)
+    for place, target in zip(places, targets, strict=True):
+        blocks.add_target(model, place, target)
+    offsets = _add_stations(blocks, model, stations)
+    if lenses_held:
+        focal_priors = {}
+        blocks.kept += [hold(problem, camera, [*range(len(camera.params))]) for camera in _seen(problem, model)]
+    else:
+        _add_lens(blocks, model, focal_priors)
+    solved = pyceres.SolverSummary()
+    pyceres.solve(solver_options(len(model.reg_image_ids())), problem, solved)
+    focal_sigmas = posterior_focal_sigmas(model, problem)
+    held = [n for n, focal in focal_priors.items() if focal_sigmas.get(n, 0.0) > UNOBSERVED]
+    if held:
+        for number in held:
+            keep_near(problem, model.cameras[number], focal_priors[number], FOCAL_SIGMA)
+        pyceres.solve(solver_options(len(model.reg_image_ids())), problem, solved)
+    normed = np.array(
+        [
+            math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())
+            for p, t in zip(places, targets, strict=True)
+        ]
+    )
+    model.update_point_3d_errors()
+    usable = bool(solved.IsSolutionUsable()) and bool(np.isfinite(places).all())
+    return Adjusted(model, places, normed, offsets, sigma, focal_sigmas, tuple(held), usable)
+
+
+def feature_sigma(model: pycolmap.Reconstruction) -> float:
+    """Standard deviation of the features' coordinates by their residuals, at least a pixel."""
+    errors = []
+    for number in sorted(model.reg_image_ids()):
+        image = model.images[number]
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
+        seen = [point for point in image.points2D if point.has_point3D()]
+        if not seen:
+            continue
+        xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
+        shown = camera.img_from_cam(xyz @ pose.rotation.matrix().T + pose.translation)
+        errors.append(np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1))
+    squares = np.concatenate([np.zeros(0), *errors]) ** 2
+    squares = squares[np.isfinite(squares)]
+    unknowns = 3 * model.num_points3D() + 6 * len(model.reg_image_ids())
+    degrees = max(2 * len(squares) - unknowns, 1)
+    return max(math.sqrt(float(squares.sum()) / degrees), LEAST_SIGMA_PX)
+
+
+class _Blocks:
+    """Adds residual blocks, in units of the features' standard deviation, and keeps what Ceres points at."""
+
+    def __init__(self, problem: Any, sigma_px: float) -> None:
+        self.problem = problem
+        self.sigma_px = sigma_px
+        self.kept: list[object] = []
+
+    def add(self, cost: Any, parameters: list[Float64[np.ndarray, " _"]]) -> None:
+        self.kept += [cost, *parameters]
+        self.problem.add_residual_block(cost, None, parameters)
+
+    def add_prior(
+        self, parameter: Float64[np.ndarray, " k"], mean: Float64[np.ndarray, " k"], sigmas: Float64[np.ndarray, " k"]
+    ) -> None:
+        """A parameter about a mean."""
+        covariance = np.diag((sigmas / self.sigma_px) ** 2)
+        self.add(pyceres.factors.NormalPrior(mean, covariance), [parameter])
+
+    def add_target(self, model: pycolmap.Reconstruction, place: Float64[np.ndarray, " 3"], target: Target) -> None:
+        """A control point: where it is surveyed, and its marks."""
+        for (number, pixel), mark_sigma in zip(target.marks, target.mark_sigmas_px.tolist(), strict=True):
+            image = model.images[number]
+            camera = model.cameras[image.camera_id]
+            covariance = np.eye(2) * (mark_sigma / self.sigma_px) ** 2
+            cost = pycolmap.cost_functions.ReprojErrorCost(camera.model, covariance, pixel)
+            self.add(cost, [place, image.frame.rig_from_world.params, camera.params])
+        self.add_prior(place, target.place, np.minimum(target.sigmas, UNBOUND_M))
+
+
+class _StationCost(pyceres.CostFunction):  # type: ignore[misc]
+    """A camera's centre and its flight's offset against the position that its photo states."""
+
+    def __init__(self, stated: Float64[np.ndarray, " 3"], weights: Float64[np.ndarray, " 3"]) -> None:
+        super().__init__()
+        self.set_num_residuals(3)
+        self.set_parameter_block_sizes([7, 3])
+        self._stated, self._weights = stated, weights
+
+    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        """Ceres' interface: pose as quaternion (x, y, z, w) and translation, camera from world; then the offset."""
+        quat, t = np.asarray(parameters[0][:4]), np.asarray(parameters[0][4:])
+        axis, w = -quat[:3], quat[3]  # of the inverse rotation
+        turned = np.cross(axis, t)
+        centre = -(t + 2.0 * w * turned + 2.0 * np.cross(axis, turned))
+        residuals[:] = self._weights * (centre + np.asarray(parameters[1]) - self._stated)
+        if jacobians is not None:
+            if jacobians[0] is not None:
+                k, jacobian = cross_matrix(axis), np.zeros((3, 7))
+                jacobian[:, :3] = -2.0 * w * cross_matrix(t)
+                jacobian[:, :3] += 2.0 * (axis @ t * np.eye(3) + np.outer(axis, t) - 2.0 * np.outer(t, axis))
+                jacobian[:, 3] = -2.0 * turned
+                jacobian[:, 4:] = -(np.eye(3) + 2.0 * w * k + 2.0 * k @ k)
+                jacobians[0][:] = (self._weights[:, None] * jacobian).ravel()
+            if jacobians[1] is not None:
+                jacobians[1][:] = np.diag(self._weights).ravel()
+        return True
+
+
+def _features(model: pycolmap.Reconstruction) -> Any:
+    """COLMAP's bundle adjuster of all photos, with no gauge: control is it."""
+    options = pycolmap.BundleAdjustmentOptions()
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in sorted(model.reg_image_ids()):
+        config.add_image(number)
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+
+
+def _add_stations(
+    blocks: _Blocks,
+    model: pycolmap.Reconstruction,
+    stations: tuple[Stations, Float64[np.ndarray, "n 3"], Sequence[int]],
+) -> Float64[np.ndarray, "k 3"]:
+    where, enu, numbers = stations
+    offsets = np.zeros((len(where.flights), 3))
+    for offset, sigmas in zip(offsets, where.offset_sigmas(), strict=True):
+        blocks.add_prior(offset, np.zeros(3), sigmas)
+    for k, number in enumerate(numbers):
+        cost = _StationCost(enu[k], blocks.sigma_px / where.sigmas[k])
+        blocks.add(cost, [model.images[number].frame.rig_from_world.params, offsets[where.group[k]]])
+    return offsets
+
+
+def _seen(problem: Any, model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
+    """The cameras that a problem is about, by id."""
+    return [camera for _, camera in sorted(model.cameras.items()) if problem.has_parameter_block(camera.params)]
+
+
+def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Mapping[int, float]) -> None:
+    """What the metadata and SfM know of lenses, so that what neither photos nor control tell stays there."""
+    for number, camera in sorted(model.cameras.items()):
+        params = camera.params
+        if not blocks.problem.has_parameter_block(params):
+            continue
+        mean = np.array(params, dtype=np.float64)
+        sigmas = np.full(len(mean), 1e6)
+        for index in camera.focal_length_idxs():
+            mean[index] = focal_priors.get(number, mean[index])
+            sigmas[index] = FOCAL_SIGMA * mean[index]
+        for index in camera.extra_params_idxs():
+            sigmas[index] = DISTORTION_SIGMA
+        blocks.add_prior(params, mean, sigmas)
+        blocks.kept += keep_shape(blocks.problem, camera)
+
+
+def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> float:
+    """How far an adjustment moved what the photos show: root mean square of the points' motion after the best
+    similarity, seen by the cameras as they were, pixels.
+
+    Args:
+        before: The model.
+        after: The same model, adjusted, in any frame; the same points and photos under the same numbers.
+    """
+    numbers = sorted(set(before.points3D.keys()) & set(after.points3D.keys()))
+    if len(numbers) < 3:
+        return 0.0
+    old = np.array([before.points3D[number].xyz for number in numbers])
+    new = np.array([after.points3D[number].xyz for number in numbers])
+    weights = np.ones(len(numbers))
+    for _ in range(ROUNDS):  # points far off are seen by few, and would turn the rest
+        scale, rotation, translation = fit_similarity(new, old, weights)
+        back = Similarity(float(scale), rotation, translation).apply(new)
+        distance = np.linalg.norm(back - old, axis=1)
+        weights = 1.0 / (1.0 + (distance / max(float(np.median(distance)), 1e-300)) ** 2)
+    place = {number: k for k, number in enumerate(numbers)}
+    squares: list[Float64[np.ndarray, " n"]] = []
+    for number in sorted(before.reg_image_ids()):
+        image = before.images[number]
+        seen = [place[p.point3D_id] for p in image.points2D if p.has_point3D() and p.point3D_id in place]
+        if not seen:
+            continue
+        camera, pose = before.cameras[image.camera_id], image.cam_from_world()
+        shown = [camera.img_from_cam(xyz[seen] @ pose.rotation.matrix().T + pose.translation) for xyz in (old, back)]
+        squares.append(((shown[1] - shown[0]) ** 2).sum(axis=1))
+    together = np.concatenate(squares)
+    return float(np.sqrt(together[np.isfinite(together)].mean()))

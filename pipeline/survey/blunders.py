@@ -1,0 +1,264 @@
+"""Control that is wrong: in another CRS, swapped, or off; every case with what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.joint_fit import (
+    JointFit,
+    Observed,
+    Priors,
+    critical,
+    find_blunders,
+    fit_jointly,
+    misfit,
+    studentised,
+)
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic, utm_of
+from splatpipe.pipeline.survey.geodesy import ecef_from_geodetic
+from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.place import Site, Stations, locate_survey, observed_in
+from splatpipe.pipeline.survey.surveyed_points import Survey, SurveyPoint
+
+FAR_M = 2000.0  # from the photos: control that they are to show lies nearer
+DATUM_M = 20.0  # off the positions, and more than they are wrong: another datum
+DATUM_SIGMAS = 5.0
+DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
+SWAPPED_SHARE = 0.3  # of how far two points are off, what is left of it when their names are swapped
+WEAK = 4.0  # times the control's own accuracy: the model is known less well
+LEAST_GSD = 3.0  # a point off by fewer ground pixels is none that a message helps with
+CONTROL_HINT = "--set georef.control=none goes on without control."
+
+
+def require_near(survey: Survey, config: GeorefConfig, stations: Stations) -> Float64[np.ndarray, "n 3"]:
+    """Where the survey's points are, if that is where the photos were taken.
+
+    Returns:
+        Latitude, longitude, height (NaN where it is not known).
+
+    Raises:
+        SplatpipeError: if they are elsewhere; the hint names the CRS that would put them there.
+    """
+    try:
+        geodetic = locate_survey(survey, config)
+    except SplatpipeError as error:
+        better = _better_reading(survey, stations)
+        raise SplatpipeError(f"{survey.name}: {error}", f"{better or error.hint} {CONTROL_HINT}") from error
+    if len(stations) == 0:
+        return geodetic
+    away = _distance_m(geodetic, stations)
+    if away > FAR_M:
+        better = _better_reading(survey, stations) or (
+            "Check the CRS in its first line, and that east (or longitude) comes before north."
+        )
+        raise SplatpipeError(
+            f"The points of {survey.name} lie {away / 1000.0:,.1f} km from where the photos were taken, read in"
+            f" {survey.crs.text} ({survey.crs.name}).",
+            f"{better} {CONTROL_HINT}",
+        )
+    return geodetic
+
+
+def name_blunders(
+    survey: Survey,
+    site: Site,
+    model: SparseModel,
+    start: tuple[Similarity, Priors],
+    config: GeorefConfig,
+    report: Reporter,
+) -> Survey:
+    """The survey without control that contradicts the rest; what is wrong is told, of check points as well."""
+    similarity, priors = start
+    observed = observed_in(site, survey, model, similarity.scale, config.mark_sigma_px)
+    control = [k for k, point in enumerate(survey.points) if point.role == "control" and point.found is not None]
+    least = LEAST_GSD * gsd_m(survey, model, similarity.scale)
+    off = find_blunders(similarity, observed, priors, least)
+    kept = np.ones(len(observed), dtype=bool)
+    kept[list(off)] = False
+    fit = fit_jointly(similarity, observed.only(kept), priors)
+    suspects = {control[k] for k in off}
+    for k, point in enumerate(survey.points):
+        if point.role == "check" and point.found is not None and is_off(fit, site, point, k, least, config):
+            suspects.add(k)
+    points = list(survey.points)
+    swapped = _swapped(sorted(suspects), survey, site, fit.similarity)
+    for a, b in swapped:
+        report.warning(
+            f"The names {points[a].name} and {points[b].name} look swapped in {survey.name}:"
+            " each lies where the other is surveyed. Both are left out.",
+            "Exchange the two names, and run again.",
+        )
+        points[a] = points[a].left_out(f"it looks swapped with {points[b].name}")
+        points[b] = points[b].left_out(f"it looks swapped with {points[a].name}")
+    for k in sorted(suspects.difference(*swapped)):
+        points[k] = _told_off(points[k], offset_of(points[k], site, k, fit.similarity), report)
+    return survey.with_points(points)
+
+
+@dataclass(frozen=True)
+class _Off:
+    """How far a point is from where it is surveyed: found less surveyed; NaN in height where that is not known."""
+
+    enu: Float64[np.ndarray, " 3"]
+
+    @property
+    def length(self) -> float:
+        return float(np.sqrt(np.nansum(self.enu**2)))
+
+    def __str__(self) -> str:
+        parts = [f"{name} {value:+.2f}" for name, value in zip(("east", "north", "up"), self.enu, strict=True)]
+        return ", ".join(part for part, value in zip(parts, self.enu, strict=True) if np.isfinite(value)) + " m"
+
+
+def offset_of(point: SurveyPoint, site: Site, index: int, similarity: Similarity) -> _Off:
+    """Where a point is found less where it is surveyed."""
+    assert point.found is not None
+    off = similarity.apply(point.found.xyz[None])[0] - site.targets.enu[index]
+    return _Off(np.where(np.isfinite(site.targets.sigmas[index]), off, np.nan))
+
+
+def is_off(fit: JointFit, site: Site, point: SurveyPoint, index: int, least_m: float, config: GeorefConfig) -> bool:
+    """Whether a point that took no part in a fit contradicts it."""
+    if point.found is None or fit.degrees == 0:
+        return False
+    mark = fit.similarity.scale * config.mark_sigma_px * np.sqrt(np.trace(point.found.covariance) / 3.0)
+    alone = Observed(
+        point.found.xyz[None],
+        site.targets.enu[index][None],
+        np.hypot(site.targets.sigmas[index], mark)[None],
+        np.full(1, -1, dtype=np.int64),
+        np.ones(1, dtype=bool),
+    )
+    residual, sigmas = misfit(fit, alone, 0)
+    known = int(np.isfinite(site.targets.sigmas[index]).sum())
+    return studentised(residual, sigmas, known) > critical(fit.degrees) and float(np.linalg.norm(residual)) > least_m
+
+
+def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Reporter) -> None:
+    """Warn of control that lies beside the positions by more than these are wrong."""
+    if len(stations) == 0:
+        return
+    shift = np.hypot(fit.offsets[:, 0], fit.offsets[:, 1])
+    sigma = float(np.median(stations.sigmas[:, 0]))
+    if float(shift.min()) > max(DATUM_M, DATUM_SIGMAS * sigma):
+        report.warning(
+            f"The control of {survey.name} lies {shift.min():.0f} m beside the photos' positions.",
+            f"Is {survey.crs.text} its CRS, and its datum the right one? The frame follows the control.",
+        )
+    lift = fit.offsets[:, 2]
+    heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
+    if heights and float(np.abs(lift).min()) > DATUMS_APART_M:
+        report.warning(
+            f"The heights of {survey.name} lie {abs(lift[0]):.0f} m {'below' if lift[0] > 0 else 'above'} the photos'"
+            " positions, further than vertical datums differ.",
+            "Are they in feet, or above a point of the site? The frame follows the control.",
+        )
+
+
+def tell_weak(fit: JointFit, observed: Observed, model: SparseModel, report: Reporter) -> None:
+    """Warn of control that hardly tells where the model is away from it: few points, in one corner or on a line."""
+    control = observed.sigmas[observed.is_control]
+    if len(model.points) == 0 or len(control) == 0:
+        return
+    noise = max(fit.noise, 1.0)
+    worth = noise * float(np.median(control[np.isfinite(control)]))
+    measured = np.isfinite(control).any(axis=0)
+    known = noise * float(np.median(fit.sigmas_at(model.points)[:, measured].max(axis=1)))
+    if known > WEAK * worth:
+        report.warning(
+            f"The control tells where the model is to {known:.2f} m only, away from its points.",
+            "Add control points, spread over the site and not on one line.",
+        )
+
+
+def gsd_m(survey: Survey, model: SparseModel, scale: float) -> float:
+    """Ground sampling distance: metres a pixel, the median over the marks."""
+    sizes = []
+    for point in survey.points:
+        if point.found is None:
+            continue
+        for sighting in point.sightings:
+            if sighting.index is not None and sighting.agrees:
+                image = model.reconstruction.images[model.image_ids[sighting.index]]
+                focal = model.reconstruction.cameras[image.camera_id].mean_focal_length()
+                depth = float((image.cam_from_world() * point.found.xyz)[2])
+                sizes.append(scale * depth / focal)
+    return float(np.median(sizes)) if sizes else 0.0
+
+
+def _told_off(point: SurveyPoint, off: _Off, report: Reporter) -> SurveyPoint:
+    if point.role == "check":
+        report.warning(
+            f"Check point {point.name} lies {off.length:.2f} m from where it is surveyed ({off}).",
+            "Compare its coordinates and marks with the field book. It stays in the accuracy's table.",
+        )
+        return point
+    report.warning(
+        f"Control point {point.name} is left out: the others and the photos have it {off.length:.2f} m"
+        f" from where it is surveyed ({off}).",
+        "Compare its coordinates and its marks with the field book, correct the file, and run again.",
+    )
+    return point.left_out(f"it is {off.length:.2f} m off where the others and the photos have it")
+
+
+def _swapped(suspects: Sequence[int], survey: Survey, site: Site, similarity: Similarity) -> list[tuple[int, int]]:
+    """Pairs of which each lies where the other is surveyed."""
+    pairs: list[tuple[int, int]] = []
+    taken: set[int] = set()
+    for a in suspects:
+        for b in suspects:
+            if a < b and not {a, b} & taken:
+                own = max(_gap(survey, site, similarity, a, a), _gap(survey, site, similarity, b, b))
+                other = max(_gap(survey, site, similarity, a, b), _gap(survey, site, similarity, b, a))
+                if other < SWAPPED_SHARE * own:
+                    pairs.append((a, b))
+                    taken |= {a, b}
+    return pairs
+
+
+def _gap(survey: Survey, site: Site, similarity: Similarity, found: int, surveyed: int) -> float:
+    """How far the place of one point is from where another is surveyed."""
+    place = survey.points[found].found
+    assert place is not None
+    off = similarity.apply(place.xyz[None])[0] - site.targets.enu[surveyed]
+    known = np.isfinite(site.targets.sigmas[surveyed])
+    return float(np.linalg.norm(off[known]))
+
+
+def _distance_m(geodetic: Float64[np.ndarray, "n 3"], stations: Stations) -> float:
+    places = [np.column_stack([each[:, :2], np.zeros(len(each))]) for each in (geodetic, stations.geodetic)]
+    centres = [np.median(ecef_from_geodetic(place), axis=0) for place in places]
+    return float(np.linalg.norm(centres[0] - centres[1]))
+
+
+def _better_reading(survey: Survey, stations: Stations) -> str:
+    """The CRS, or the order of coordinates, that would put the points where the photos were taken; empty if none."""
+    if len(stations) == 0:
+        return ""
+    place = np.median(stations.geodetic, axis=0)
+    zone = utm_of(float(place[0]), float(place[1]))
+    number = zone.text.rpartition(":")[2]
+    candidates = [survey.crs.text, zone.text, "EPSG:4326"]
+    if number.startswith("326"):
+        candidates.append(f"EPSG:258{number[3:]}")
+    stated = np.array([[point.surveyed.x, point.surveyed.y, 0.0] for point in survey.points], dtype=np.float64)
+    for text in candidates:
+        for swapped in (False, True):
+            try:
+                points = stated[:, [1, 0, 2]] if swapped else stated
+                geodetic = to_geodetic(np.ascontiguousarray(points), parse_crs(text), approximate=True).geodetic
+            except SplatpipeError:
+                continue
+            if _distance_m(geodetic, stations) <= FAR_M and (swapped or text != survey.crs.text):
+                how = "with its first two coordinates exchanged" if swapped else f"as {text}"
+                how += f" and as {text}" if swapped and text != survey.crs.text else ""
+                return f"Read {how} they lie where the photos were taken: correct the file."
+    return ""

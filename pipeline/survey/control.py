@@ -1,0 +1,291 @@
+"""Georeferencing by control: the frame that it gives, and the model that it bends where the model is bent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.joint_fit import SIMILARITY, JointFit, fit_jointly
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.accuracy import Placed
+from splatpipe.pipeline.survey.adjustment import Adjusted, Target, adjust, can_adjust, moved_px
+from splatpipe.pipeline.survey.blunders import name_blunders, require_near, tell_datum, tell_weak
+from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.survey.model import SparseModel, model_of
+from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.place import (
+    MIN_CONTROL,
+    Site,
+    make_site,
+    observed_in,
+    require_fit,
+    start_similarity,
+    stations_of,
+    with_sigmas_times,
+)
+from splatpipe.pipeline.survey.surveyed_points import Survey, locate
+
+BENT_PX = 0.5  # what control has to move the photos' content by, root mean square, for the model to be worth bending
+QUIET = 2.0  # times the stated sigmas: control that is off by no more keeps them
+STRAY = 0.1  # of a focal length from its prior: worth a warning
+SUSPICIOUS = 1.0  # with sigmas that are none too small, sound control stays well below
+LONELY = 3.0  # a point is off alone where the others are quieter without it by this
+CROWD = 3.0  # sigmas: where half of the points are off by more, it is not one that is
+SUSPECTS = 3  # points that are tried so, those with the largest residuals
+ROUNDS = 4  # of adjustment, each with the control that the one before showed to be wrong or less accurate
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What georeferencing starts from.
+
+    Attributes:
+        model: The sparse model.
+        positions: What the photos state.
+        photos: All photos of the capture by name.
+        focal_priors: What the metadata say, in the model's pixels, by COLMAP's camera id.
+        lenses_held: Whether the lenses stay as they are.
+    """
+
+    model: SparseModel
+    positions: Positions
+    photos: Mapping[str, Photo]
+    focal_priors: Mapping[int, float]
+    lenses_held: bool = False
+
+
+@dataclass(frozen=True)
+class ByControl:
+    """What control gives.
+
+    Attributes:
+        frame: The frame.
+        survey: The points, with what became of them, found in the model that goes on.
+        site: The world.
+        placed: The model that goes on, in it.
+        bent: It, where control bent it; None where the model stays as it was.
+        moved_px: How far control moved what the photos show; None where nothing was adjusted.
+        sigma_factor: What the control's stated or assumed sigmas were multiplied by.
+        focal_held: COLMAP's ids of cameras whose focal length neither photos nor control tell.
+    """
+
+    frame: Frame
+    survey: Survey
+    site: Site
+    placed: Placed
+    bent: pycolmap.Reconstruction | None
+    moved_px: float | None
+    sigma_factor: float
+    focal_held: tuple[int, ...] = ()
+
+
+def place_by_control(
+    survey: Survey, capture: Capture, frame: Frame | None, config: GeorefConfig, report: Reporter
+) -> ByControl:
+    """Georeference a model by its survey.
+
+    Args:
+        survey: Its points.
+        capture: The model and its photos.
+        frame: What the positions alone give; None where they give nothing.
+        config: Options.
+        report: Takes warnings.
+
+    Raises:
+        NoPlaceError: if there are neither positions nor enough control.
+        SplatpipeError: if the control is elsewhere, or has another shape.
+    """
+    model = capture.model
+    stations = stations_of(model, capture.positions, frame)
+    site = make_site(survey, require_near(survey, config, stations), stations, frame, config)
+    start = start_similarity(site, survey, model, capture.positions, frame)
+    survey = name_blunders(survey, site, model, start, config, report)
+    observed = observed_in(site, survey, model, start[0].scale, config.mark_sigma_px)
+    fit = fit_jointly(start[0], observed, start[1])
+    require_fit(fit, observed, survey)
+    factor = fit.noise if fit.noise > QUIET else 1.0
+    tell_datum(fit, survey, stations, report)
+    tell_weak(fit, observed, model, report)
+    placed = Placed(model, fit.similarity, fit.offsets)
+    result = ByControl(_frame(frame, survey, site, fit, config), survey, site, placed, None, None, factor)
+    if config.adjust == "auto" and int(observed.is_control.sum()) >= MIN_CONTROL:
+        if can_adjust(model.reconstruction):
+            result = _adjusted(result, capture, config, report)
+        else:
+            report.warning("A model with camera rigs is placed by control, but not adjusted to it.")
+    if result.bent is None:  # with what the adjustment found of the control
+        observed = observed_in(site, result.survey, model, start[0].scale, config.mark_sigma_px)
+        observed = with_sigmas_times(observed, result.sigma_factor)
+        fit = fit_jointly(fit.similarity, observed, start[1])
+        placed = Placed(model, fit.similarity, fit.offsets)
+        result = replace(result, placed=placed, frame=_frame(frame, result.survey, site, fit, config))
+    return result
+
+
+def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, config: GeorefConfig) -> Frame:
+    control = survey.of_role("control")
+    heights = any(point.surveyed.z is not None for point in control)
+    vertical = survey.crs.vertical if heights else UNKNOWN if frame is None else frame.vertical_datum
+    if vertical == UNKNOWN and config.vertical != "auto":
+        vertical = parse_vertical(config.vertical)
+    by = [f"{len(control)} control point{'s' if len(control) > 1 else ''}"] if control else []
+    by += [f"the positions of {len(site.stations)} photos"] if len(site.stations) else []
+    note = f"From {' and '.join(by)}."
+    if not heights:
+        note += " Heights are the positions'." if len(site.stations) else " Heights count from the control points."
+    residuals = dict(frame.residuals) if frame is not None else {}
+    residuals.pop("uncertainty", None)  # the positions' alone
+    left_out = frame.left_out if frame is not None else ()
+    return Frame("enu", fit.similarity, site.origin, vertical, residuals, left_out, note)
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """An adjustment with the control that it believes."""
+
+    survey: Survey
+    done: Adjusted
+    factor: float
+    noise: float
+
+
+def _settle(result: ByControl, capture: Capture, config: GeorefConfig, report: Reporter) -> _Settled:
+    """Adjust until the control agrees: without a point that alone is off, else with larger sigmas."""
+    best = _try(result.survey, 1.0, result, capture, config)
+    for _ in range(ROUNDS):
+        better = _without_one(best, result, capture, config) if best.noise > SUSPICIOUS else None
+        if better is None:
+            if best.noise <= QUIET:
+                break
+            best = _try(best.survey, best.factor * best.noise, result, capture, config)
+            continue
+        index, off, best = better
+        point = best.survey.points[index]
+        report.warning(
+            f"Control point {point.name} is left out: adjusted to the others, the photos have it {off:.2f} m from where"
+            " it is surveyed.",
+            "Compare its coordinates and its marks with the field book, correct the file, and run again.",
+        )
+    return best
+
+
+def _try(survey: Survey, factor: float, result: ByControl, capture: Capture, config: GeorefConfig) -> _Settled:
+    chosen = _chosen(survey)
+    done = _adjust(survey, chosen, factor, result, capture, config)
+    coordinates = np.array([3 if survey.points[k].surveyed.z is not None else 2 for k in chosen], dtype=np.int64)
+    return _Settled(survey, done, factor, _noise(done.normed, coordinates))
+
+
+def _without_one(
+    settled: _Settled, result: ByControl, capture: Capture, config: GeorefConfig
+) -> tuple[int, float, _Settled] | None:
+    """The point without which the others agree, how far it is off then, and the adjustment; None if there is none."""
+    chosen = _chosen(settled.survey)
+    if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > CROWD:
+        return None
+    for worst in np.argsort(-settled.done.normed, kind="stable")[:SUSPECTS].tolist():
+        index = chosen[worst]
+        points = list(settled.survey.points)
+        points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
+        rest = _try(settled.survey.with_points(points), settled.factor, result, capture, config)
+        if rest.noise <= settled.noise / LONELY:
+            model = model_of(rest.done.reconstruction, capture.photos)
+            found = locate(settled.survey.points[index], model, capture.photos, config.mark_sigma_px).found
+            if found is not None:
+                known = np.isfinite(result.site.targets.sigmas[index])
+                off = float(np.linalg.norm((found.xyz - result.site.targets.enu[index])[known]))
+                return index, off, rest
+    return None
+
+
+def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report: Reporter) -> ByControl:
+    """The result with the model that an adjustment bends, where that moves what the photos show."""
+    settled = _settle(result, capture, config, report)
+    survey, done, factor = settled.survey, settled.done, settled.factor
+    if not done.usable:
+        report.warning(
+            "The adjustment to the control did not find a solution: the control places the model without bending it.",
+            "Is the control spread over the site, and marked right?",
+        )
+        return replace(result, survey=survey)
+    if factor > 1.0:
+        worth = factor * float(np.median(result.site.targets.sigmas[_chosen(survey), 0]))
+        report.warning(
+            f"The control points agree with each other and the photos to {worth:.2f} m only, {factor:.1f} times what"
+            " they are stated or taken to be worth: their standard deviations are raised by that.",
+            "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… says what they are worth.",
+        )
+    _tell_lens(done, capture, report)
+    moved = moved_px(capture.model.reconstruction, done.reconstruction)
+    result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held)
+    if moved < BENT_PX:
+        return result
+    report.note(f"Control moves what the photos show by {moved:.1f} px: the model is bent to it, and trained anew.")
+    world_from_model = result.placed.world_from_model
+    bent = pycolmap.Reconstruction(done.reconstruction)
+    back = world_from_model.inverse()
+    bent.transform(pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation))
+    model = model_of(bent, capture.photos)
+    points = [
+        locate(point, model, capture.photos, config.mark_sigma_px) if point.found is not None else point
+        for point in survey.points
+    ]
+    placed = Placed(model, world_from_model, done.offsets)
+    return replace(result, survey=survey.with_points(points), placed=placed, bent=bent)
+
+
+def _tell_lens(done: Adjusted, capture: Capture, report: Reporter) -> None:
+    """Warn of focal lengths that nothing tells, and of those that control takes far from what the metadata say."""
+    for number, camera in sorted(done.reconstruction.cameras.items()):
+        prior = capture.focal_priors.get(number)
+        if number in done.held:
+            report.warning(
+                f"Neither the photos nor the control tell the focal length (to {done.focal_sigmas[number]:.1%}):"
+                " it stays within 3 % of what the metadata say.",
+                "Add control at another height, or oblique photos, for heights to be trusted.",
+            )
+        elif prior is not None and abs(camera.mean_focal_length() / prior - 1.0) > STRAY:
+            report.warning(
+                f"Control takes the focal length from {prior:.0f} to {camera.mean_focal_length():.0f} pixels,"
+                " more than 10 % from what the metadata say.",
+                "Was it another lens, or are the photos cropped? Check heights against known ones.",
+            )
+
+
+def _noise(normed: Float64[np.ndarray, " n"], coordinates: Int64[np.ndarray, " n"]) -> float:
+    """Of control over its sigmas, by the degrees of freedom that a similarity leaves."""
+    return math.sqrt(float((coordinates * normed**2).sum()) / max(int(coordinates.sum()) - SIMILARITY, 1))
+
+
+def _chosen(survey: Survey) -> list[int]:
+    return [k for k, point in enumerate(survey.points) if point.role == "control" and point.found is not None]
+
+
+def _adjust(
+    survey: Survey, chosen: Sequence[int], factor: float, result: ByControl, capture: Capture, config: GeorefConfig
+) -> Adjusted:
+    model, site = capture.model, result.site
+    targets = []
+    for k in chosen:
+        point = survey.points[k]
+        assert point.found is not None
+        marks, sigmas = [], []
+        for sighting in point.sightings:
+            if sighting.index is not None and sighting.agrees:
+                scale = model.view(sighting.index, capture.photos[sighting.photo].width).scale
+                marks.append((model.image_ids[sighting.index], np.array(sighting.pixel) * scale))
+                sigmas.append(config.mark_sigma_px * scale)
+        place = result.placed.world_from_model.apply(point.found.xyz[None])[0]
+        targets.append(Target(site.targets.enu[k], factor * site.targets.sigmas[k], place, marks, np.array(sigmas)))
+    numbers = [model.image_ids[index] for index in site.stations.indices]
+    stations = (site.stations, site.station_enu, numbers)
+    start = result.placed.world_from_model
+    return adjust(model.reconstruction, start, targets, stations, capture.focal_priors, capture.lenses_held)

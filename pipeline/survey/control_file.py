@@ -1,0 +1,365 @@
+"""Files of surveyed points and of where photos show them: ODM's ``gcp_list.txt``, and a CSV with a header.
+
+ODM (docs.opendronemap.org, "Ground Control Points"): the first line names the CRS, then one observation a line,
+``geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extra…]``, blanks or tabs between. ``#`` begins a comment. What is
+read is plain text from elsewhere: everything has a limit, and every refusal names the line.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from splatpipe.pipeline.survey.survey_text import (
+    CRS_COMMENT,
+    MAX_LINE_CHARS,
+    UNKNOWN,
+    LineError,
+    TableKind,
+    delimiter_of,
+    find_columns,
+    is_number,
+    number_in,
+    read_lines,
+    title_of,
+    told_by_line,
+    written_lines,
+)
+
+Role = Literal["control", "check"]
+MAX_POINTS = 10_000
+MAX_NAME = 255
+SAME_PLACE_M = 1e-3  # lines of one point repeat its coordinates; within a millimetre they do
+SEA_LEVEL_M = 20.0  # a height of exactly 0 is one, where other points lie so near to it; else nobody measured it
+SIGMA_BOUNDS_M = (1e-4, 1e3)
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "name": ("name", "label", "point", "point_name", "gcp", "gcp_name", "id"),
+    "x": ("x", "geo_x", "east", "easting", "e", "lon", "longitude", "x/east", "x/longitude"),
+    "y": ("y", "geo_y", "north", "northing", "n", "lat", "latitude", "y/north", "y/latitude"),
+    "z": ("z", "geo_z", "height", "h", "up", "alt", "altitude", "elevation", "z/altitude"),
+    "photo": ("photo", "image", "image_name", "photo_name", "filename", "file", "camera"),
+    "px": ("px", "pixel_x", "im_x", "image_x", "u", "column", "x_px"),
+    "py": ("py", "pixel_y", "im_y", "image_y", "v", "row", "y_px"),
+    "role": ("role", "type", "kind"),
+    "sigma_horizontal": (
+        "sigma_horizontal",
+        "sigma_h",
+        "sigma_xy",
+        "accuracy_xy",
+        "horz_accuracy",
+        "sigma_horizontal_m",
+    ),
+    "sigma_vertical": ("sigma_vertical", "sigma_v", "sigma_z", "accuracy_z", "vert_accuracy", "sigma_vertical_m"),
+    "crs": ("crs", "epsg", "srs"),
+}
+_NEEDED = ("x", "y", "photo", "px", "py")  # columns of a table
+_NEEDED_OF_POINTS = ("name", "x", "y")  # of one without marks
+GEOGRAPHIC = ("lon", "longitude", "lat", "latitude")
+ROLES: Mapping[str, Role] = {
+    "control": "control",
+    "gcp": "control",
+    "check": "check",
+    "checkpoint": "check",
+    "cp": "check",
+}
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Where a photo shows a point: the file's pixel coordinates in the stored grid, as written."""
+
+    photo: str
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class SurveyedPoint:
+    """A point of the survey.
+
+    Attributes:
+        name: As written, or ``point N`` where lines have no name.
+        x: Easting or longitude, in the file's CRS.
+        y: Northing or latitude.
+        z: Height; None where nobody measured it.
+        sigma_m: Horizontal (each of two) and vertical standard deviation; None where the file states none.
+        role: None where the file leaves it open.
+        marks: In the file's order.
+    """
+
+    name: str
+    x: float
+    y: float
+    z: float | None
+    sigma_m: tuple[float | None, float | None]
+    role: Role | None
+    marks: tuple[Mark, ...]
+
+
+@dataclass(frozen=True)
+class ControlFile:
+    """What a control file says.
+
+    Attributes:
+        crs: Its text.
+        points: In the order of their first lines.
+        zero_heights: Points whose height 0.0 was taken as unknown.
+    """
+
+    crs: str
+    points: tuple[SurveyedPoint, ...]
+    zero_heights: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One observation; ``name`` is empty where the line has none."""
+
+    line: int
+    name: str
+    place: tuple[float, float, float | None]
+    mark: Mark | None
+    role: Role | None
+    sigma_m: tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A control file as it is written, for those who change it line by line.
+
+    Attributes:
+        lines: All of it, numbered from 1.
+        header: Number of the header's line; None in ODM's list.
+        crs: As written.
+        rows: Its observations.
+    """
+
+    lines: tuple[tuple[int, str], ...]
+    header: int | None
+    crs: str
+    rows: tuple[Row, ...]
+
+    @property
+    def groups(self) -> dict[str, list[Row]]:
+        """The rows of each point by its name, ``point N`` where lines have none."""
+        groups: dict[object, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(row.name or row.place, []).append(row)
+        named: dict[str, list[Row]] = {}
+        for number, group in enumerate(groups.values(), 1):
+            name = group[0].name or f"point {number}"
+            named[name if name not in named else f"{name} (line {group[0].line})"] = group
+        return named
+
+
+def read_control_file(path: Path) -> ControlFile:
+    """Read a file of control and check points.
+
+    Raises:
+        SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
+    """
+    table = read_table(path)
+    with told_by_line(path, _KIND):
+        return _assemble(table)
+
+
+def read_points_file(path: Path) -> ControlFile:
+    """Read surveyed points that need not be marked yet: a control file, or a CSV with no more than name,x,y,z.
+
+    Raises:
+        SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
+    """
+    table = read_table(path, _NEEDED_OF_POINTS)
+    with told_by_line(path, _POINTS):
+        return _assemble(table)
+
+
+def read_table(path: Path, needed: Sequence[str] = _NEEDED) -> Table:
+    """Read a control file's lines; they may be of no observation yet.
+
+    Args:
+        path: The file.
+        needed: Columns without which a line is no header.
+
+    Raises:
+        SplatpipeError: if it is no such file.
+    """
+    return parse_table(read_lines(path, _KIND if needed == _NEEDED else _POINTS), path, needed)
+
+
+def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[str] = _NEEDED) -> Table:
+    """The same of numbered lines; the path is for messages.
+
+    Raises:
+        SplatpipeError: if they are no such file's.
+    """
+    kind = _KIND if needed == _NEEDED else _POINTS
+    written = written_lines(lines, path, kind)
+    header = next((i for i, (_, line) in enumerate(written[:2]) if _is_header(line, needed)), None)
+    with told_by_line(path, kind):
+        crs, rows = _odm_rows(written) if header is None else _csv_rows(lines, written, header)
+    return Table(tuple(lines), None if header is None else written[header][0], crs, tuple(rows))
+
+
+_EXPECTED = (
+    "First a line with the CRS, e.g. EPSG:32633, then lines of `x y z pixel_x pixel_y photo point`;"
+    " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo."
+)
+_KIND = TableKind("control file", _EXPECTED, max_bytes=32 << 20, max_lines=200_000)
+_POINTS = TableKind(
+    "file of points",
+    "A first line with the CRS, e.g. EPSG:32633, then a CSV with a header such as name,x,y,z; or a control file.",
+    max_bytes=_KIND.max_bytes,
+    max_lines=_KIND.max_lines,
+)
+
+
+def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row]]:
+    first, crs = written[0][0], written[0][1].strip()
+    fields = crs.split()
+    if len(fields) >= 6 and all(is_number(field) for field in fields[:5]):
+        raise LineError(first, "the first line has to name the CRS, and is an observation", _EXPECTED)
+    for number, line in written[:2]:
+        _require_no_header(number, line)
+    rows = []
+    for number, line in written[1:]:
+        fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 5 else line.split()
+        if len(fields) < 6:
+            raise LineError(number, f"{len(fields)} fields where at least 6 are needed")
+        place = (number_in(number, "x", fields[0]), number_in(number, "y", fields[1]), _height(number, fields[2]))
+        mark = Mark(
+            _name(number, fields[5]), number_in(number, "pixel x", fields[3]), number_in(number, "pixel y", fields[4])
+        )
+        name = _name(number, fields[6]) if len(fields) > 6 and fields[6] else ""
+        rows.append(Row(number, name, place, mark, None, (None, None)))
+    return crs, rows
+
+
+def _is_header(line: str, needed: Sequence[str]) -> bool:
+    delimiter = delimiter_of(line)
+    columns = find_columns(next(csv.reader([line], delimiter=delimiter)), COLUMNS)
+    return set(needed) <= set(columns) or set(_NEEDED) <= set(columns)
+
+
+def _require_no_header(number: int, line: str) -> None:
+    """Refuse a table's header that lacks columns, which would pass for a line of ODM's list."""
+    columns = find_columns(next(csv.reader([line], delimiter=delimiter_of(line))), COLUMNS)
+    missing = [name for name in _NEEDED if name not in columns]
+    if missing and len(columns) >= len(_NEEDED) - 2:
+        titles = ", ".join(COLUMNS[name][1] for name in missing)
+        raise LineError(number, f"a header without the columns {titles}", _EXPECTED)
+
+
+def _csv_rows(
+    lines: Sequence[tuple[int, str]], written: Sequence[tuple[int, str]], header: int
+) -> tuple[str, list[Row]]:
+    number, line = written[header]
+    delimiter = delimiter_of(line)
+    titles = next(csv.reader([line], delimiter=delimiter))
+    columns = find_columns(titles, COLUMNS)
+    crs = written[0][1].strip() if header == 1 else ""
+    comments = (CRS_COMMENT.match(text.strip()) for _, text in lines)
+    crs = crs or next((found.group(1).strip() for found in comments if found), "")
+    if not crs and title_of(titles[columns["x"]]) in GEOGRAPHIC:
+        crs = "EPSG:4326"
+    rows = []
+    for number, text in written[header + 1 :]:
+        try:
+            cells = next(csv.reader([text], delimiter=delimiter))
+        except csv.Error as error:
+            raise LineError(number, str(error)) from error
+        row = {name: cells[place].strip() if place < len(cells) else "" for name, place in columns.items()}
+        stated = row.get("crs", "")
+        if stated:
+            stated = f"EPSG:{stated}" if stated.isdigit() else stated
+            if crs and crs.casefold() != stated.casefold():
+                raise LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})", "Use one CRS a file.")
+            crs = stated
+        rows.append(_csv_row(number, row))
+    if not crs:
+        raise LineError(0, "it names no CRS", "Put it into the first line, e.g. EPSG:32633, or into a column crs.")
+    return crs, rows
+
+
+def _csv_row(number: int, row: Mapping[str, str]) -> Row:
+    role = row.get("role", "").casefold()
+    if role and role not in ROLES:
+        raise LineError(number, f"the role {role[:40]!r} is neither control nor check")
+    place = (number_in(number, "x", row["x"]), number_in(number, "y", row["y"]), _height(number, row.get("z", "")))
+    mark = None
+    if row.get("photo"):  # a point may be listed without being marked
+        photo = _name(number, row["photo"])
+        mark = Mark(photo, *(number_in(number, f"pixel {key[1]}", row.get(key, "")) for key in ("px", "py")))
+    sigmas = (_sigma(number, row.get("sigma_horizontal", "")), _sigma(number, row.get("sigma_vertical", "")))
+    return Row(number, _name(number, row["name"]) if row.get("name") else "", place, mark, ROLES.get(role), sigmas)
+
+
+def _assemble(table: Table) -> ControlFile:
+    crs, groups = table.crs, table.groups
+    if not crs or len(crs) > MAX_LINE_CHARS:
+        raise LineError(0, "it names no CRS")
+    if not groups:
+        raise LineError(0, "it has no observations")
+    if len(groups) > MAX_POINTS:
+        raise LineError(0, f"it has more than {MAX_POINTS:,} points")
+    heights = [group[0].place[2] for group in groups.values()]
+    at_sea = any(height and abs(height) < SEA_LEVEL_M for height in heights)
+    points, zero = [], []
+    for name, group in groups.items():
+        point = _point(name, group, keep_zero=at_sea)
+        points.append(point)
+        if point.z is None and group[0].place[2] == 0.0:
+            zero.append(name)
+    return ControlFile(crs, tuple(points), tuple(zero))
+
+
+def _point(name: str, rows: Sequence[Row], keep_zero: bool) -> SurveyedPoint:
+    first = rows[0]
+    marks: dict[str, Mark] = {}
+    for row in rows:
+        _require_same(name, first, row)
+        if row.mark is not None:
+            if row.mark.photo in marks and row.mark != marks[row.mark.photo]:
+                raise LineError(row.line, f"a second mark of {name} in {row.mark.photo}", "A photo shows a point once.")
+            marks[row.mark.photo] = row.mark
+    x, y, z = first.place
+    role = next((row.role for row in rows if row.role is not None), None)
+    sigmas = tuple(next((row.sigma_m[k] for row in rows if row.sigma_m[k] is not None), None) for k in (0, 1))
+    height = None if z == 0.0 and not keep_zero else z
+    return SurveyedPoint(name, x, y, height, (sigmas[0], sigmas[1]), role, tuple(marks.values()))
+
+
+def _require_same(name: str, first: Row, row: Row) -> None:
+    for have, want in zip(row.place, first.place, strict=True):
+        if (have is None) != (want is None) or (
+            have is not None and want is not None and abs(have - want) > SAME_PLACE_M
+        ):
+            raise LineError(
+                row.line,
+                f"{name} has other coordinates than in line {first.line}",
+                "One name is one point: correct the coordinates, or give the points different names.",
+            )
+    if row.role is not None and first.role is not None and row.role != first.role:
+        raise LineError(row.line, f"{name} is {row.role} here and {first.role} in line {first.line}")
+
+
+def _height(line: int, text: str) -> float | None:
+    return None if text.casefold() in UNKNOWN else number_in(line, "height", text)
+
+
+def _sigma(line: int, text: str) -> float | None:
+    if text.casefold() in UNKNOWN:
+        return None
+    value = number_in(line, "the standard deviation", text)
+    if not SIGMA_BOUNDS_M[0] <= value <= SIGMA_BOUNDS_M[1]:
+        raise LineError(line, f"a standard deviation of {value:g} m")
+    return value
+
+
+def _name(line: int, text: str) -> str:
+    if not text or len(text) > MAX_NAME:
+        raise LineError(line, "a name that is empty or too long")
+    return text

@@ -1,0 +1,117 @@
+"""The frame of a reconstruction: where its model lies in the world, and how well that is known."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.survey.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
+
+__all__ = [
+    "Correspondences",
+    "DirectionPrior",
+    "Frame",
+    "Origin",
+    "Similarity",
+    "SimilarityFit",
+    "ecef_from_geodetic",
+    "geodetic_from_ecef",
+    "load_frame",
+    "robust_similarity",
+    "save_frame",
+]
+
+FRAME_KINDS = ("enu", "arbitrary")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a model lies.
+
+    Attributes:
+        kind: ``enu``: the world is local east-north-up in metres about ``origin``. ``arbitrary``: up is +z, but scale,
+            place and heading mean nothing.
+        world_from_model: From the model's frame to the world's.
+        origin: The world's zero on the earth; None when arbitrary.
+        vertical_datum: Of the world's heights, which are as they were stated: ``ellipsoidal``, ``EPSG:n``, or
+            ``unknown`` unless somebody declared it.
+        crs: The CRS that coordinates are read out in, as ``parse_crs`` takes it; empty for the UTM zone of ``origin``.
+        approximate_crs: The user accepts it though a grid of it is missing.
+        residuals: ``rmse_horizontal_m``, ``rmse_vertical_m``, ``rmse_m`` of the photos that took part, how many there
+            are, the standard deviations of scale and rotation, and east, north, up of each photo by name (metres).
+        left_out: Photos whose position is off, sorted.
+        note: In a sentence, what the frame was made from.
+    """
+
+    kind: Literal["enu", "arbitrary"]
+    world_from_model: Similarity
+    origin: Origin | None = None
+    vertical_datum: str = "unknown"
+    residuals: Mapping[str, Any] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    note: str = ""
+    crs: str = ""
+    approximate_crs: bool = False
+
+
+def save_frame(frame: Frame, path: Path) -> None:
+    """Write a frame as JSON; numbers read back as the same float64."""
+    similarity = frame.world_from_model
+    origin = frame.origin
+    value = {
+        "kind": frame.kind,
+        "origin": None
+        if origin is None
+        else {"latitude": origin.latitude, "longitude": origin.longitude, "height_m": origin.height_m},
+        "vertical_datum": frame.vertical_datum,
+        "crs": frame.crs,
+        "approximate_crs": frame.approximate_crs,
+        "world_from_model": similarity.matrix().tolist(),
+        "scale": similarity.scale,
+        "rotation": similarity.rotation.tolist(),
+        "translation": similarity.translation.tolist(),
+        "residuals": dict(frame.residuals),
+        "left_out": list(frame.left_out),
+        "note": frame.note,
+    }
+    path.write_text(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def load_frame(path: Path) -> Frame:
+    """Read a frame.
+
+    Raises:
+        SplatpipeError: if the file is missing or broken.
+    """
+    try:
+        value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        similarity = Similarity(
+            float(value["scale"]),
+            np.array(value["rotation"], dtype=np.float64).reshape(3, 3),
+            np.array(value["translation"], dtype=np.float64).reshape(3),
+        )
+        Similarity.from_matrix(similarity.matrix())
+        if value["kind"] not in FRAME_KINDS or not math.isfinite(similarity.scale):
+            raise ValueError(f"kind {value['kind']!r}")
+        return Frame(
+            kind=value["kind"],
+            world_from_model=similarity,
+            origin=None if value["origin"] is None else Origin(**value["origin"]),
+            vertical_datum=value["vertical_datum"],
+            residuals=value["residuals"],
+            left_out=tuple(value["left_out"]),
+            note=value["note"],
+            crs=str(value.get("crs", "")),
+            approximate_crs=bool(value.get("approximate_crs", False)),
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SplatpipeError(f"The frame {path} cannot be read: {error}", "Run again with --rerun georef.") from error

@@ -1,0 +1,279 @@
+"""The frame that a model lies in, from the positions that its photos state."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.fitting import (
+    MAX_SIGMA_ROTATION_RAD,
+    MAX_SIGMA_SCALE,
+    MIN_POSITIONS,
+    NoPlaceError,
+    PositionFit,
+    fit_positions,
+    require_determined,
+    taken_order,
+)
+from splatpipe.pipeline.survey.flight_offsets import (
+    bound,
+    declared_datum,
+    flights_json,
+    shared_errors,
+    tell_flights_apart,
+    unbound,
+)
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.level import Positions, known_directions
+from splatpipe.pipeline.survey.model import SparseModel
+
+ORIGIN_DIGITS = 5  # degrees: a metre; the origin then stays where it is when some photos come or go
+SWAPPED_NOISE = 0.5  # of the residuals: what fits twice as well with swapped coordinates has them swapped
+POOR_NOISES = 2.0  # times what positions state: worth a warning
+LINE_RAD = math.radians(60.0)  # positions that tell the rotation about an axis no better lie along it
+NADIR_PITCH_DEG = -60.0
+HEIGHT_TOLERANCE = 0.1  # of the height above ground, against what the drone measured
+NAMES_SHOWN = 10
+
+
+def georeference(
+    model: SparseModel, positions: Positions, max_error_m: float | Literal["auto"], photos: Mapping[str, Photo]
+) -> tuple[Frame, PositionFit]:
+    """The frame from positions, in the vertical datum that these declare.
+
+    Args:
+        model: The sparse model.
+        positions: What the photos state.
+        max_error_m: Positions further off are left out; ``auto``: those that are off by far more than the noise of all.
+        photos: All photos of the capture by name; they tell the order in which they were taken.
+
+    Raises:
+        NoPlaceError: if they do not determine one.
+    """
+    limit = None if max_error_m == "auto" else max_error_m
+    usable = [name for name in model.names if _altitude(positions.by_name.get(name)) is not None]
+    if len(usable) < MIN_POSITIONS:
+        raise NoPlaceError(_why_few(model, positions, len(usable)))
+    times = {name: photos[name].time if name in photos else None for name in usable}
+    names = taken_order(usable, positions.by_name, times)
+    records = [positions.by_name[name] for name in names]
+    index = {name: i for i, name in enumerate(model.names)}
+    geodetic = np.array([[r["latitude"], r["longitude"], r["altitude_m"]] for r in records], dtype=np.float64)
+    sigmas = np.array([[r["sigma_horizontal_m"]] * 2 + [r["sigma_vertical_m"]] for r in records], dtype=np.float64)
+    origin = _origin(geodetic)
+    source = model.centres[[index[name] for name in names]]
+    points = Correspondences(source, origin.enu_from_geodetic(geodetic), sigmas)
+    points = replace(points, shared=shared_errors(records, sigmas))
+    flights = np.array([int(record.get("flight", 0)) for record in records], dtype=np.int64)
+    directions = known_directions(model, positions)
+    noise = math.inf
+    try:
+        if points.shared is not None:
+            points = _bound(points, limit)
+        robust = _robust(points, limit, directions.prior)
+        noise = robust.noise
+        fit = fit_positions(points, flights, robust, limit, directions, model.points)
+        require_determined(fit, points)
+    except NoPlaceError:
+        _require_unswapped(points, geodetic, limit, noise)
+        raise
+    if noise > 1.0:
+        _require_unswapped(points, geodetic, limit, noise)
+    wrong = [name for name in model.names if name in positions.wrong]
+    left_out = [name for name, inlier in zip(names, fit.inliers, strict=True) if not inlier]
+    note = f"From the positions of {len(names) - len(left_out)} photos: {fit.uncertainty.sentence()}"
+    note += f"; the rotation that they leave open is from {fit.held_by}." if fit.held_by else "."
+    residuals = {**_residuals(names, fit), "flights": flights_json(records, points, fit.noisy.offsets)}
+    datum = declared_datum(records, points)
+    return Frame("enu", fit.noisy.similarity, origin, datum, residuals, tuple(sorted(left_out + wrong)), note), fit
+
+
+def _bound(points: Correspondences, limit: float | None) -> Correspondences:
+    """Which flights are apart, from a fit in which each has any offset; none where that determines nothing."""
+    try:
+        return bound(points, robust_similarity(unbound(points), limit))
+    except ValueError:
+        return points
+
+
+def _robust(points: Correspondences, limit: float | None, prior: DirectionPrior) -> SimilarityFit:
+    try:
+        fit = robust_similarity(points, limit, prior)
+    except ValueError as error:
+        raise NoPlaceError(f"the positions do not fit the model ({error})") from error
+    _require_agreement(fit, len(points))
+    return fit
+
+
+def _require_unswapped(
+    points: Correspondences, geodetic: Float64[np.ndarray, "n 3"], limit: float | None, noise: float
+) -> None:
+    """Refuse positions that fit far better with latitude and longitude swapped; a flat flight fits both ways a little.
+
+    Args:
+        points: The cameras, and their positions as stated.
+        geodetic: The latter, as latitude and longitude (degrees) and height (metres).
+        limit: As for the fit.
+        noise: What the residuals of the positions as stated are, over their sigmas.
+    """
+    swapped = geodetic[:, [1, 0, 2]]
+    if np.abs(swapped[:, 0]).max() > 90.0:
+        return
+    target = _origin(swapped).enu_from_geodetic(swapped)
+    try:
+        fit = robust_similarity(replace(points, target=target), limit)
+        _require_agreement(fit, len(points))
+    except (ValueError, NoPlaceError):
+        return
+    determined = fit.sigma_scale <= MAX_SIGMA_SCALE and fit.sigma_rotation_rad <= MAX_SIGMA_ROTATION_RAD
+    if determined and fit.noise < SWAPPED_NOISE * noise:
+        raise NoPlaceError("the photo positions fit only with latitude and longitude swapped: correct them")
+
+
+def _require_agreement(fit: SimilarityFit, positions: int) -> None:
+    inliers = int(fit.inliers.sum())
+    if inliers < MIN_POSITIONS or 2 * inliers < positions:
+        raise NoPlaceError(f"only {inliers} of {positions} photo positions agree with the model")
+
+
+def _why_few(model: SparseModel, positions: Positions, usable: int) -> str:
+    stated = sum(name in positions.by_name for name in model.names)
+    if stated == 0:
+        return "no photo of the model has a position"
+    if usable < stated:
+        return f"only {usable} photos of the model have a position with an altitude"
+    return f"only {stated} photo{'s' if stated > 1 else ''} of the model {'have' if stated > 1 else 'has'} a position"
+
+
+def _origin(geodetic: Float64[np.ndarray, "n 3"]) -> Origin:
+    """A rounded median; longitudes are taken about the first, as they may straddle 180°."""
+    first = geodetic[0, 1]
+    longitude = first + float(np.median((geodetic[:, 1] - first + 180.0) % 360.0 - 180.0))
+    return Origin(
+        latitude=round(float(np.median(geodetic[:, 0])), ORIGIN_DIGITS),
+        longitude=round((longitude + 180.0) % 360.0 - 180.0, ORIGIN_DIGITS),
+        height_m=float(round(float(np.median(geodetic[:, 2])))),
+    )
+
+
+def _residuals(names: Sequence[str], fit: PositionFit) -> dict[str, Any]:
+    used = fit.residuals[fit.inliers]
+    told = fit.uncertainty
+    return {
+        "rmse_horizontal_m": _rms(used[:, :2]),
+        "rmse_vertical_m": _rms(used[:, 2:]),
+        "rmse_m": _rms(used),
+        "photos_used": len(used),
+        "over_stated_sigmas": float(np.sqrt((told.noise.factors[[0, 0, 1]] ** 2).mean())),
+        "sigma_scale_percent": 100.0 * told.scale,
+        "sigma_rotation_deg": math.degrees(told.weakest_rad),
+        "uncertainty": told.as_json(),
+        "photos": dict(sorted(zip(names, fit.residuals.tolist(), strict=True))),
+    }
+
+
+def _rms(residuals: Float64[np.ndarray, "n k"]) -> float:
+    """Root mean square of the vectors' lengths."""
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+
+
+def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Positions, report: Reporter) -> None:
+    """Say how well the positions place the model; warn of what is wrong with them, or weak about the fit."""
+    report.note(f"Placed by the photos' positions: {fit.uncertainty.sentence()}.")
+    _tell_noise(fit, frame, positions, report)
+    _tell_directions(fit, report)
+    tell_flights_apart(frame.residuals["flights"], report)
+    if frame.left_out:
+        shown = ", ".join(frame.left_out[:NAMES_SHOWN])
+        more = f" and {len(frame.left_out) - NAMES_SHOWN} more" if len(frame.left_out) > NAMES_SHOWN else ""
+        report.warning(
+            f"The stated position of {len(frame.left_out)} photos is off and left out of the fit: {shown}{more}.",
+            "The photos themselves are used.",
+        )
+    heights = _heights(frame, model, positions)
+    if heights is not None and abs(heights[0] / heights[1] - 1.0) > HEIGHT_TOLERANCE:
+        report.warning(
+            f"The cameras are {heights[0]:.1f} m above the ground in the model, {heights[1]:.1f} m by the drone.",
+            "On a flight at one height the focal length is hardly observable, and heights scale with it; or it took "
+            "off from other ground.",
+        )
+
+
+def _tell_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Reporter) -> None:
+    """Warn of positions that scatter by far more than they state."""
+    used = [positions.by_name[name] for name in frame.residuals["photos"]]
+    factors = fit.uncertainty.noise.factors
+    if float(factors.max()) > POOR_NOISES:
+        stated = [
+            float(np.median([record[f"sigma_{axis}_m"] for record in used])) for axis in ("horizontal", "vertical")
+        ]
+        across, height = (factor * sigma for factor, sigma in zip(factors.tolist(), stated, strict=True))
+        report.warning(
+            f"The photos' positions are poor: off by about {across:.1f} m horizontally and {height:.1f} m in height,"
+            f" where {stated[0]:g} and {stated[1]:g} m were to be expected. So {fit.uncertainty.sentence()}.",
+            "Control points (gcp_list.txt), or better positions (positions.csv), would place it well.",
+        )
+
+
+def _tell_directions(fit: PositionFit, report: Reporter) -> None:
+    """Warn of directions that are not the positions'."""
+    if fit.contradicted_rad > 0.0:
+        report.warning(
+            f"The photos' positions would turn the model by {math.degrees(fit.contradicted_rad):.0f}° against"
+            f" {fit.held_by}: their error drifts along the flight. How the model is turned is mostly from the latter.",
+            "Look whether level ground is level in the result. Control points would tell.",
+        )
+    elif fit.held_by and fit.alone_rad > LINE_RAD:
+        report.warning(f"The photos were taken along a line: the rotation that they leave open is from {fit.held_by}.")
+    elif fit.held_by:
+        report.warning(
+            f"The photos' positions tell how the model is turned only to {math.degrees(fit.alone_rad):.1f}°:"
+            f" it is from {fit.held_by} as well."
+        )
+
+
+def _heights(frame: Frame, model: SparseModel, positions: Positions) -> tuple[float, float] | None:
+    """Median height of nadir cameras above the ground: in the model, and above take-off by the drone."""
+    relative: list[float] = []
+    index: list[int] = []
+    for i, name in enumerate(model.names):
+        record = positions.by_name.get(name, {})
+        height, pitch = record.get("relative_altitude_m"), record.get("pitch_deg")
+        if height is not None and height > 1.0 and pitch is not None and pitch <= NADIR_PITCH_DEG:
+            index.append(i)
+            relative.append(height)
+    if len(index) < MIN_POSITIONS or len(model.points) == 0:
+        return None
+    up = frame.world_from_model.apply(model.points)[:, 2]
+    cameras = frame.world_from_model.apply(model.centres[index])[:, 2]
+    return float(np.median(cameras) - np.median(up)), float(np.median(relative))
+
+
+def _altitude(record: Mapping[str, Any] | None) -> float | None:
+    return None if record is None else record["altitude_m"]
+
+
+def read_positions(path: Path) -> Positions:
+    """Read ``positions.json``.
+
+    Raises:
+        SplatpipeError: if it is missing or broken.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        by_name = {record["name"]: record for record in value["positions"]}
+        return Positions(by_name, value.get("orientations", {}), value.get("wrong", {}))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SplatpipeError(f"The positions {path} cannot be read: {error}", "Run with --rerun ingest.") from error

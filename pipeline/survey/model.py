@@ -1,0 +1,154 @@
+"""The sparse model as georef needs it: camera centres, rotations and points, and its files as they are."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.photos.names import match_names
+
+RAY_STEP = 1e-5  # of x/z: a hundredth of a pixel, for differences
+
+
+@dataclass(frozen=True)
+class View:
+    """A photo in the model.
+
+    Attributes:
+        camera: COLMAP's, with its distortion.
+        cam_from_model: Pose.
+        scale: Pixels of the camera to one of the photo.
+    """
+
+    camera: pycolmap.Camera
+    cam_from_model: Float64[np.ndarray, "3 4"]
+    scale: float
+
+    def ray(self, pixel: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
+        """x/z and y/z of the ray through a pixel of the photo; not finite where the lens model has none."""
+        found = self.camera.cam_from_img((pixel * self.scale)[None])
+        return np.full(2, np.nan) if found is None else np.asarray(found, np.float64).reshape(2)
+
+    def pixels_by_ray(self, ray: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "2 2"]:
+        """Derivative of the photo's pixels by a ray's x/z and y/z; not finite where the lens model has none."""
+        around = np.tile(np.append(ray, 1.0), (4, 1))
+        around[:, :2] += RAY_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        shown = self.camera.img_from_cam(around) if np.isfinite(ray).all() else None
+        if shown is None:
+            return np.full((2, 2), np.nan)
+        shown = np.asarray(shown, np.float64).reshape(4, 2)
+        return np.asarray((shown[::2] - shown[1::2]).T / (2.0 * RAY_STEP * self.scale))
+
+    def pixel(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 2"]:
+        """Where the photo shows a point of the model; not finite behind the camera."""
+        seen = self.cam_from_model[:, :3] @ point + self.cam_from_model[:, 3]
+        if seen[2] <= 0.0:
+            return np.full(2, np.nan)
+        found = self.camera.img_from_cam(seen[None])
+        return np.full(2, np.nan) if found is None else np.asarray(found, np.float64).reshape(2) / self.scale
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """What georef needs of a sparse model, its photos sorted by name.
+
+    Attributes:
+        names: Of the registered photos, as ingest has them; as the model has them where ingest does not know them.
+        centres: Camera centres.
+        cam_from_model: Rotations.
+        points: Of the sparse cloud.
+        image_ids: COLMAP's numbers of the photos.
+        reconstruction: What COLMAP has of all this.
+    """
+
+    names: list[str]
+    centres: Float64[np.ndarray, "n 3"]
+    cam_from_model: Float64[np.ndarray, "n 3 3"]
+    points: Float64[np.ndarray, "m 3"]
+    image_ids: tuple[int, ...]
+    reconstruction: pycolmap.Reconstruction
+
+    def view(self, index: int, width: int) -> View:
+        """A photo's camera.
+
+        Args:
+            index: Of the photo.
+            width: Of the photo that pixels are stated in; the model may have been made from smaller ones.
+        """
+        image = self.reconstruction.images[self.image_ids[index]]
+        camera = self.reconstruction.cameras[image.camera_id]
+        return View(camera, np.asarray(image.cam_from_world().matrix(), np.float64), camera.width / width)
+
+    def gsd(self, scale: float) -> float | None:
+        """Ground sampling distance in a world that is so many times larger: the median of the photos' medians."""
+        sizes = []
+        for number in self.image_ids:
+            image = self.reconstruction.images[number]
+            seen = [self.reconstruction.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]
+            if seen:
+                pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+                depths = np.array(seen) @ pose[2, :3] + pose[2, 3]
+                focal = self.reconstruction.cameras[image.camera_id].mean_focal_length()
+                sizes.append(scale * float(np.median(depths)) / focal)
+        return float(np.median(sizes)) if sizes else None
+
+
+def read_model(path: Path, photos: Iterable[str]) -> SparseModel:
+    """Read a sparse model.
+
+    Args:
+        path: Its folder.
+        photos: The names that ingest gave the photos.
+
+    Raises:
+        SplatpipeError: if it cannot be read or has no photo with a pose.
+    """
+    try:
+        reconstruction = pycolmap.Reconstruction(str(path))
+    except Exception as error:  # pycolmap raises its C++ errors as several types
+        raise SplatpipeError(
+            f"The sparse model cannot be read: {' '.join(str(error).split())[:200]}",
+            "It has to hold cameras, images and points3D, as COLMAP writes them (.bin or .txt).",
+        ) from error
+    if not any(image.has_pose for image in reconstruction.images.values()):
+        raise SplatpipeError("The sparse model has no photo with a pose.", "Reconstruct again, with more overlap.")
+    return model_of(reconstruction, photos)
+
+
+def model_of(reconstruction: pycolmap.Reconstruction, photos: Iterable[str]) -> SparseModel:
+    """What georef needs of a reconstruction; the names are those that ingest gave the photos."""
+    images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
+    poses = np.stack([np.asarray(image.cam_from_world().matrix(), dtype=np.float64) for image in images])
+    rotations = poses[:, :, :3]
+    centres = -np.einsum("nji,nj->ni", rotations, poses[:, :, 3])
+    points = [point.xyz for _, point in sorted(reconstruction.points3D.items())]
+    cloud = np.array(points, dtype=np.float64).reshape(-1, 3)
+    finite: Bool[np.ndarray, " n"] = np.isfinite(centres).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
+    matched = match_names((image.name for image in images), photos)
+    names = [matched.get(image.name, image.name) for image, good in zip(images, finite, strict=True) if good]
+    ids = tuple(image.image_id for image, good in zip(images, finite, strict=True) if good)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    return SparseModel(names, centres[finite], rotations[finite], cloud, ids, reconstruction)
+
+
+def copy_model(source: Path, target: Path, may_link: bool) -> None:
+    """The model's files as they are: linked where that is allowed (never a user's own) and possible, else copied."""
+    target.mkdir(parents=True, exist_ok=True)
+    for path in sorted(source.iterdir()):
+        if path.is_file() and not path.name.startswith("."):
+            copy = target / path.name
+            copy.unlink(missing_ok=True)
+            if may_link:
+                with contextlib.suppress(OSError):  # another file system, or one without links
+                    os.link(path, copy)
+                    continue
+            shutil.copyfile(path, copy)

@@ -1,0 +1,319 @@
+"""Where each photo was taken, how the camera was turned, and how well both are known.
+
+From three sources, the first that states a thing: the file of positions, EXIF (where corrected positions are written
+back), XMP. Angles are from the file, then the gimbal's in XMP, then the ``Camera:`` tags. Accuracies are from the file,
+then XMP, then EXIF, else what the receiver's kind of fix gives.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.photos.camera_angles import Convention, gimbal_from_nadir, tell_convention
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.doubts import find_wrong
+from splatpipe.pipeline.photos.exif import Gps
+from splatpipe.pipeline.photos.xmp import xmp_number
+from splatpipe.pipeline.survey.crs_names import ELLIPSOIDAL, UNKNOWN, parse_vertical
+from splatpipe.pipeline.survey.flights import Stamp, tell_flights
+from splatpipe.pipeline.survey.stated_positions import FilePlace
+
+ALTITUDE_BOUNDS_M = (-1000.0, 20_000.0)
+NULL_ISLAND_DEG = 1e-6  # receivers without a fix write 0, 0
+FIXED, SINGLE = 50, 16  # drone-dji:RtkFlag (DJI's user manuals); 32 to 49 are kinds of float
+FLOAT = range(32, 50)
+# Horizontal (per axis) and vertical standard deviations, metres, where a photo does not state its own.
+DEFAULT_SIGMAS_M = {"fixed": (0.02, 0.03), "float": (0.5, 1.0), "single": (3.0, 5.0), None: (3.0, 5.0)}
+LEAST_SIGMA_M = 0.005  # stated accuracies below are the receiver's noise, not the camera's position
+VERTICAL_OVER_HORIZONTAL = 1.5  # of GNSS errors, where only the horizontal one is stated
+DATUM_STEP_M = 1.0  # EXIF and XMP altitudes further apart than this are not roundings of one value
+NOWHERE = "states a position that is none on Earth"
+
+
+@dataclass(frozen=True)
+class Position:
+    """A photo's position and angles; angles are degrees, yaw clockwise from north, pitch -90 straight down.
+
+    Attributes:
+        name: The photo.
+        latitude: Degrees north, WGS84.
+        longitude: Degrees east, WGS84.
+        altitude_m: As stated. None when there is none.
+        altitude_source: ``file``, ``exif`` or ``xmp``; None when there is none.
+        relative_altitude_m: Above the take-off point, by the drone.
+        sigma_horizontal_m: Standard deviation in east and in north each.
+        sigma_vertical_m: Standard deviation of the altitude.
+        rtk: ``fixed``, ``float``, ``single``; None when the drone says nothing of it.
+        yaw_deg: Of the camera (gimbal).
+        pitch_deg: Likewise.
+        roll_deg: Likewise.
+        flight_yaw_deg: Of the aircraft.
+        flight_pitch_deg: Likewise.
+        flight_roll_deg: Likewise.
+        orientation: EXIF's, 1 to 8: how the stored grid was turned when the camera was upright.
+        source: Of latitude and longitude: ``file``, ``exif`` or ``xmp``.
+        sigma_source: Of the standard deviations: ``file``, ``xmp``, ``exif``, or ``default``.
+        vertical: Datum of the altitude: ``ellipsoidal``, ``EPSG:n`` or ``unknown``. EXIF's AltitudeRef declares none.
+        flight: Number of the flight, from 0: photos of one share their receiver's error.
+    """
+
+    name: str
+    latitude: float
+    longitude: float
+    altitude_m: float | None
+    altitude_source: str | None
+    relative_altitude_m: float | None
+    sigma_horizontal_m: float
+    sigma_vertical_m: float
+    rtk: str | None
+    yaw_deg: float | None
+    pitch_deg: float | None
+    roll_deg: float | None
+    flight_yaw_deg: float | None
+    flight_pitch_deg: float | None
+    flight_roll_deg: float | None
+    orientation: int
+    source: str = "exif"
+    sigma_source: str = "default"
+    vertical: str = UNKNOWN
+    flight: int = 0
+
+
+@dataclass(frozen=True)
+class PositionList:
+    """The positions of all photos that state one.
+
+    Attributes:
+        positions: Sorted by the photos' names.
+        wrong: Why a stated position is none, by photo: the end of a sentence that starts with its name.
+        altitude_step_m: Median of EXIF's altitude less XMP's where both are given, else None.
+        orientations: EXIF orientation of every photo that has another than 1, by name.
+    """
+
+    positions: tuple[Position, ...]
+    wrong: Mapping[str, str]
+    altitude_step_m: float | None
+    orientations: Mapping[str, int]
+
+    @property
+    def impossible(self) -> tuple[str, ...]:
+        """Photos whose position cannot be on Earth."""
+        return tuple(name for name, reason in self.wrong.items() if reason == NOWHERE)
+
+
+def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlace] | None = None) -> PositionList:
+    """Take positions and angles from the photos' metadata, and from the file of positions.
+
+    Args:
+        photos: Those that take part, sorted by name.
+        places: What the file says, by photo.
+    """
+    found: list[Position] = []
+    stamps: list[Stamp] = []
+    wrong: dict[str, str] = {}
+    steps: list[float] = []
+    conventions = _conventions(photos)
+    for photo in photos:
+        place = (places or {}).get(photo.name)
+        stated = [gps for gps in (_file_gps(place), photo.exif.gps, _xmp_gps(photo.xmp)) if gps and not gps.void]
+        good = [gps for gps in stated if is_on_earth(gps.latitude, gps.longitude)]
+        if stated and not good:
+            wrong[photo.name] = NOWHERE
+        if not good:
+            continue
+        source = "file" if place is not None else "exif" if good[0] is photo.exif.gps else "xmp"
+        position = _position(photo, good[0], source, place)
+        yaw, pitch, roll = _angles(photo, place, conventions.get(_camera(photo), "nadir"))
+        position = replace(position, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
+        found.append(position)
+        stamps.append(_stamp(photo, position))
+        exif_altitude, xmp_altitude = _exif_altitude(photo.exif.gps), _xmp_altitude(photo.xmp)
+        if exif_altitude is not None and xmp_altitude is not None:
+            steps.append(exif_altitude - xmp_altitude)
+    wrong |= find_wrong({each.name: (each.latitude, each.longitude) for each in found})
+    flights = tell_flights(stamps)
+    numbered = [replace(each, flight=flight) for each, flight in zip(found, flights, strict=True)]
+    return PositionList(
+        tuple(each for each in numbered if each.name not in wrong),
+        dict(sorted(wrong.items())),
+        float(np.median(steps)) if steps else None,
+        {photo.name: photo.exif.orientation for photo in photos if photo.exif.orientation != 1},
+    )
+
+
+def positions_json(positions: PositionList) -> JSON:
+    """What ``positions.json`` holds."""
+    value = {
+        "positions": [asdict(position) for position in positions.positions],
+        "orientations": dict(positions.orientations),
+    }
+    return value | ({"wrong": dict(positions.wrong)} if positions.wrong else {})
+
+
+def is_on_earth(latitude: float, longitude: float) -> bool:
+    """Whether a position can be meant: finite, within bounds, and not the 0, 0 of a receiver without a fix."""
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        return False
+    if abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        return False
+    return abs(latitude) > NULL_ISLAND_DEG or abs(longitude) > NULL_ISLAND_DEG
+
+
+def _position(photo: CheckedPhoto, gps: Gps, source: str, place: FilePlace | None) -> Position:
+    """All but the angles."""
+    xmp = photo.xmp
+    altitudes = {
+        "file": place.altitude_m if place is not None else None,
+        # Positions that were corrected afterwards (PPK) are written to EXIF: it comes before XMP.
+        "exif": _exif_altitude(photo.exif.gps),
+        "xmp": _xmp_altitude(xmp),
+    }
+    altitude_source = next((name for name, altitude in altitudes.items() if altitude is not None), None)
+    rtk = _rtk(xmp)
+    sigma_source, horizontal, vertical = _sigmas(photo, rtk, place)
+    return Position(
+        name=photo.name,
+        latitude=gps.latitude,
+        longitude=gps.longitude,
+        altitude_m=altitudes[altitude_source] if altitude_source else None,
+        altitude_source=altitude_source,
+        relative_altitude_m=xmp_number(xmp, "drone-dji:RelativeAltitude", *ALTITUDE_BOUNDS_M),
+        sigma_horizontal_m=horizontal,
+        sigma_vertical_m=vertical,
+        rtk=rtk,
+        yaw_deg=None,
+        pitch_deg=None,
+        roll_deg=None,
+        flight_yaw_deg=xmp_number(xmp, "drone-dji:FlightYawDegree", -720.0, 720.0),
+        flight_pitch_deg=xmp_number(xmp, "drone-dji:FlightPitchDegree", -180.0, 180.0),
+        flight_roll_deg=xmp_number(xmp, "drone-dji:FlightRollDegree", -360.0, 360.0),
+        orientation=photo.exif.orientation,
+        source=source,
+        sigma_source=sigma_source,
+        vertical=_vertical(xmp, rtk, place if altitude_source == "file" else None, altitude_source),
+    )
+
+
+def _rtk(xmp: Mapping[str, str]) -> str | None:
+    flag = xmp_number(xmp, "drone-dji:RtkFlag", 0, 255)
+    if flag is None:
+        return None
+    return "fixed" if flag == FIXED else "float" if flag in FLOAT else "single" if flag == SINGLE else None
+
+
+def _vertical(xmp: Mapping[str, str], rtk: str | None, place: FilePlace | None, source: str | None) -> str:
+    """The datum that the file's CRS, RTK or Pix4D's tags declare."""
+    if place is not None:
+        return place.vertical
+    if source is None:
+        return UNKNOWN
+    if rtk in ("fixed", "float") and xmp.get("drone-dji:AltitudeType", "").casefold() == "rtkalt":
+        return ELLIPSOIDAL  # DJI's developer guide on altitudes: RTK's are ellipsoidal heights
+    try:
+        return parse_vertical(xmp.get("Camera:VertCS", UNKNOWN))
+    except SplatpipeError:
+        return UNKNOWN
+
+
+def _camera(photo: CheckedPhoto) -> tuple[str, str]:
+    return photo.exif.make, photo.exif.model
+
+
+def _conventions(photos: Sequence[CheckedPhoto]) -> dict[tuple[str, str], Convention]:
+    """Where each camera's ``Camera:Pitch`` is counted from."""
+    pitches: dict[tuple[str, str], list[float]] = {}
+    for photo in photos:
+        pitch = xmp_number(photo.xmp, "Camera:Pitch", -360.0, 360.0)
+        if pitch is not None:
+            pitches.setdefault(_camera(photo), []).append(pitch)
+    return {camera: tell_convention(values) for camera, values in pitches.items()}
+
+
+def _angles(
+    photo: CheckedPhoto, place: FilePlace | None, convention: Convention
+) -> tuple[float | None, float | None, float | None]:
+    xmp = photo.xmp
+    yaw, pitch, roll = (
+        xmp_number(xmp, f"drone-dji:Gimbal{name}Degree", -limit, limit)
+        for name, limit in (("Yaw", 720.0), ("Pitch", 180.0), ("Roll", 360.0))
+    )
+    if place is not None and place.angles_deg is not None:
+        yaw, pitch, roll = place.angles_deg
+    elif yaw is None and pitch is None:
+        yaw, pitch, roll = (xmp_number(xmp, f"Camera:{name}", -720.0, 720.0) for name in ("Yaw", "Pitch", "Roll"))
+        if convention == "nadir" and yaw is not None and pitch is not None:
+            yaw, pitch, roll = gimbal_from_nadir(yaw, pitch, roll or 0.0)
+    return yaw, pitch, roll
+
+
+def _sigmas(photo: CheckedPhoto, rtk: str | None, place: FilePlace | None) -> tuple[str, float, float]:
+    """Where they are from, horizontal, vertical."""
+    xmp, exif = photo.xmp, photo.exif.gps
+    east = xmp_number(xmp, "drone-dji:RtkStdLon", 1e-6, 1000.0)
+    north = xmp_number(xmp, "drone-dji:RtkStdLat", 1e-6, 1000.0)
+    up = xmp_number(xmp, "drone-dji:RtkStdHgt", 1e-6, 1000.0)
+    stated = xmp_number(xmp, "Camera:GPSXYAccuracy", 1e-4, 1e4)
+    source = "default"
+    horizontal, vertical = DEFAULT_SIGMAS_M[rtk]
+    if east is not None and north is not None and up is not None:
+        source, horizontal, vertical = "xmp", max(east, north), up
+    elif stated is not None:
+        above = xmp_number(xmp, "Camera:GPSZAccuracy", 1e-4, 1e4)
+        source, horizontal, vertical = "xmp", stated, above or VERTICAL_OVER_HORIZONTAL * stated
+    elif exif is not None and exif.horizontal_error_m is not None:
+        source, horizontal = "exif", exif.horizontal_error_m
+        vertical = VERTICAL_OVER_HORIZONTAL * horizontal
+    if place is not None and place.sigma_m[0] is not None:
+        source, horizontal = "file", place.sigma_m[0]
+        vertical = place.sigma_m[1] or VERTICAL_OVER_HORIZONTAL * horizontal
+    return source, max(horizontal, LEAST_SIGMA_M), max(vertical, LEAST_SIGMA_M)
+
+
+def _stamp(photo: CheckedPhoto, position: Position) -> Stamp:
+    xmp = photo.xmp
+    serial = xmp.get("drone-dji:DroneSerialNumber") or photo.exif.serial or " ".join(_camera(photo))
+    device = (position.source, position.altitude_source or "", serial, xmp.get("Camera:FlightUUID", ""))
+    takeoff = math.nan
+    if position.altitude_m is not None and position.relative_altitude_m is not None:
+        takeoff = position.altitude_m - position.relative_altitude_m
+    return Stamp(device, _seconds(photo.exif.time), takeoff)
+
+
+def _seconds(time: str | None) -> float:
+    try:
+        return datetime.datetime.fromisoformat(time or "").replace(tzinfo=datetime.UTC).timestamp()
+    except ValueError:
+        return math.nan
+
+
+def _file_gps(place: FilePlace | None) -> Gps | None:
+    return None if place is None else Gps(place.latitude, place.longitude)
+
+
+def _exif_altitude(gps: Gps | None) -> float | None:
+    altitude = gps.altitude_m if gps is not None else None
+    if altitude is None or not ALTITUDE_BOUNDS_M[0] <= altitude <= ALTITUDE_BOUNDS_M[1]:
+        return None
+    return altitude
+
+
+def _xmp_altitude(xmp: Mapping[str, str]) -> float | None:
+    return xmp_number(xmp, "drone-dji:AbsoluteAltitude", *ALTITUDE_BOUNDS_M)
+
+
+def _xmp_gps(xmp: Mapping[str, str]) -> Gps | None:
+    """The position that XMP states; DJI spells the longitude both ways."""
+    latitude = xmp_number(xmp, "drone-dji:GpsLatitude", -1e6, 1e6)
+    longitude = xmp_number(xmp, "drone-dji:GpsLongitude", -1e6, 1e6)
+    if longitude is None:
+        longitude = xmp_number(xmp, "drone-dji:GpsLongtitude", -1e6, 1e6)
+    if latitude is None or longitude is None:
+        return None
+    return Gps(latitude, longitude, void=xmp.get("drone-dji:GpsStatus", "").casefold() == "invalid")

@@ -1,0 +1,102 @@
+"""What the file of positions says of the photos that are there, on the earth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.photos.camera_angles import gimbal_from_nadir, tell_convention
+from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
+from splatpipe.pipeline.survey.position_file import PhotoPlace, read_position_file
+
+NAMES_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class FilePlace:
+    """A photo's position in the file.
+
+    Attributes:
+        latitude: Degrees north, WGS84.
+        longitude: Degrees east, WGS84.
+        altitude_m: In the datum ``vertical``; None where the file states none.
+        vertical: ``ellipsoidal``, ``EPSG:n`` or ``unknown``, by the file's CRS.
+        angles_deg: Yaw, pitch (-90 straight down) and roll of the camera; None where they are unknown.
+        sigma_m: Horizontal and vertical standard deviation; None where the file states none.
+    """
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None
+    vertical: str
+    angles_deg: tuple[float, float, float] | None
+    sigma_m: tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class FilePlaces:
+    """The photos of the file.
+
+    Attributes:
+        by_name: Those that are there, by the photo's name.
+        unknown: Names in the file that no photo has.
+        note: The CRS and the way from it to WGS 84, a sentence.
+    """
+
+    by_name: Mapping[str, FilePlace]
+    unknown: tuple[str, ...]
+    note: str
+
+
+def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False) -> FilePlaces:
+    """Read a file of positions.
+
+    Args:
+        path: The file.
+        photos: Names of the photos that take part.
+        approximate: Take a CRS though the grid of its best way to WGS 84 is missing.
+
+    Raises:
+        SplatpipeError: if it is no such file, names no photo that is there, or its CRS cannot be used.
+    """
+    file = read_position_file(path)
+    find = NameFinder(photos)
+    matched: dict[str, PhotoPlace] = {}
+    unknown: list[str] = []
+    for photo in file.photos:
+        name = find(photo.name)
+        if name is None or name in matched:
+            unknown.append(photo.name)
+        else:
+            matched[name] = photo
+    if not matched:
+        shown = ", ".join(unknown[:NAMES_SHOWN])
+        raise SplatpipeError(
+            f"{path.name} names no photo that is there: {shown}{', …' if len(unknown) > NAMES_SHOWN else ''}.",
+            "It may be of another capture: name the right one with --set ingest.positions=PATH, or =none to ignore it.",
+        )
+    crs = parse_crs(file.crs)
+    rows = list(matched.values())
+    points = np.array([[row.x, row.y, np.nan if row.z is None else row.z] for row in rows], dtype=np.float64)
+    located = to_geodetic(points, crs, approximate)
+    angles = _gimbal_angles(rows)
+    places = {
+        name: FilePlace(
+            float(latitude), float(longitude), float(up) if np.isfinite(up) else None, crs.vertical, turned, row.sigma_m
+        )
+        for name, row, turned, (latitude, longitude, up) in zip(matched, rows, angles, located.geodetic, strict=True)
+    }
+    return FilePlaces(places, tuple(unknown), f"{crs.text} ({crs.name}) by {located.operation.name}")
+
+
+def _gimbal_angles(rows: Sequence[PhotoPlace]) -> list[tuple[float, float, float] | None]:
+    """The photos' angles as a gimbal's, whichever of the two conventions the file has."""
+    known = [row.angles_deg for row in rows if row.angles_deg is not None]
+    if tell_convention(angles[1] for angles in known) == "gimbal":
+        return [row.angles_deg for row in rows]
+    return [None if row.angles_deg is None else gimbal_from_nadir(*row.angles_deg) for row in rows]

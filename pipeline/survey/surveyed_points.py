@@ -1,0 +1,304 @@
+"""The surveyed points of a capture: from the control file to rays of the model's cameras, every one with its role."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.triangulation import Rays, Triangulated, triangulate
+from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.control_file import ControlFile, SurveyedPoint, read_control_file
+from splatpipe.pipeline.survey.crs import Crs, parse_crs
+from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.options import GeorefConfig
+
+NAMES_SHOWN = 8
+LEAST_FOR_CHECKS = 6  # points, from which on some are kept as check points
+EVERY_NTH = 3  # of them
+OUTSIDE_SHARE = 0.3  # of the marks beyond their photos: they were made in photos of another size
+MARK_TOLERANCE = 10.0  # times their sigma
+LEAST_TOLERANCE_PX = 5.0  # of marks; SfM's own errors at the border of a photo
+FIT_TOLERANCE = 8.0  # times the model's mean reprojection error
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A mark of a point in a photo.
+
+    Attributes:
+        photo: Its name.
+        pixel: In the stored grid; (0, 0) is the top-left corner of the first pixel.
+        index: Of the photo in the model; None where the photo has no pose.
+        agrees: Whether the mark took part in the point's place.
+    """
+
+    photo: str
+    pixel: tuple[float, float]
+    index: int | None
+    agrees: bool = True
+
+
+@dataclass(frozen=True)
+class SurveyPoint:
+    """A surveyed point.
+
+    Attributes:
+        surveyed: As in the file.
+        role: What it is for.
+        why: Where it is left out: the reason, a clause.
+        sightings: Its marks, in the order of the photos' names.
+        found: Its place in the model; None where its marks do not tell it.
+    """
+
+    surveyed: SurveyedPoint
+    role: Literal["control", "check", "left_out"]
+    why: str
+    sightings: tuple[Sighting, ...]
+    found: Triangulated | None = None
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.surveyed.name
+
+    def left_out(self, why: str) -> SurveyPoint:
+        """The same point, left out."""
+        return replace(self, role="left_out", why=why)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """All points.
+
+    Attributes:
+        file: What the control file says.
+        crs: Its CRS.
+        name: Of the file, for messages.
+        points: In its order.
+    """
+
+    file: ControlFile
+    crs: Crs
+    name: str
+    points: tuple[SurveyPoint, ...]
+
+    def with_points(self, points: Sequence[SurveyPoint]) -> Survey:
+        """The same file with other points."""
+        return replace(self, points=tuple(points))
+
+    def of_role(self, role: str) -> list[SurveyPoint]:
+        """The points of a role."""
+        return [point for point in self.points if point.role == role]
+
+
+def load_survey(
+    path: Path, config: GeorefConfig, photos: Mapping[str, Photo], model: SparseModel, report: Reporter
+) -> Survey:
+    """Read a control file and find its points in the model.
+
+    Args:
+        path: The file.
+        config: Roles, and what pixels mean.
+        photos: All photos of the capture by name.
+        model: The sparse model.
+        report: Takes warnings of marks and photos that cannot be used.
+
+    Raises:
+        SplatpipeError: if the file is none, or not of these photos.
+    """
+    file = read_control_file(path)
+    try:
+        crs = parse_crs(file.crs)
+    except SplatpipeError as error:
+        raise SplatpipeError(f"The CRS of {path.name}: {error}", error.hint) from error
+    sightings = _sightings(file, path.name, config, photos, model, report)
+    points = [
+        locate(SurveyPoint(point, "control", "", tuple(seen)), model, photos, config.mark_sigma_px)
+        for point, seen in zip(file.points, sightings, strict=True)
+    ]
+    if file.zero_heights:
+        report.note(
+            f"A height of 0.0 is taken as unknown: {_some(file.zero_heights)} of {path.name} "
+            f"{'controls' if len(file.zero_heights) == 1 else 'control'} horizontally only."
+        )
+    _tell_unusable(points, path.name, model, photos, report)
+    return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
+
+
+def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], mark_sigma_px: float) -> SurveyPoint:
+    """A point with its place by its marks, in a model; left out where they do not tell it."""
+    placed = [k for k, sighting in enumerate(point.sightings) if sighting.index is not None]
+    if len(placed) < 2:
+        return point.left_out(_why_unseen(point, len(placed)))
+    rays, error_px = _rays([point.sightings[k] for k in placed], model, photos)
+    good = np.isfinite(rays.rays).all(axis=1) & np.isfinite(rays.pixels).all(axis=(1, 2))
+    tolerance = max(LEAST_TOLERANCE_PX, MARK_TOLERANCE * mark_sigma_px, FIT_TOLERANCE * error_px)
+    found = triangulate(rays.only(good), tolerance) if good.sum() >= 2 else None
+    if found is None:
+        many = "two marks" if len(placed) == 2 else f"{len(placed)} marks"
+        return point.left_out(
+            f"its {many} do not meet in one point: one is wrong, or the photos are too close together"
+        )
+    agrees = np.zeros(len(placed), dtype=bool)
+    agrees[good] = found.agree
+    sightings = list(point.sightings)
+    for k, agree in zip(placed, agrees.tolist(), strict=True):
+        sightings[k] = replace(sightings[k], agrees=agree)
+    return replace(point, sightings=tuple(sightings), found=found)
+
+
+def _rays(sightings: Sequence[Sighting], model: SparseModel, photos: Mapping[str, Photo]) -> tuple[Rays, float]:
+    """Rays of marks in photos of the model, and the model's mean reprojection error in the photos' pixels."""
+    views = [model.view(s.index, photos[s.photo].width) for s in sightings if s.index is not None]
+    rays = np.stack([view.ray(np.array(s.pixel)) for view, s in zip(views, sightings, strict=True)])
+    poses = np.stack([view.cam_from_model for view in views])
+    pixels = np.stack([view.pixels_by_ray(ray) for view, ray in zip(views, rays, strict=True)])
+    error_px = model.reconstruction.compute_mean_reprojection_error() / min(view.scale for view in views)
+    return Rays(poses, rays, pixels), error_px
+
+
+def residual_px(
+    sighting: Sighting, place: Float64[np.ndarray, " 3"], model: SparseModel, photos: Mapping[str, Photo]
+) -> Float64[np.ndarray, " 2"] | None:
+    """Where a photo shows a place of the model less where the mark is; None where it does not show it."""
+    if sighting.index is None:
+        return None
+    residual = model.view(sighting.index, photos[sighting.photo].width).pixel(place) - np.array(sighting.pixel)
+    return residual if np.isfinite(residual).all() else None
+
+
+def _sightings(
+    file: ControlFile,
+    name: str,
+    config: GeorefConfig,
+    photos: Mapping[str, Photo],
+    model: SparseModel,
+    report: Reporter,
+) -> list[list[Sighting]]:
+    find = NameFinder(sorted(photos))
+    index = {photo: k for k, photo in enumerate(model.names)}
+    shift = 0.5 if config.pixel_origin == "centre" else 0.0
+    marks = [(mark, find(mark.photo)) for point in file.points for mark in point.marks]
+    missing = sorted({mark.photo for mark, photo in marks if photo is None})
+    outside: list[str] = []
+    result = []
+    for point in file.points:
+        seen: dict[str, Sighting] = {}
+        for mark in point.marks:
+            photo = find(mark.photo)
+            if photo is None:
+                continue
+            x, y = mark.x + shift, mark.y + shift
+            if 0.0 <= x <= photos[photo].width and 0.0 <= y <= photos[photo].height:
+                seen.setdefault(photo, Sighting(photo, (x, y), index.get(photo)))
+            else:
+                outside.append(f"{point.name} in {photo}")
+        result.append([seen[photo] for photo in sorted(seen)])
+    _tell_marks(name, len(marks), missing, outside, report, all_missing=all(photo is None for _, photo in marks))
+    return result
+
+
+def _tell_marks(
+    name: str, marks: int, missing: Sequence[str], outside: Sequence[str], report: Reporter, all_missing: bool
+) -> None:
+    if marks == 0:
+        raise SplatpipeError(
+            f"{name} has points but no marks of them in photos.", "Mark each point in at least two, better four photos."
+        )
+    if all_missing:
+        raise SplatpipeError(
+            f"None of the photos that {name} names is in this capture: {_some(missing)}.",
+            "Check that the file belongs to these photos; it names them as their files are called."
+            " --set georef.control=none goes on without control.",
+        )
+    if missing:
+        report.warning(
+            f"{name} names {len(missing)} photos that are not in this capture: {_some(missing)}.",
+            "Their marks are left out. Correct the names, or add the photos.",
+        )
+    if len(outside) > OUTSIDE_SHARE * marks:
+        raise SplatpipeError(
+            f"{len(outside)} of {marks} marks of {name} lie outside of their photos: {_some(outside)}.",
+            "Were they made in photos of another size, or turned ones? Pixels count in the photos as they are here.",
+        )
+    if outside:
+        report.warning(
+            f"{len(outside)} marks of {name} lie outside of their photos and are left out: {_some(outside)}.",
+            "Correct their pixel coordinates.",
+        )
+
+
+def _why_unseen(point: SurveyPoint, placed: int) -> str:
+    count = len(point.sightings)
+    if count == 0:
+        return "it is marked in no photo of this capture"
+    if placed < count and placed < 2 <= count:
+        return f"only {placed} of the {count} photos that it is marked in could be placed"
+    return "it is marked in one photo only" if placed else "the photo that it is marked in could not be placed"
+
+
+def _tell_unusable(
+    points: Sequence[SurveyPoint], name: str, model: SparseModel, photos: Mapping[str, Photo], report: Reporter
+) -> None:
+    for point in points:
+        if point.found is None:
+            report.warning(
+                f"Point {point.name} of {name} is left out: {point.why}.",
+                "Mark it in at least two photos that show it from different places; better four.",
+            )
+            continue
+        wrong = [s for s in point.sightings if s.index is not None and not s.agrees]
+        if wrong:
+            off = [residual_px(sighting, point.found.xyz, model, photos) for sighting in wrong]
+            named = [
+                s.photo if r is None else f"{s.photo} ({np.hypot(*r):.0f} px)" for s, r in zip(wrong, off, strict=True)
+            ]
+            report.warning(
+                f"Marks of {point.name} do not lie where its other marks have it, and are left out: {_some(named)}.",
+                "Correct these marks: another point may have been marked, or the wrong photo named.",
+            )
+
+
+def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]:
+    """Roles by the option, the file, or for six points and more every third.
+
+    Args:
+        points: With role ``control``, or left out.
+        setting: `georef.check_points`.
+
+    Raises:
+        SplatpipeError: if it names points that are not there.
+    """
+    usable = [point.name for point in points if point.role != "left_out"]
+    setting = setting.strip()
+    if setting == "none":
+        checks: set[str] = set()
+    elif setting == "auto":
+        stated = [point for point in points if point.surveyed.role is not None]
+        checks = {point.name for point in stated if point.surveyed.role == "check"}
+        if not stated and len(usable) >= LEAST_FOR_CHECKS:
+            checks = set(usable[EVERY_NTH - 1 :: EVERY_NTH])
+    else:
+        checks = {name.strip() for name in setting.split(",") if name.strip()}
+        unknown = sorted(checks - {point.name for point in points})
+        if unknown:
+            raise SplatpipeError(
+                f"georef.check_points names points that the control file does not have: {_some(unknown)}.",
+                f"It has {_some([point.name for point in points])}.",
+            )
+    return [
+        replace(point, role="check") if point.role == "control" and point.name in checks else point for point in points
+    ]
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    return ", ".join(names[:NAMES_SHOWN]) + more

@@ -1,0 +1,144 @@
+"""How well positions place a model: its coordinates, north, up and scale, in figures and in a sentence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.geometry.similarity import similarity_jacobian
+from splatpipe.pipeline.survey.receiver_noise import NoisyFit, ReceiverNoise
+
+NORMAL_95 = 1.959964
+LEAST_DEGREES = 3.0  # of freedom that intervals count on: of strongly correlated errors, effective ones run out
+MOST_PLACES = 2000  # of the model that its coordinates are judged at
+DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations of a frame that positions gave, and what a truth lies within in 95 of 100 cases.
+
+    Attributes:
+        offset_m: East, north, up, of the middle of the cameras; with what the receiver's error has in common.
+        north_rad: Of the heading.
+        up_rad: Of the angle between what the frame has for up and what is up (root mean square).
+        scale: Relative.
+        weakest_rad: Of the rotation about its weakest axis.
+        coordinates_m: Horizontal (of each coordinate) and in height, of a typical place of the model.
+        common_m: Horizontally and in height: what all positions may be off together, in the former.
+        noise: Of the positions.
+        covariance: Of rotation vector, scale's logarithm and place, without the common part.
+    """
+
+    offset_m: Float64[np.ndarray, " 3"]
+    north_rad: float
+    up_rad: float
+    scale: float
+    weakest_rad: float
+    coordinates_m: Float64[np.ndarray, " 2"]
+    common_m: Float64[np.ndarray, " 2"]
+    noise: ReceiverNoise
+    covariance: Float64[np.ndarray, "7 7"]
+
+    def sentence(self) -> str:
+        """As people are told it."""
+        across, height = self.coordinates_m.tolist()
+        metres = f"about {_metres(across)}"
+        if not 0.67 < height / max(across, 1e-12) < 1.5:
+            metres += f" ({_metres(height)} in height)"
+        angles = f"north to {_degrees(self.north_rad)}, up to {_degrees(self.up_rad)}"
+        return f"coordinates good to {metres}, {angles}, scale to {_percent(self.scale)}"
+
+    def as_json(self) -> dict[str, Any]:
+        """As `frame.json` and `accuracy.json` hold it: standard deviations, 95 % bounds, the noise, the sentence."""
+        horizontal, vertical = (student_95(float(degrees)) for degrees in self.noise.degrees)
+        weakest = max(horizontal, vertical)
+        times = np.array([horizontal, horizontal, vertical])
+        return {
+            "sentence": self.sentence(),
+            "coordinates_sigma_m": _rounded(self.coordinates_m),
+            "offset_sigma_m": _rounded(self.offset_m),
+            "offset_95_m": _rounded(times * self.offset_m),
+            "north_sigma_deg": _rounded(math.degrees(self.north_rad)),
+            "north_95_deg": _rounded(horizontal * math.degrees(self.north_rad)),
+            "up_sigma_deg": _rounded(math.degrees(self.up_rad)),
+            "up_95_deg": _rounded(weakest * math.degrees(self.up_rad)),
+            "scale_sigma_percent": _rounded(100.0 * self.scale),
+            "scale_95_percent": _rounded(100.0 * horizontal * self.scale),
+            "noise_over_stated": _rounded(self.noise.factors),
+            "noise_correlation": _rounded(self.noise.correlations),
+            "common_m": _rounded(self.common_m),
+        }
+
+
+def uncertainty_of(
+    fit: NoisyFit,
+    source: Float64[np.ndarray, "n 3"],
+    places: Float64[np.ndarray, "m 3"],
+    stated: Float64[np.ndarray, " 2"],
+) -> Uncertainty:
+    """What a fit of positions is worth.
+
+    Residuals do not show what all positions are off together. What a receiver states of its positions is said of their
+    whole error, so what the residuals do not show of that is taken to be common to them: a flight whose positions agree
+    to 0.4 m of stated 3 m lies somewhere within 3 m. Positions that scatter by more than they state have shown it all.
+
+    Args:
+        fit: Of the positions.
+        source: Places of the cameras that took part, in the model.
+        places: Of the model's points.
+        stated: What the positions state, horizontally and in height (metres); zeros where flights' offsets are part of
+            the fit, and hold it already.
+    """
+    spread = 2.0 * np.sqrt(2.0 / np.maximum(fit.noise.degrees, 1.0))
+    shown = fit.noise.factors**2 * (1.0 + spread)  # its upper bound: noise as stated leaves nothing
+    common = stated * np.sqrt(np.maximum(1.0 - shown, 0.0))
+    common_3 = common[[0, 0, 1]]
+    covariance = fit.covariance
+    tilt = covariance[:2, :2]
+    chosen = places[:: max(1, len(places) // MOST_PLACES)] if len(places) else source
+    reach = similarity_jacobian(fit.similarity, chosen, about=source.mean(axis=0))
+    variances = np.einsum("nkp,pq,nkq->nk", reach, covariance, reach)
+    typical = np.median(variances, axis=0) + common_3**2
+    return Uncertainty(
+        offset_m=np.sqrt(np.diag(covariance)[4:] + common_3**2),
+        north_rad=math.sqrt(covariance[2, 2]),
+        up_rad=math.sqrt(float(np.trace(tilt))),
+        scale=math.sqrt(covariance[3, 3]),
+        weakest_rad=math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+        coordinates_m=np.sqrt(np.array([typical[:2].mean(), typical[2]])),
+        common_m=common,
+        noise=fit.noise,
+        covariance=covariance,
+    )
+
+
+def student_95(degrees: float) -> float:
+    """What Student's t stays within in 95 of 100 cases (Abramowitz and Stegun, Handbook, 1964, 26.7.5)."""
+    z, n = NORMAL_95, max(degrees, LEAST_DEGREES)
+    first = (z**3 + z) / 4.0
+    second = (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0
+    third = (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0
+    return z + first / n + second / n**2 + third / n**3
+
+
+def _metres(value: float) -> str:
+    if value < 0.0995:
+        return f"{max(100.0 * value, 0.1):.2g} cm"
+    return f"{value:.2g} m" if value < 99.5 else f"{value:,.0f} m"
+
+
+def _degrees(value: float) -> str:
+    return f"{max(math.degrees(value), 0.01):.2g}°"
+
+
+def _percent(value: float) -> str:
+    return f"{max(100.0 * value, 0.01):.2g} %"
+
+
+def _rounded(value: Any) -> Any:
+    return np.round(np.asarray(value, dtype=np.float64), DIGITS).tolist()

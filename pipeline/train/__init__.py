@@ -1,0 +1,1 @@
+"""Training: the schedule, an iteration, density control, appearance, budgets, checkpoints."""

@@ -1,0 +1,257 @@
+"""A training that fills a time budget: what an iteration costs, forecast, and the plan that meets the time.
+
+The forecast comes from real iterations on throw-away states (``measure``). It is used before training only: afterwards
+the plan says what every iteration computes, and the clock no more than after which of them the training ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatpipe.pipeline.train.densify import room_at
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import coarse_level_at, resolve_schedule
+
+# Of these, up to COARSEST_MEGAPIXELS, none was compared by held-out quality: they are judgement, the reasons theirs.
+SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
+SIZE_STEP = 1.5  # between the sizes tried: fine enough to use the time, coarse enough for a short list
+FULL_SHARE = 0.9  # of the dataset's size is as good as all of it, and spares the resampling
+
+FIRST_ITERATIONS = 1500  # a training of FIRST_SECONDS shall have as many: below it the colours have not settled
+FIRST_SECONDS = 30.0
+LONGEST = 30_000  # iterations, as published: beyond them little is learnt
+FEWEST = 300  # iterations, however short the time: fewer do not leave the initial blur
+VISITS = 10  # iterations a photo at least: one seen less often leaves floaters before its camera
+
+FIRST_GROWTH = 1.5  # times the initial Gaussians that every plan has room for, before it takes larger photos
+FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer; the plan thins the initial ones down to it at most
+COARSEST_MEGAPIXELS = 0.05  # photos are halved at the start of a training no further than to this
+GRADIENT_SHARE = 0.5  # of ``densify_gradient``: Gaussians follow ``room_at``, and so the forecast, but not into noise
+
+EXPORT_GAUSSIAN_S = 8e-6  # a Gaussian of the model moved, written twice and hashed
+AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
+SAMPLES = 60  # points that a forecast takes of a training: its schedules are linear or steps
+SCHEDULE_SHARE = 0.95  # of the time for the planned schedule; what is over polishes at its last learning rates
+POLISH = 1.5  # times the planned iterations at most, where the forecast was too high
+
+
+@dataclass(frozen=True)
+class Timing:
+    """A measured iteration.
+
+    Attributes:
+        gaussians: In the model.
+        pixels: Of the photo.
+        seconds: Wall clock.
+    """
+
+    gaussians: int
+    pixels: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What an iteration takes: base + Gaussians + pixels + pairs, where a pixel's pairs grow with the Gaussians.
+
+    Attributes:
+        base_s: Whatever the size.
+        gaussian_s: A Gaussian: projection, optimiser.
+        pixel_s: A pixel: loss, and the pairs that are there with few Gaussians already.
+        pair_s: A Gaussian times a pixel.
+    """
+
+    base_s: float
+    gaussian_s: float
+    pixel_s: float
+    pair_s: float
+
+    def seconds(self, gaussians: int, pixels: int | float) -> float:
+        """Of an iteration."""
+        return self.base_s + self.gaussian_s * gaussians + self.pixel_s * pixels + self.pair_s * gaussians * pixels
+
+
+def fit_speed(timings: Sequence[Timing]) -> Speed:
+    """The speed that explains the timings best (relative least squares), with no cost below zero.
+
+    Raises:
+        ValueError: without timings, or with one that took no time.
+    """
+    if not timings or min(timing.seconds for timing in timings) <= 0.0:
+        raise ValueError("a speed needs timings of more than zero seconds")
+    table = np.array([_terms(timing.gaussians, timing.pixels) for timing in timings])
+    seconds = np.array([timing.seconds for timing in timings])
+    scale = table.max(axis=0)  # brings the columns to one size
+    weighted = table / scale / seconds[:, None]
+    costs = np.zeros(4)
+    free = [0, 1, 2, 3]
+    while free:  # leave out the most negative cost until none is: few columns, so this is close to the best
+        found = np.linalg.lstsq(weighted[:, free], np.ones(len(timings)), rcond=1e-9)[0]
+        if found.min() >= 0.0:
+            costs[free] = found / scale[free]
+            break
+        free.pop(int(found.argmin()))
+    return Speed(*costs.tolist())
+
+
+def _terms(gaussians: int, pixels: int) -> npt.NDArray[np.float64]:
+    return np.array([1.0, gaussians, pixels, gaussians * pixels])
+
+
+def forecast(speed: Speed, options: TrainConfig, initial: int, megapixels: float) -> float:
+    """Seconds that a training takes.
+
+    Args:
+        speed: Of this machine on this scene.
+        options: Resolved.
+        initial: Gaussians at the start.
+        megapixels: Of a photo at full size.
+    """
+    steps = min(SAMPLES, options.iterations)
+    total = 0.0
+    for step in range(steps):
+        iteration = int((step + 0.5) * options.iterations / steps) + 1
+        pixels = 1e6 * megapixels / 4 ** coarse_level_at(options, iteration)
+        total += speed.seconds(room_at(options, initial, iteration), pixels)
+    return total * options.iterations / steps
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be planned.
+
+    Attributes:
+        config: The options, not resolved; its ``max_gaussians`` is the most that may be planned.
+        initial: Gaussians at the start.
+        photos: To train on.
+        megapixels: Their mean size in the dataset.
+        speed: Of this machine on this scene.
+        prepare_s: Decoding every photo once.
+        seconds: What is left for the training when its photos have so many megapixels.
+    """
+
+    config: TrainConfig
+    initial: int
+    photos: int
+    megapixels: float
+    speed: Speed
+    prepare_s: float
+    seconds: Callable[[float], float]
+
+    def left(self, megapixels: float, cap: int) -> float:
+        """Seconds for the training when as many Gaussians as the cap allows are to be exported."""
+        return self.seconds(megapixels) - EXPORT_GAUSSIAN_S * cap
+
+    def takes(self, options: TrainConfig, megapixels: float) -> float:
+        """Forecast of a training, its photos' decoding (once a size) included, seconds."""
+        decoding = self.prepare_s * (1 + options.coarse_levels)
+        return decoding + AGEING * forecast(self.speed, options, self.initial, megapixels)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What meets the time.
+
+    Attributes:
+        options: Resolved: iterations, cap, halvings at the start and a low threshold of density control.
+        megapixels: Most of a photo; None for the dataset's size.
+        seconds: When the training ends, done or not.
+        forecast_s: When the schedule should be done.
+    """
+
+    options: TrainConfig
+    megapixels: float | None
+    seconds: float
+    forecast_s: float
+
+    @property
+    def last_iteration(self) -> int:
+        """The most iterations: beyond the schedule until the time is up, unless that is as long as is of use."""
+        scheduled = self.options.iterations
+        return scheduled if scheduled >= LONGEST else int(POLISH * scheduled)
+
+
+def choose(task: Task) -> Choice:
+    """Divide the time between the size of the photos, iterations and Gaussians.
+
+    Photos grow to the dataset's size first, as long as ``wanted_iterations`` and room for the first growth fit; then
+    the cap grows; what is over goes into iterations, up to ``LONGEST``.
+    """
+    most = task.config.max_gaussians
+    first = min(most, max(FEWEST_GAUSSIANS, int(FIRST_GROWTH * task.initial)))
+    size, cap = SMALLEST_MEGAPIXELS, first
+    for size in reversed(sizes(task.megapixels)):
+        if _fits(task, size, first, wanted_iterations(task, size)):
+            break
+    iterations = wanted_iterations(task, size)
+    if _fits(task, size, first, iterations):
+        cap = first
+        if size >= task.megapixels:
+            cap = _largest(first, most, lambda gaussians: _fits(task, size, gaussians, iterations))
+    else:  # too little time for even that: fewer iterations, then fewer Gaussians
+        least = min(first, FEWEST_GAUSSIANS)
+        cap = _largest(least, first, lambda gaussians: _fits(task, size, gaussians, FEWEST))
+    iterations = _largest(FEWEST, max(LONGEST, iterations), lambda count: _fits(task, size, cap, count))
+    options = planned_options(task, size, cap, iterations)
+    reduced_to = None if size >= task.megapixels else size
+    return Choice(options, reduced_to, task.left(size, cap), task.takes(options, size))
+
+
+def sizes(megapixels: float) -> list[float]:
+    """Sizes of photos to choose from, smallest first; the last one is the dataset's."""
+    ladder = []
+    size = SMALLEST_MEGAPIXELS
+    while size < FULL_SHARE * megapixels:
+        ladder.append(round(size, 4))
+        size *= SIZE_STEP
+    return [*ladder, megapixels]
+
+
+def wanted_iterations(task: Task, megapixels: float) -> int:
+    """Iterations that are worth more than larger photos or more Gaussians."""
+    return max(VISITS * task.photos, worthwhile_iterations(task.seconds(megapixels)))
+
+
+def worthwhile_iterations(seconds: float) -> int:
+    """Iterations that a training of so many seconds shall have at least, from ``FEWEST`` to ``LONGEST``.
+
+    They grow with the root of the time, so that what they work on grows as much; with it 10 minutes give about the
+    7,000 of the standard preset.
+    """
+    wanted = FIRST_ITERATIONS * math.sqrt(max(seconds, 1.0) / FIRST_SECONDS)
+    return int(min(LONGEST, max(FEWEST, wanted)))
+
+
+def planned_options(task: Task, megapixels: float, cap: int, iterations: int) -> TrainConfig:
+    """The options of a planned training, resolved."""
+    config = task.config
+    halvings = int(max(0.0, math.log(megapixels / COARSEST_MEGAPIXELS, 4)))
+    planned = {
+        "iterations": iterations,
+        "max_gaussians": cap,
+        "coarse_levels": max(config.coarse_levels, min(2, halvings)),
+        "densify_gradient": GRADIENT_SHARE * float(resolve_schedule(config, task.photos).densify_gradient),
+    }
+    return resolve_schedule(config.model_copy(update=planned), task.photos)
+
+
+def _fits(task: Task, megapixels: float, cap: int, iterations: int) -> bool:
+    options = planned_options(task, megapixels, cap, iterations)
+    return task.takes(options, megapixels) <= SCHEDULE_SHARE * task.left(megapixels, cap)
+
+
+def _largest(least: int, most: int, fits: Callable[[int], bool]) -> int:
+    """The largest count from ``least`` to ``most`` that fits, to three digits; ``least`` if none does."""
+    if most <= least or not fits(least):
+        return least
+    if fits(most):
+        return most
+    while most - least > max(1, least // 1000):
+        middle = (least + most) // 2
+        least, most = (middle, most) if fits(middle) else (least, middle)
+    return least

@@ -1,0 +1,77 @@
+"""Where a killed training goes on from: tensors and counts after a whole iteration, tied to one plan."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.splat.archives import read_archive
+
+CHECKPOINT_FORMAT = 1
+_FACTS = "facts"
+
+
+class BrokenCheckpointError(Exception):
+    """A checkpoint that cannot be gone on from; the message says why."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What one holds.
+
+    Attributes:
+        arrays: Every tensor of the state, by name.
+        facts: Counts and curves as JSON values.
+    """
+
+    arrays: Mapping[str, npt.NDArray[Any]]
+    facts: Mapping[str, Any]
+
+
+def save_checkpoint(path: Path, plan_digest: str, checkpoint: Checkpoint) -> None:
+    """Replace the checkpoint at ``path`` at once.
+
+    The file is an uncompressed NumPy archive, whose checksums tell a damaged one.
+
+    Raises:
+        OSError: if it cannot be written; the one before is still there.
+    """
+    header = {"format": CHECKPOINT_FORMAT, "plan": plan_digest, "facts": dict(checkpoint.facts)}
+    facts = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    if _FACTS in checkpoint.arrays:
+        raise ValueError(f"an array may not be called {_FACTS}")
+    write_durably(path, lambda file: np.savez(file, allow_pickle=False, **{_FACTS: facts, **checkpoint.arrays}))
+
+
+def load_checkpoint(path: Path, plan_digest: str) -> Checkpoint:
+    """Read a checkpoint back.
+
+    Args:
+        path: Where it is.
+        plan_digest: The plan it must be of.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        BrokenCheckpointError: if it is damaged, of another version, or of another plan.
+    """
+    try:
+        arrays = read_archive(path)
+        header = json.loads(arrays.pop(_FACTS).tobytes())
+        found = (header["format"], header["plan"])
+        facts = header["facts"]
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BrokenCheckpointError(f"it is damaged ({error})") from error
+    if found[0] != CHECKPOINT_FORMAT:
+        raise BrokenCheckpointError("it was written by another version")
+    if found[1] != plan_digest:
+        raise BrokenCheckpointError("it belongs to another plan")
+    return Checkpoint(arrays, facts)

@@ -1,0 +1,275 @@
+"""Adaptive density control: how Gaussians are cloned, split, pruned and their opacity reset, and how many there may be.
+
+Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023,
+section 5 and its published settings, changed in two ways whatever the score (which the strategies in `density/` make).
+The number of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
+"Taming 3DGS", SIGGRAPH Asia 2024). And two that take the place of one have the opacity that lets as much light through
+as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.draws import SPLIT_POSITION, normal
+from splatpipe.pipeline.train.options import TrainConfig
+
+MIN_AFTER_PRUNE = 1  # a model is never emptied: there would be nothing left to learn from
+
+
+@dataclass(frozen=True)
+class Growth:
+    """New rows for the model: which old Gaussian each is made from, and what differs.
+
+    Attributes:
+        source: (m,) old row of each new Gaussian.
+        fresh: (m,) True where it is new, so that its optimiser state starts at zero.
+        means: (m, 3) world units.
+        log_scales: (m, 3).
+        opacity_logits: (m,).
+    """
+
+    source: Int64[Tensor, " m"]
+    fresh: Bool[Tensor, " m"]
+    means: Float[Tensor, "m 3"]
+    log_scales: Float[Tensor, "m 3"]
+    opacity_logits: Float[Tensor, " m"]
+
+    def select(self, rows: Bool[Tensor, " m"]) -> Growth:
+        """The rows of a mask."""
+        return Growth(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> Growth:
+    """The Gaussians of a mask, as they are."""
+    source = torch.nonzero(rows).flatten()
+    kept = gaussians.select(source)
+    return Growth(source, torch.zeros(len(kept), dtype=torch.bool), kept.means, kept.log_scales, kept.opacity_logits)
+
+
+@dataclass(frozen=True)
+class DensityEvent:
+    """What a step of density control did.
+
+    Attributes:
+        iteration: When.
+        cloned: Gaussians copied.
+        split: Gaussians replaced by two.
+        pruned: Gaussians removed.
+        held_back: Gaussians that the schedule kept from being densified.
+        gaussians: How many there are now.
+        relocated: Dead Gaussians that took the place of live ones.
+        added: Copies of live Gaussians that were drawn.
+    """
+
+    iteration: int
+    cloned: int
+    split: int
+    pruned: int
+    held_back: int
+    gaussians: int
+    relocated: int = 0
+    added: int = 0
+
+    def to_json(self) -> dict[str, int]:
+        """For `history.json`."""
+        return asdict(self)
+
+
+class DensityStatistics:
+    """Running sums over the photos since the last step.
+
+    Attributes:
+        score_sum: (n,) sum of the photos' scores.
+        seen: (n,) photos that saw the Gaussian.
+        max_radius_px: (n,) largest radius on screen.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.score_sum = torch.zeros(count)
+        self.seen = torch.zeros(count)
+        self.max_radius_px = torch.zeros(count)
+
+    def observe(self, gradient_px: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"], width: int, height: int) -> None:
+        """Add an iteration's image-plane gradients, by their norm in NDC.
+
+        Args:
+            gradient_px: dL/d(mean2D) summed over the pixels, or its magnitudes, x and y apart.
+            visible: Which Gaussians the photo saw.
+            width: Of the render, pixels.
+            height: Of the render, pixels.
+        """
+        self.add(torch.hypot(gradient_px[:, 0] * (0.5 * width), gradient_px[:, 1] * (0.5 * height)), visible)
+
+    def add(self, score: Float[Tensor, " n"], visible: Bool[Tensor, " n"]) -> None:
+        """Add an iteration's scores, which are overwritten; those that are not finite count as 0."""
+        self.score_sum += score.nan_to_num_(0.0, 0.0, 0.0).mul_(visible)
+        self.seen += visible
+
+    def observe_radii(self, radii_px: Float[Tensor, " n"]) -> None:
+        """Add an iteration's sizes on screen, pixels (0 where unseen)."""
+        torch.maximum(self.max_radius_px, radii_px, out=self.max_radius_px)
+
+    def score(self) -> Float[Tensor, " n"]:
+        """The statistic: averaged over the photos that saw the Gaussian."""
+        return self.score_sum / self.seen.clamp(min=1.0)
+
+    def to_arrays(self) -> dict[str, Tensor]:
+        """Its tensors by name, for a checkpoint."""
+        return {"score_sum": self.score_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
+
+
+def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
+    """The most Gaussians that density control leaves: up to the cap, fast at first and slower towards its last step.
+
+    What comes early has time to be trained; what comes late has the better score. With x the share of the steps done,
+    the share of the growth is x (2 - x).
+
+    Args:
+        options: Resolved.
+        initial: Gaussians at the start.
+        iteration: Now.
+    """
+    first, last, every = int(options.densify_from), int(options.densify_until), int(options.densify_every)
+    initial = min(initial, options.max_gaussians)
+    if not options.densify or iteration < first or last < first:
+        return initial
+    done = min(1.0, (iteration - first + every) / (last - first + every))
+    return initial + int(done * (2.0 - done) * (options.max_gaussians - initial))
+
+
+def grow(
+    gaussians: Gaussians, score: Float[Tensor, " n"], room: int, options: TrainConfig, extent: float, iteration: int
+) -> tuple[Growth, dict[str, int]]:
+    """Clone the small and split the large Gaussians whose score asks for it.
+
+    Those whose halved opacity would be under the pruning limit are left: both halves would go in the next step.
+
+    Args:
+        gaussians: The model.
+        score: ``DensityStatistics.score`` of each.
+        room: How many Gaussians may be added.
+        options: Resolved.
+        extent: Of the scene, world units.
+        iteration: Names the random numbers.
+
+    Returns:
+        The new rows (kept ones in their order, then clones, then two children for each split), and the counts
+        ``cloned``, ``split`` and ``held_back``.
+    """
+    lasting = gaussians.opacity_logits >= lowest_logit_to_halve(options.prune_opacity)
+    wanted = torch.nonzero((score > float(options.densify_gradient)) & lasting).flatten()
+    chosen = _largest(wanted, score, max(0, room))
+    size = gaussians.log_scales.amax(dim=1)
+    large = size[chosen] > math.log(options.split_extent * extent)
+    cloned, split = chosen[~large], chosen[large]
+
+    kept = torch.ones(len(gaussians), dtype=torch.bool)
+    kept[split] = False
+    old = torch.nonzero(kept).flatten()
+    source = torch.cat((old, cloned, split, split))
+    fresh = torch.arange(len(source)) >= len(old)
+    means, log_scales = gaussians.means[source], gaussians.log_scales[source]
+    children = len(old) + len(cloned)
+    means[children:] += _split_offsets(gaussians, split, options.seed, iteration)
+    log_scales[children:] -= math.log(options.split_shrink)
+    logits = gaussians.opacity_logits.clone()
+    logits[chosen] = half_opacity(logits[chosen])
+    counts = {"cloned": len(cloned), "split": len(split), "held_back": len(wanted) - len(chosen)}
+    return Growth(source, fresh, means, log_scales, logits[source]), counts
+
+
+def half_opacity(logits: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+    """The logit of the opacity of which two let as much light through as one of the given: 1 - √(1 - α).
+
+    Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024.
+    """
+    log_through = 0.5 * torch.nn.functional.logsigmoid(-logits)  # ln √(1 - α), finite for any logit
+    # 1 - √(1 - α) = α / (1 + √(1 - α)), which does not cancel for small α.
+    return torch.nn.functional.logsigmoid(logits) - torch.log1p(torch.exp(log_through)) - log_through
+
+
+def lowest_logit_to_halve(limit: float) -> float:
+    """The logit of the opacity whose half, by ``half_opacity``, is the limit: 1 - (1 - α)²."""
+    opacity = limit * (2.0 - limit)
+    return math.log(opacity / (1.0 - opacity)) if opacity > 0.0 else -math.inf
+
+
+def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit: int) -> Int64[Tensor, " k"]:
+    """Up to ``limit`` candidates of the largest value (ties: the first row), in row order."""
+    if len(candidates) <= limit:
+        return candidates
+    ranked = torch.argsort(value[candidates], descending=True, stable=True)
+    return candidates[ranked[:limit]].sort().values
+
+
+def _split_offsets(gaussians: Gaussians, rows: Int64[Tensor, " s"], seed: int, iteration: int) -> Float[Tensor, "t 3"]:
+    """Draw two positions within each parent, relative to its mean: the first of all, then the second of all."""
+    parents = rows.numpy().astype(np.uint64)
+    children = np.concatenate((2 * parents, 2 * parents + np.uint64(1)))
+    index = (3 * children)[:, None] + np.arange(3, dtype=np.uint64)
+    unit = torch.from_numpy(normal(seed, iteration, SPLIT_POSITION, index).astype(np.float32))  # (2s, 3)
+    both = torch.cat((rows, rows))
+    local = unit * torch.exp(gaussians.log_scales[both])
+    return rotate(gaussians.quats[both], local)
+
+
+def rotate(quats: Float[Tensor, "k 4"], vectors: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
+    """Turn each vector by its quaternion, which need not be a unit one."""
+    w, axis = quats[:, :1], quats[:, 1:]  # q v q⁻¹ = v + 2 u×(u×v + w v) for |q| = 1
+    norm = quats.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    w, axis = w / norm, axis / norm
+    return vectors + 2.0 * torch.cross(axis, torch.cross(axis, vectors, dim=1) + w * vectors, dim=1)
+
+
+def prune_mask(
+    gaussians: Gaussians,
+    options: TrainConfig,
+    extent: float,
+    iteration: int,
+    radius_px: Float[Tensor, " n"],
+) -> Bool[Tensor, " n"]:
+    """Which Gaussians go: nearly transparent, too large in the world (after the first reset), or broken.
+
+    Args:
+        gaussians: The model.
+        options: Resolved.
+        extent: Of the scene, world units.
+        iteration: Now.
+        radius_px: Largest radius on screen since the last step, pixels; 0 for new ones.
+    """
+    gone = torch.sigmoid(gaussians.opacity_logits) < options.prune_opacity
+    size = gaussians.log_scales.amax(dim=1)
+    after_reset = 0 < int(options.reset_every) < iteration
+    if options.prune_extent > 0.0 and after_reset:
+        gone |= size > math.log(options.prune_extent * extent)
+    if options.prune_screen_px > 0.0 and after_reset:
+        gone |= radius_px > options.prune_screen_px
+    gone |= ~torch.isfinite(gaussians.means).all(dim=1) | ~torch.isfinite(size)
+    if len(gaussians) - int(gone.sum()) < MIN_AFTER_PRUNE:
+        gone[torch.argmax(torch.nan_to_num(gaussians.opacity_logits, nan=-math.inf))] = False
+    return gone
+
+
+def is_density_step(options: TrainConfig, iteration: int) -> bool:
+    """Whether density control acts after this iteration."""
+    within = int(options.densify_from) <= iteration <= int(options.densify_until)
+    return options.densify and within and iteration % int(options.densify_every) == 0
+
+
+def is_opacity_reset(options: TrainConfig, iteration: int) -> bool:
+    """Whether opacities are reset after this iteration: never in the last step of density control or later."""
+    every = int(options.reset_every)
+    return options.densify and every > 0 and iteration % every == 0 and iteration < int(options.densify_until)
+
+
+def reset_opacity(opacity_logits: Float[Tensor, " n"], limit: float) -> None:
+    """Leave no opacity above ``limit``, in place."""
+    opacity_logits.clamp_(max=math.log(limit / (1.0 - limit)))

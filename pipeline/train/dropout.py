@@ -1,0 +1,68 @@
+"""Random dropping of Gaussians: a model from few photos shall not lean on any one Gaussian before a camera.
+
+The idea of Park, Ryu, Kim: "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR 2025.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.draws import DROPOUT, uniform
+from splatpipe.pipeline.train.options import TrainConfig
+
+DROPPED_LOGIT = -30.0  # an opacity of 1e-13: the projection culls it, so it costs nothing and learns nothing
+LARGEST_OPACITY = 0.999  # of the scaled ones, which a logit has to hold; the blending caps alpha at 0.99
+
+
+def share_at(options: TrainConfig, iteration: int) -> float:
+    """The share left out at an iteration (from 1): rises evenly to `dropout` at the schedule's end."""
+    return float(options.dropout) * min(1.0, iteration / options.iterations)
+
+
+def dropped(gaussians: Gaussians, options: TrainConfig, iteration: int) -> Gaussians:
+    """The Gaussians as an iteration renders them; the same object where `dropout` is 0.
+
+    A random share has no opacity, the others have theirs over 1 - share: what a pixel lets through is the same on
+    average over the draws, as long as no scaled opacity exceeds 1.
+
+    Args:
+        gaussians: The model.
+        options: The training's.
+        iteration: From 1; with the seed and a Gaussian's row it names the random number.
+    """
+    share = share_at(options, iteration)
+    if share == 0.0:
+        return gaussians
+    drawn = torch.from_numpy(uniform(options.seed, iteration, DROPOUT, np.arange(len(gaussians))))
+    logits = _Dropped.apply(gaussians.opacity_logits, drawn >= share, share)  # type: ignore[no-untyped-call]
+    return replace(gaussians, opacity_logits=logits)
+
+
+class _Dropped(torch.autograd.Function):
+    """Logits of σ / (1 - share) for those kept.
+
+    Where the cap holds, the gradient is that of the opacity below it: the cap binds in the Gaussian's middle, and its
+    flanks still tell how opaque it should be.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, logits: Float[Tensor, " n"], kept: Bool[Tensor, " n"], share: float) -> Float[Tensor, " n"]:
+        opacity = torch.sigmoid(logits)
+        scaled = (opacity / (1.0 - share)).clamp(max=LARGEST_OPACITY)
+        ctx.save_for_backward(opacity, scaled, kept)
+        ctx.share = share
+        return torch.where(kept, torch.log(scaled) - torch.log1p(-scaled), DROPPED_LOGIT)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Float[Tensor, " n"]) -> tuple[Tensor, None, None]:
+        opacity, scaled, kept = ctx.saved_tensors
+        # d logit(σ') / d logit(σ) with σ' = σ / (1 - share): both logits' slopes are σ (1 - σ).
+        slope = opacity * (1.0 - opacity) / ((1.0 - ctx.share) * scaled * (1.0 - scaled))
+        return torch.where(kept, gradient * slope, 0.0), None, None

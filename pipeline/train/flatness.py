@@ -1,0 +1,98 @@
+"""Early end: where the loss on the training photos is flat, the rest of the schedule is run down quickly.
+
+Epochs are compared, in which every photo counts once, by a straight line through the logarithms of their mean losses
+over the logarithm of the iteration. Such a power law has no unit, and it foretells too much gain rather than too
+little, for a real curve bends towards its floor: on four captures it was 1.5 to 2 times what came. Learning rates that
+have not fallen yet hide a part of the gain, so the end is not abrupt: the schedule's remainder is compressed into a
+short tail. Only losses and iterations have a say, no clock and no held-out photo.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+
+WINDOW_SHARE = 0.25  # of the iterations done: what the line is drawn through
+FEWEST_EPOCHS = 8  # in it, so that their scatter is known
+STANDARD_ERRORS = 2.0  # the line is taken so much steeper: noise does not end a training that still gains
+TAIL_SHARE = 0.1  # of the iterations done: what the rest of the schedule is compressed into
+
+
+def settled_from(options: TrainConfig) -> int:
+    """Iteration after which only the rates change: all Gaussians, all degrees and the photos' full size are there.
+
+    Args:
+        options: Resolved.
+    """
+    density = int(options.densify_until) if options.densify else 0
+    coarse = int(options.coarse_until) if options.coarse_levels else 0
+    return max(density, coarse, options.sh_degree * int(options.sh_every))
+
+
+def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
+    """Share of the loss that training on would take off it, rather too large than too small.
+
+    Args:
+        epochs: Middle iteration and mean loss of each, in order; at least three.
+        last: Iteration until which it would go on.
+
+    Returns:
+        At most 1; below 0 where the loss rises. 1 where a loss is not above 0, so nothing can be said.
+    """
+    losses = np.array([loss for _, loss in epochs])
+    if not (losses > 0.0).all():
+        return 1.0
+    x, y = np.log([middle for middle, _ in epochs]), np.log(losses)
+    x -= x.mean()
+    slope = float((x * y).sum() / (x * x).sum())
+    scatter = float(np.square(y - y.mean() - slope * x).sum()) / (len(x) - 2)
+    slope -= STANDARD_ERRORS * math.sqrt(scatter / float((x * x).sum()))
+    return 1.0 - math.exp(slope * math.log(last / epochs[-1][0]))
+
+
+def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> bool:
+    """Whether `stop_when_flat` ends the training after a tail that begins here.
+
+    Args:
+        epochs: Middle iteration and mean loss of all since ``settled_from``.
+        plan: The training's.
+        iteration: Now, the last one of an epoch.
+    """
+    scheduled = plan.options.iterations
+    recent = [epoch for epoch in epochs if epoch[0] > (1.0 - WINDOW_SHARE) * iteration]
+    recent = list(epochs[-max(FEWEST_EPOCHS, len(recent)) :])
+    if len(recent) < FEWEST_EPOCHS or iteration + _tail(iteration) >= scheduled:
+        return False
+    return expected_gain(recent, scheduled) < plan.options.stop_when_flat
+
+
+def ends_at(plan: Plan, flat_at: int) -> int:
+    """The last iteration.
+
+    Args:
+        plan: The training's.
+        flat_at: Iteration after which the tail began; 0 where it did not.
+    """
+    return min(plan.last_iteration, flat_at + _tail(flat_at)) if flat_at else plan.last_iteration
+
+
+def place_in_schedule(plan: Plan, flat_at: int, iteration: int) -> int:
+    """The iteration of the schedule whose rates an iteration has: in the tail it runs ahead, to the schedule's last.
+
+    Args:
+        plan: The training's.
+        flat_at: As above.
+        iteration: From 1.
+    """
+    if flat_at == 0 or iteration <= flat_at:
+        return iteration
+    return flat_at + (iteration - flat_at) * (plan.options.iterations - flat_at) // _tail(flat_at)
+
+
+def _tail(flat_at: int) -> int:
+    return max(1, round(TAIL_SHARE * flat_at))

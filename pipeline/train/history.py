@@ -1,0 +1,113 @@
+"""What happened in a training, without clocks: the same for every run of a plan."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from splatpipe.pipeline.train.densify import DensityEvent
+
+CURVE_EVERY = 50  # iterations that a point of the curve is the mean of
+
+
+@dataclass
+class History:
+    """The curve of the loss and the events of density control.
+
+    Attributes:
+        curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and width of the photo.
+        density: Steps of density control.
+        resets: Iterations after which opacities were reset.
+        growth_ended: Iteration from which memory allowed no more Gaussians; 0 where it did.
+        skipped_gradients: Gaussians' gradients left out because they were not finite, over all iterations.
+        loss_sum: Of the losses since the last point.
+        loss_count: How many those are.
+        epochs: With `stop_when_flat`, middle iteration and mean loss of those to judge by.
+        epoch_sum: Of the losses in the epoch that runs.
+        epoch_count: How many those are.
+        flat_at: Iteration after which the schedule was run down because the loss was flat; 0 where it was not.
+    """
+
+    curve: list[dict[str, float | int | None]] = field(default_factory=list)
+    density: list[dict[str, int]] = field(default_factory=list)
+    resets: list[int] = field(default_factory=list)
+    growth_ended: int = 0
+    skipped_gradients: int = 0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+    epochs: list[tuple[int, float]] = field(default_factory=list)
+    epoch_sum: float = 0.0
+    epoch_count: int = 0
+    flat_at: int = 0
+
+    def add_loss(self, loss: float) -> None:
+        """Count an iteration's loss; one that is not finite is left out."""
+        if math.isfinite(loss):
+            self.loss_sum += loss
+            self.loss_count += 1
+            self.epoch_sum += loss
+            self.epoch_count += 1
+
+    def add_density(self, event: DensityEvent) -> None:
+        """Note a step of density control."""
+        self.density.append(event.to_json())
+
+    def end_iteration(self, iteration: int, last: bool, facts: Mapping[str, int]) -> None:
+        """Close a point of the curve where one is due.
+
+        Args:
+            iteration: Now.
+            last: Whether the training ends here.
+            facts: What else the point says.
+        """
+        closed = bool(self.curve) and self.curve[-1]["iteration"] == iteration
+        if closed or (iteration % CURVE_EVERY != 0 and not last):
+            return
+        loss = self.loss_sum / self.loss_count if self.loss_count else None
+        self.curve.append({"iteration": iteration, "loss": loss, **facts})
+        self.loss_sum, self.loss_count = 0.0, 0
+
+    def end_epoch(self, middle: int, judged: bool) -> None:
+        """Close an epoch, in which every photo was trained on once.
+
+        Args:
+            middle: Its middle iteration.
+            judged: Whether it is one to judge the end of training by.
+        """
+        if judged and self.epoch_count:
+            self.epochs.append((middle, self.epoch_sum / self.epoch_count))
+        self.epoch_sum, self.epoch_count = 0.0, 0
+
+    def recent_loss(self) -> float | int | None:
+        """Mean loss since the last point of the curve, or that point's."""
+        return self.loss_sum / self.loss_count if self.loss_count else self.last_loss()
+
+    def last_loss(self) -> float | int | None:
+        """The curve's last value."""
+        return self.curve[-1]["loss"] if self.curve else None
+
+    def state(self) -> dict[str, Any]:
+        """All of it as JSON values, for a checkpoint."""
+        return {
+            "curve": self.curve,
+            "density": self.density,
+            "resets": self.resets,
+            "growth_ended": self.growth_ended,
+            "skipped_gradients": self.skipped_gradients,
+            "loss_sum": self.loss_sum,
+            "loss_count": self.loss_count,
+            "epochs": self.epochs,
+            "epoch_sum": self.epoch_sum,
+            "epoch_count": self.epoch_count,
+            "flat_at": self.flat_at,
+        }
+
+    def to_json(self) -> str:
+        """The text of `history.json`."""
+        kept = {name: value for name, value in self.state().items() if not name.startswith(("loss_", "epoch"))}
+        if not self.flat_at:
+            del kept["flat_at"]
+        return json.dumps(kept, indent=1, allow_nan=False) + "\n"

@@ -1,0 +1,180 @@
+"""What this machine needs for this scene: real iterations on throw-away states, and a held-out view's evaluation."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.images import reduced_view
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.smoothing import sampling_of
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
+
+MOST_VIEWS = 8  # a size is timed on: their mean is within a few percent of all photos'
+PICTURES = 3  # that evaluate keeps of a view: photo, render, error
+NEVER = 1_000_000_000  # iterations until a step of density control
+WARM_UP_ITERATIONS = 100  # until opacities, which step by a twentieth of a logit, are spread as in training
+WARM_UP_SHARE = 0.5  # of the time for measuring at most
+PILOT_ITERATION = 10  # the state claims to be so far, so that all SH degrees take part
+SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a surface shared out (0.5)
+STREAM = 7  # of the jitter's random numbers; the pilot is thrown away, so nothing depends on them
+
+Step = Callable[[TrainState, Plan, TrainingPhoto], None]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """This machine on this scene.
+
+    Attributes:
+        speed: Of an iteration.
+        decode_s: Reading a photo of the dataset and reducing it.
+        evaluate_s: Rendering, measuring and keeping a held-out view, a megapixel.
+    """
+
+    speed: Speed
+    decode_s: float
+    evaluate_s: float
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What may be spent on measuring, and what for.
+
+    Attributes:
+        most_s: No round is begun after so many seconds; one is done always.
+        iteration_s: What an iteration of the plan may take, about: photos that take it are the ones to be timed.
+    """
+
+    most_s: float
+    iteration_s: float
+
+
+def measure(
+    plan: Plan, start: Gaussians, views: Sequence[View], step: Step, effort: Effort, sky: SkyModel | None = None
+) -> Measured:
+    """Time real iterations at two sizes and two numbers of Gaussians.
+
+    Args:
+        plan: Without a budget; its cap is the larger number of Gaussians.
+        start: The initial Gaussians.
+        views: To train on.
+        step: An iteration of training.
+        effort: Its limit.
+        sky: As training begins with; a copy is trained.
+    """
+    began = time.monotonic()
+    chosen = [views[index * len(views) // min(len(views), MOST_VIEWS)] for index in range(min(len(views), MOST_VIEWS))]
+    trial = replace(plan, options=pilot_options(plan))
+    small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
+    counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
+    models = [stretched(start, count, plan.options.seed) for count in counts]
+    states = [_pilot_state(model, trial, views, copy.deepcopy(sky)) for model in models]
+    _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
+    first = _timed(states[0], trial, small[0], step)
+    # Cost grows a little slower than size, so the line through two sizes is right near them only.
+    megapixels = SMALLEST_MEGAPIXELS * max(2.0, effort.iteration_s / first.seconds)
+    large, decode_s = _photos(chosen, megapixels)
+    _evaluation_seconds(states[-1].finished(), small[0], plan)  # pays for what is loaded once
+    evaluate_s = _evaluation_seconds(states[-1].finished(), large[0], plan)
+    timings = [first]
+    for photos in zip(small, large, strict=True):
+        for state in states:
+            timings += [_timed(state, trial, photo, step) for photo in photos]
+        if time.monotonic() - began > effort.most_s:
+            break
+    return Measured(fit_speed(timings), decode_s, evaluate_s)
+
+
+def pilot_options(plan: Plan) -> TrainConfig:
+    """Those of the plan without steps of density control, all SH degrees taking part."""
+    lengths = {"densify_every": NEVER, "densify_from": 1, "densify_until": NEVER, "reset_every": 0, "sh_every": 1}
+    return plan.options.model_copy(update=lengths)
+
+
+def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
+    """The Gaussians thinned or multiplied to a number, their area on the photos about the same.
+
+    Args:
+        start: Of the scene.
+        count: How many are wanted.
+        seed: Of the jitter within each parent.
+    """
+    rows = torch.arange(count) * len(start) // count
+    model = start.select(rows)
+    if count > len(start):
+        generator = torch.Generator().manual_seed(seed + STREAM)
+        sizes = torch.exp(model.log_scales)
+        model.means = model.means + sizes * torch.randn(count, 3, generator=generator)
+        model.log_scales = model.log_scales - SPLIT_SHRINK * math.log(count / len(start))
+    return model
+
+
+def _pilot_state(start: Gaussians, trial: Plan, views: Sequence[View], sky: SkyModel | None) -> TrainState:
+    state = TrainState.begin(start, trial, sky)
+    state.iteration, state.sampling = PILOT_ITERATION, sampling_of(trial, views)
+    return state
+
+
+def _warm_up(
+    states: Sequence[TrainState], trial: Plan, photos: Sequence[TrainingPhoto], step: Step, until: float
+) -> None:
+    """Train each state a little: opacities and sizes that have left their start cost more than those there."""
+    for number in range(WARM_UP_ITERATIONS):
+        for state in states:
+            step(state, trial, photos[number % len(photos)])
+        if time.monotonic() > until:
+            break
+
+
+def _photos(views: Sequence[View], megapixels: float) -> tuple[list[TrainingPhoto], float]:
+    """The views as training sees them, and the seconds that one took."""
+    began = time.monotonic()
+    photos = []
+    for view in views:
+        camera, pixels, mask = reduced_view(view, megapixels)
+        colour = torch.from_numpy(pixels.astype(np.float32) * np.float32(1.0 / 255.0))
+        counts = None if mask is None else torch.from_numpy(mask)
+        photos.append(TrainingPhoto(camera, colour, counts))
+    return photos, (time.monotonic() - began) / len(photos)
+
+
+def _timed(state: TrainState, trial: Plan, photo: TrainingPhoto, step: Step) -> Timing:
+    began = time.monotonic()
+    step(state, trial, photo)
+    seconds = time.monotonic() - began
+    return Timing(len(state.gaussians), photo.camera.width * photo.camera.height, max(seconds, 1e-6))
+
+
+def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Plan) -> float:
+    """What a held-out view takes a megapixel: a render, every measure, the pictures as PNG."""
+    began = time.monotonic()
+    with torch.no_grad():
+        options = rasterizer.RenderOptions(
+            gaussians.sh_degree, antialias=plan.options.antialias, near=plan.near, depth=False
+        )
+        colour = rasterizer.render(gaussians, photo.camera, options).colour.clamp(0.0, 1.0)
+    for function in metrics.METRICS.values():
+        try:
+            function(colour, photo.colour, photo.mask)
+        except ValueError:
+            continue  # too few pixels for this measure: evaluate leaves it out, too
+    pixels = (photo.colour * 255.0).to(torch.uint8).numpy()
+    for _ in range(PICTURES):
+        cv2.imencode(".png", pixels)
+    return (time.monotonic() - began) / (1e-6 * photo.camera.width * photo.camera.height)

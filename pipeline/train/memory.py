@@ -1,0 +1,107 @@
+"""How many Gaussians fit into a memory limit, and whether the process keeps to it.
+
+| of a Gaussian with SH of degree 3 (59 numbers, float32) | bytes |
+|---|---|
+| parameters | 236 |
+| their gradients | 236 |
+| Adam's two moments | 472 |
+| statistics of density control | 12 |
+| **state of training** | **956** |
+| while density control copies parameters and moments, and the model is written | 860 |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+from dataclasses import replace
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.splat.sh import coefficient_count
+from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+
+FLOAT_BYTES = 4
+SHAPE_NUMBERS = 11  # of a Gaussian besides its colour: position, scales, rotation, opacity
+STATE_COPIES = 4  # a parameter has a gradient and two moments
+STATISTICS_BYTES = 12
+PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
+PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
+FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
+RESIDENT_STEP = 16_000_000  # what the process has is rounded up to it: a few pages more or less change no plan
+GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
+
+
+def bytes_per_gaussian(options: TrainConfig) -> int:
+    """Most that a Gaussian takes at any time of a training."""
+    numbers = SHAPE_NUMBERS + 3 * coefficient_count(options.sh_degree)
+    state = STATE_COPIES * FLOAT_BYTES * numbers + STATISTICS_BYTES
+    return int(state * (1.0 + PEAK_SHARE))
+
+
+def within_memory(plan: Plan, largest_pixels: int, report: Reporter) -> Plan:
+    """The plan with a cap on Gaussians that keeps the process within ``max_memory_bytes``.
+
+    Args:
+        plan: Without it.
+        largest_pixels: Of a training photo.
+        report: Is told where the initial Gaussians have to be thinned.
+
+    Raises:
+        MachineError: if not even the fewest fit beside what the process has already.
+    """
+    return_free_heap()
+    limit, taken = plan.options.max_memory_bytes, -(-resident_bytes() // RESIDENT_STEP) * RESIDENT_STEP
+    room = limit - taken - FIXED_BYTES - PIXEL_BYTES * largest_pixels
+    most = room // bytes_per_gaussian(plan.options)
+    if most < min(FEWEST_GAUSSIANS, plan.initial_gaussians):
+        least = limit - room + FEWEST_GAUSSIANS * bytes_per_gaussian(plan.options)
+        raise MachineError(
+            f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB of them already, "
+            f"and photos of {largest_pixels / 1e6:.1f} megapixels need room, too.",
+            hint=f"Give --max-memory at least {least / 1e6 + 1:.0f}M, or lower undistort.max_megapixels.",
+        )
+    if most < plan.initial_gaussians:
+        report.warning(
+            f"{limit / 1e9:.2f} GB hold {most:,} Gaussians, fewer than the {plan.initial_gaussians:,} sparse points: "
+            "every part of the scene is thinned evenly.",
+            hint="Give more with --max-memory for a finer model.",
+        )
+    cap = min(plan.options.max_gaussians, int(most))
+    return replace(plan, options=plan.options.model_copy(update={"max_gaussians": cap}))
+
+
+def over_memory(options: TrainConfig) -> bool:
+    """Whether the process is about to pass its limit: asked after every step of density control.
+
+    The plan's cap should never let it come to that. Where it does, growth ends for the rest of the training and its
+    checkpoints: besides the deadline the one thing that a machine may change in a planned training, and it is told.
+    """
+    limit = options.max_memory_bytes
+    if limit == 0 or resident_bytes() <= GROWTH_STOPS_AT * limit:
+        return False
+    return_free_heap()
+    return resident_bytes() > GROWTH_STOPS_AT * limit
+
+
+def without_growth(options: TrainConfig) -> TrainConfig:
+    """The options without density control: no Gaussian comes, none goes, no opacity is reset."""
+    return options.model_copy(update={"densify": False})
+
+
+def return_free_heap() -> None:
+    """Give back what the stages before have freed: glibc keeps it for the process."""
+    with contextlib.suppress(OSError, AttributeError):  # another libc
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def resident_bytes() -> int:
+    """Memory of this process now, bytes; 0 where the system does not say."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) * 1024
+    except (OSError, StopIteration, ValueError):
+        return 0

@@ -1,0 +1,122 @@
+"""Decoded photos in a file without a name, read through windows that are mapped only while they are read."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.images import Mask, Pixels
+
+SHARE_OF_FREE = 0.5  # of the disk's free space at most: checkpoints and the model need room too
+
+
+@dataclass(frozen=True)
+class _Slot:
+    offset: int
+    camera: Camera
+    has_mask: bool
+
+
+def stored_bytes(camera: Camera, has_mask: bool) -> int:
+    """What a photo takes in the file: three bytes a pixel, one more with a mask, to a whole number of pages."""
+    used = camera.width * camera.height * (4 if has_mask else 3)
+    return -(-used // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+
+
+class PhotoCache:
+    """Photos of 8 bits, each stored once and read any number of times.
+
+    The file has no name, so the system frees it when it is closed or its process dies, however that dies; another run
+    never sees it. What is read is mapped for that read alone: mapped pages count as the process's memory.
+
+    Args:
+        folder: On whose disk the file lies.
+
+    Attributes:
+        room_bytes: How large the file may grow, from the disk's free space when it was made.
+
+    Raises:
+        MachineError: if the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._slots: dict[tuple[int, int], _Slot] = {}
+        self._end = 0
+        with self._explained():
+            self.room_bytes = int(SHARE_OF_FREE * shutil.disk_usage(folder).free)
+            self._file = tempfile.TemporaryFile(dir=folder, prefix="photos-", buffering=0)  # noqa: SIM115
+
+    def close(self) -> None:
+        """Give the disk's space back. What was read stays valid."""
+        self._file.close()
+
+    def put(self, key: tuple[int, int], camera: Camera, colour: Pixels, mask: Mask | None) -> None:
+        """Store a photo if it fits in ``room_bytes``; otherwise nothing happens.
+
+        Args:
+            key: To ask for it by.
+            camera: Of the photo's size.
+            colour: (h, w, 3), contiguous.
+            mask: (h, w), contiguous.
+
+        Raises:
+            MachineError: if the disk is full nevertheless, or fails.
+        """
+        slot = _Slot(self._end, camera, mask is not None)
+        end = slot.offset + stored_bytes(camera, slot.has_mask)
+        if end > self.room_bytes:
+            return
+        with self._explained():
+            self._write(colour, slot.offset)
+            if mask is not None:
+                self._write(mask, slot.offset + colour.nbytes)
+        self._slots[key] = slot
+        self._end = end
+
+    def get(self, key: tuple[int, int]) -> tuple[Camera, Pixels, Mask | None] | None:
+        """A stored photo, or None where there is none of that key.
+
+        The arrays are the file itself, not to be written to; with the last of them goes the mapping.
+
+        Raises:
+            MachineError: if the file cannot be mapped.
+        """
+        slot = self._slots.get(key)
+        if slot is None:
+            return None
+        height, width = slot.camera.height, slot.camera.width
+        pixels = width * height
+        length = pixels * (4 if slot.has_mask else 3)
+        with self._explained():
+            window = mmap.mmap(self._file.fileno(), length, mmap.MAP_SHARED, mmap.PROT_READ, offset=slot.offset)
+        colour = np.frombuffer(window, np.uint8, 3 * pixels).reshape(height, width, 3)
+        if not slot.has_mask:
+            return slot.camera, colour, None
+        return slot.camera, colour, np.frombuffer(window, np.bool_, pixels, 3 * pixels).reshape(height, width)
+
+    def _write(self, data: Pixels | Mask, offset: int) -> None:
+        rest = data.data.cast("B")
+        while rest:
+            written = os.pwrite(self._file.fileno(), rest, offset)
+            rest, offset = rest[written:], offset + written
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise MachineError(
+                f"The decoded photos cannot be kept in {self._folder}: {error.strerror}.",
+                hint="Make room or check the permissions, then run again: it goes on from here.",
+            ) from error

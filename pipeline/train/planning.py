@@ -1,0 +1,136 @@
+"""The plan of a training under budgets of time and memory, made once, before its first iteration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from splatpipe.pipeline.engine.stage import Machine, Reporter
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.budget import (
+    FEWEST_GAUSSIANS,
+    FIRST_GROWTH,
+    FIRST_ITERATIONS,
+    Task,
+    choose,
+    worthwhile_iterations,
+)
+from splatpipe.pipeline.train.measure import Effort, Measured, Step, measure
+from splatpipe.pipeline.train.memory import within_memory
+from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
+from splatpipe.pipeline.train.plan import Plan, mean_megapixels, resolve_schedule
+from splatpipe.pipeline.train.sky import SkyModel
+
+MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
+MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
+PILOT_GROWTH_A_SECOND = 150.0  # Gaussians that a second of budget pays for, about: where the forecast has to be right
+LEAST_SHARE = 0.1  # of the budget for the training, even where nothing is left: the tolerance of the whole
+FILM_VIEWS = 40  # held-out views that take as long to measure as a film of ten seconds takes to make
+EXPORT_SECONDS = 5.5  # the last stages whatever the size: digests, the report with its pictures, the end of the process
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is trained.
+
+    Attributes:
+        config: The options, not resolved.
+        start: The initial Gaussians.
+        trained_on: Views to train on.
+        held_out: How many others evaluate measures.
+        machine: Threads, and when the command began.
+        sky: As training begins with; None without one.
+    """
+
+    config: TrainConfig
+    start: Gaussians
+    trained_on: Sequence[View]
+    held_out: int
+    machine: Machine
+    sky: SkyModel | None = None
+
+
+def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
+    """Fit a plan to the budgets of its options; the same plan where there are none.
+
+    Args:
+        plan: With resolved schedules.
+        scene: What is trained.
+        step: An iteration of training, to be measured.
+        report: Takes warnings.
+
+    Raises:
+        MachineError: if the memory is too small for any training.
+    """
+    if plan.options.max_memory_bytes:
+        largest = max(view.camera.width * view.camera.height for view in scene.trained_on)
+        plan = within_memory(plan, largest, report)
+    if plan.options.time_budget_s:
+        plan = within_time(plan, scene, step, report)
+    return plan
+
+
+def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
+    """The plan that fills what is left of the time budget when the last stages have their share."""
+    budget, began = plan.options.time_budget_s, time.monotonic()
+    if 0.0 < scene.machine.began_s < began:
+        began = scene.machine.began_s
+    before = time.monotonic() - began
+    effort = Effort(
+        min(MEASURE_SECONDS, MEASURE_SHARE * budget),
+        max(LEAST_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
+    )
+    measured = measure(pilot(plan, scene.config), scene.start, scene.trained_on, step, effort, scene.sky)
+    left = budget - (time.monotonic() - began)
+    choice = choose(_task(plan, scene, measured, left))
+    if choice.seconds <= LEAST_SHARE * budget:
+        report.warning(
+            f"The stages before training took {before:.0f} s of the {budget:.0f} s, so there is time for a look only.",
+            hint="Run again with the same or a longer --time-budget: what is done is reused.",
+        )
+    cameras = [view.camera for view in scene.trained_on]
+    return replace(
+        plan,
+        options=choice.options,
+        last_iteration=choice.last_iteration,
+        megapixels=choice.megapixels,
+        train_megapixels=mean_megapixels(cameras, choice.megapixels),
+        train_seconds=max(0.01, round(choice.seconds, 2)),
+        forecast_seconds=round(choice.forecast_s, 2),
+    )
+
+
+def pilot(plan: Plan, config: TrainConfig) -> Plan:
+    """The plan of a short training with a cap near which the budget's may lie, to be measured at.
+
+    Args:
+        plan: Without a budget.
+        config: The options, not resolved.
+    """
+    wanted = max(FIRST_GROWTH * plan.initial_gaussians, PILOT_GROWTH_A_SECOND * config.time_budget_s, FEWEST_GAUSSIANS)
+    short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
+    return replace(plan, options=resolve_schedule(config.model_copy(update=short), len(plan.train_views)))
+
+
+def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
+    cameras = [view.camera for view in scene.trained_on]
+    options = scene.config.model_copy(update={"max_gaussians": plan.options.max_gaussians})
+    least = LEAST_SHARE * options.time_budget_s
+
+    views = scene.held_out + (FILM_VIEWS if options.time_budget_s >= FILM_FROM_BUDGET_S else 0)
+
+    def seconds(megapixels: float) -> float:
+        after = EXPORT_SECONDS + views * measured.evaluate_s * megapixels
+        return max(least, left - after)
+
+    return Task(
+        config=options,
+        initial=plan.initial_gaussians,
+        photos=len(cameras),
+        megapixels=mean_megapixels(cameras),
+        speed=measured.speed,
+        prepare_s=measured.decode_s * len(cameras),
+        seconds=seconds,
+    )

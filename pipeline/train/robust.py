@@ -1,0 +1,242 @@
+"""Moving things: leave out of the loss what a photo shows and the other photos contradict.
+
+Trimming a photometric loss by the residual's quantile, with votes in a neighbourhood, is the idea of Sabour et al.,
+"RobustNeRF: Ignoring Distractors with Robust Losses" (CVPR 2023); residuals remembered by photo, and a trimmed share
+that grows in training, are of Sabour et al., "SpotLessSplats: Ignoring Distractors in 3D Gaussian Splatting" (2024).
+Neither learned features nor weights are used here. What fine detail and unlearned places look like is told apart from
+motion by three tests of our own:
+
+- residuals are compared between cells, not pixels, less the photo's median (exposure), and a difference that a cell
+  beside would explain does not count: edges and texture a little off are no car; nor does a hole in the model;
+- a cell's residual is a mean over the visits to its photo;
+- the other photos that see a cell's surface, as the model has it, have to agree with the model there: where they do not
+  either, the place is hard or not learnt yet, and nobody has contradicted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.rasterizer import Render
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.stream import TrainingPhoto
+
+GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them
+LEAST_CELL_PX = 4  # smaller photos have fewer: a cell has to average out detail
+MEMORY = 0.5  # of a cell's residual, that the visits before keep
+NEARBY = 1  # cells: what the model shows so near may be what the photo shows here
+LEAST_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: less than this is shading, not another thing
+VOTES = 4  # of a cell and its eight neighbours: two by two are a thing, one alone is noise
+RIM = 0.5  # of the threshold: what lies beside a left-out cell and is above that goes, too
+MOST_OF_A_PHOTO = 0.25  # may be left out: more than that is no passer-by but a model that is wrong
+MOST_WITNESSES = 24  # nearest photos that are asked about a place
+LEAST_ALPHA = 0.8  # of a pixel that is judged: below it the model has a hole, not another opinion
+SURFACE_ALPHA = 0.5  # of a cell with a depth
+UNKNOWN = -1.0  # residual of a cell that no visit has shown
+
+
+def share_at(options: TrainConfig, iteration: int) -> float:
+    """The share left out at an iteration: from `densify_from` on it rises, to `robust` at twice that.
+
+    Args:
+        options: Resolved.
+        iteration: From 1.
+    """
+    begin = int(options.densify_from)
+    return options.robust * min(1.0, max(0.0, iteration / begin - 1.0))
+
+
+class Robust:
+    """What is known of every photo's residuals, and what follows for its pixels.
+
+    Args:
+        names: Of the photos trained on.
+
+    Attributes:
+        scores: (n, GRID, GRID) residual of each cell, ``UNKNOWN`` where there is none.
+        threshold: (1,) above which a cell stands out among all photos' cells; infinite before the first epoch's end.
+        left_out: (n,) share of each photo that its last visit left out.
+        cameras: Of the photos in the order of ``scores``; not in the checkpoint.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._row = {name: row for row, name in enumerate(sorted(names))}
+        self.scores = torch.full((len(names), GRID, GRID), UNKNOWN)
+        self.threshold = torch.full((1,), torch.inf)
+        self.left_out = torch.zeros(len(names))
+        self.cameras: list[Camera] = []
+
+    def watch(self, cameras: Iterable[Camera]) -> None:
+        """Say where the photos were taken, of any size; without it nothing is contradicted, so nothing left out."""
+        self.cameras = sorted(cameras, key=lambda camera: self._row[camera.name])
+
+    def look(self, photo: TrainingPhoto, rendered: Render, shown: Float[Tensor, "h w 3"]) -> TrainingPhoto:
+        """Remember a photo's residuals; the photo without what the others contradict, or itself.
+
+        Args:
+            photo: As it is.
+            rendered: Its view, with depths.
+            shown: The render as it is compared with the photo.
+        """
+        with torch.no_grad():
+            row = self._row[photo.camera.name]
+            opaque = rendered.alpha >= LEAST_ALPHA
+            counts = opaque if photo.mask is None else photo.mask & opaque
+            before, now = self.scores[row], cell_residuals(shown, photo.colour, counts)
+            mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
+            faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: nothing held against it
+            self.scores[row] = torch.where(now < 0.0, faded, mixed)
+            cells = self._left_out_cells(row, photo.camera, rendered)
+            size = shown.shape[:2]
+            out = functional.interpolate(cells[None, None].float(), size=size, mode="nearest")[0, 0] > 0.0
+            self.left_out[row] = out.float().mean()
+        if not bool(out.any()):
+            return photo
+        return replace(photo, mask=~out if photo.mask is None else photo.mask & ~out)
+
+    def _left_out_cells(self, row: int, camera: Camera, rendered: Render) -> Bool[Tensor, "g g"]:
+        scores, threshold = self.scores[row], float(self.threshold)
+        none = torch.zeros_like(scores, dtype=torch.bool)
+        most = float(torch.quantile(scores, 1.0 - MOST_OF_A_PHOTO))
+        high, low = max(threshold, most), max(RIM * threshold, most)
+        if not bool((scores > high).any()):
+            return none
+        core = _voted(scores > high)
+        core &= self._contradicted(row, core, camera, rendered)
+        return (_near(core) & (scores > low)) | core
+
+    def _contradicted(
+        self, row: int, cells: Bool[Tensor, "g g"], camera: Camera, rendered: Render
+    ) -> Bool[Tensor, "g g"]:
+        """Of some cells, those where more of the other photos that see the place agree with the model than not."""
+        result = torch.zeros_like(cells)
+        alpha, depth_sum = _pooled(torch.stack((rendered.alpha, rendered.depth_sum)), (GRID, GRID)).double()
+        asked = cells & (alpha >= SURFACE_ALPHA)
+        v, u = (index.numpy() for index in torch.nonzero(asked, as_tuple=True))
+        if len(u) == 0 or not self.cameras:
+            return result
+        z = (depth_sum[asked] / alpha[asked]).numpy()
+        places = _unproject(camera, (u + 0.5) / GRID, (v + 0.5) / GRID, z)
+        agree, seen = np.zeros(len(u), np.int64), np.zeros(len(u), np.int64)
+        limit = float(self.threshold)
+        for other in self._witnesses(row):
+            score = _looked_up(self.scores[other].numpy(), self.cameras[other], places)
+            seen += score >= 0.0
+            agree += (score >= 0.0) & (score <= limit)
+        result[asked] = torch.from_numpy(2 * agree > seen)
+        return result
+
+    def _witnesses(self, row: int) -> list[int]:
+        """The photos nearest to one, itself left out."""
+        centres = np.array([camera.centre() for camera in self.cameras])
+        order = np.argsort(np.linalg.norm(centres - centres[row], axis=1), kind="stable")
+        return [int(other) for other in order if other != row][:MOST_WITNESSES]
+
+    def end_epoch(self, share: float) -> None:
+        """Take the threshold from all photos' cells.
+
+        Args:
+            share: Of the cells that stand out at most.
+        """
+        known = self.scores[self.scores >= 0.0].numpy()
+        if share <= 0.0 or len(known) == 0:
+            self.threshold.fill_(torch.inf)
+            return
+        place = min(len(known) - 1, int((1.0 - share) * len(known)))
+        self.threshold.fill_(max(LEAST_RESIDUAL, float(np.partition(known, place)[place])))
+
+    def share_left_out(self) -> float:
+        """Mean over the photos of what their last visits left out."""
+        return float(self.left_out.mean())
+
+    def to_arrays(self) -> dict[str, Tensor]:
+        """All that changes, by name, for a checkpoint; not copied."""
+        return {"scores": self.scores, "threshold": self.threshold, "left_out": self.left_out}
+
+    def load(self, arrays: Mapping[str, Tensor]) -> None:
+        """The inverse of ``to_arrays``.
+
+        Raises:
+            KeyError, ValueError: if something is missing or has another shape.
+        """
+        for name, tensor in self.to_arrays().items():
+            if arrays[name].shape != tensor.shape:
+                raise ValueError(f"{name} is {tuple(arrays[name].shape)}, not {tuple(tensor.shape)}")
+            tensor.copy_(arrays[name])
+
+
+def cell_residuals(
+    shown: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"]
+) -> Float[Tensor, "g g"]:
+    """How far each cell's mean colour is from the nearest of the model's there and nearby, averaged over the channels.
+
+    Args:
+        shown: The model's picture.
+        colour: The photo's.
+        counts: The pixels to compare.
+
+    Returns:
+        ``UNKNOWN`` where less than half of a cell counts.
+    """
+    height, width = counts.shape
+    size = (min(GRID, max(1, height // LEAST_CELL_PX)), min(GRID, max(1, width // LEAST_CELL_PX)))
+    weight = _pooled(counts[None].float(), size)
+    known = weight[0] >= 0.5
+    if not bool(known.any()):
+        return torch.full((GRID, GRID), UNKNOWN)
+    model, picture = (
+        _pooled(picture.permute(2, 0, 1) * counts, size) / weight.clamp(min=1e-6) for picture in (shown, colour)
+    )
+    model = model - (model - picture)[:, known].median(dim=1).values[:, None, None]
+    usable = _nearby(known[None].float())[0] > 0.0
+    apart = torch.where(usable, (_nearby(model) - picture[:, None]).abs().mean(dim=0), torch.inf)
+    residual = torch.where(known, apart.amin(dim=0), UNKNOWN)
+    return functional.interpolate(residual[None, None], size=(GRID, GRID), mode="nearest")[0, 0]
+
+
+def _nearby(planes: Float[Tensor, "c gh gw"]) -> Float[Tensor, "c k gh gw"]:
+    """What lies up to ``NEARBY`` cells from each; zeros beyond the rim."""
+    side = 2 * NEARBY + 1
+    return functional.unfold(planes[None], side, padding=NEARBY).view(len(planes), side * side, *planes.shape[1:])
+
+
+def _pooled(planes: Float[Tensor, "c h w"], size: tuple[int, int]) -> Float[Tensor, "c gh gw"]:
+    return functional.adaptive_avg_pool2d(planes[None], size)[0]
+
+
+def _voted(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
+    """Those with enough of their neighbourhood."""
+    votes = 9.0 * functional.avg_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0]
+    return cells & (votes > VOTES - 0.5)
+
+
+def _near(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
+    return functional.max_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0.0
+
+
+def _unproject(camera: Camera, across: np.ndarray, down: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """World points (n, 3) at shares of a photo's width and height, and depths along its axis."""
+    x = (across * camera.width - camera.cx) / camera.fx * z
+    y = (down * camera.height - camera.cy) / camera.fy * z
+    pose = camera.cam_from_world
+    return np.asarray((np.stack((x, y, z), axis=1) - pose[:3, 3]) @ pose[:3, :3])
+
+
+def _looked_up(scores: np.ndarray, camera: Camera, places: np.ndarray) -> np.ndarray:
+    """A photo's residuals at world points, ``UNKNOWN`` at those that it does not show."""
+    in_camera = places @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    ahead = in_camera[:, 2] > 0.0
+    z = np.where(ahead, in_camera[:, 2], 1.0)
+    across = (in_camera[:, 0] / z * camera.fx + camera.cx) / camera.width
+    down = (in_camera[:, 1] / z * camera.fy + camera.cy) / camera.height
+    inside = ahead & (across >= 0.0) & (across < 1.0) & (down >= 0.0) & (down < 1.0)
+    u, v = np.where(inside, across, 0.0) * GRID, np.where(inside, down, 0.0) * GRID
+    return np.where(inside, scores[v.astype(np.int64), u.astype(np.int64)], UNKNOWN)

@@ -1,0 +1,211 @@
+"""The sky in training: a panorama of its own behind the Gaussians, and no Gaussians where photos show it.
+
+A colour by direction alone behind the scene, and a loss on the opacity of rays into the sky, are those of Rematas et
+al., "Urban Radiance Fields", CVPR 2022; beside Gaussians, as an explicit map of directions, of Yan et al., "Street
+Gaussians", ECCV 2024. Here the sky is found without a network (``pipeline.scene.sky``), the map has cells of some
+degrees and starts at what the photos show, and only pixels known to be sky train it: a wall that the Gaussians do not
+cover yet is not painted into the sky. Away from the sky a random colour takes its place: no wall can borrow the sky's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64, Shaped
+from torch import Tensor
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View, load_points
+from splatpipe.pipeline.photos.images import reduced_sky, reduced_view
+from splatpipe.pipeline.raster.rasterizer import Render
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over
+from splatpipe.pipeline.splat.sky import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
+from splatpipe.pipeline.train.side import SideModel
+
+LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
+MOST_ERROR_PX = 2.0
+SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
+RIM_PX = 3  # around the sky, of ``WORK_MEGAPIXELS``: what the search may have left of it, and thin things before it
+SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills what no photo shows
+FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # of the colours, a step, from the start to the end of the schedule
+EPSILON = 1e-8  # Adam's: cells that hardly any pixel pulls at stay where they are
+FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: what is unseen above the horizon is smooth by then
+LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour is the mean of
+
+RGB = tuple[float, float, float]
+
+_COLOURS = "colours"
+
+
+@dataclass(frozen=True)
+class SeenSky:
+    """A photo's sky.
+
+    Attributes:
+        mask: Where it surely is.
+        around: The same and its surroundings.
+    """
+
+    mask: Bool[Tensor, "h w"]
+    around: Bool[Tensor, "h w"]
+
+
+class SkyModel(SideModel):
+    """The panorama that is trained, and the sky's masks.
+
+    Attributes:
+        panorama: Its colours are a leaf of autograd.
+    """
+
+    def __init__(
+        self, up: Float64[np.ndarray, " 3"], colours: Float32[np.ndarray, "cells 3"], masks: Mapping[str, SkyMask]
+    ) -> None:
+        """Begin with some colours.
+
+        Args:
+            up: Against gravity.
+            colours: Of the panorama's cells.
+            masks: By the photos' names; those without sky may be left out.
+        """
+        super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
+        self.panorama = Panorama(up, self.tensors[_COLOURS])
+        self._masks = {name: mask for name, mask in masks.items() if mask.any()}
+
+    @property
+    def photos(self) -> int:
+        """In how many photos there is sky."""
+        return len(self._masks)
+
+    @staticmethod
+    def begin(views: Sequence[View], dataset: Path, threads: int) -> SkyModel | None:
+        """Find the sky in photos and start with the colours that it has there; None where none of them shows any.
+
+        Args:
+            views: To be trained on.
+            dataset: That they are of, for its sparse points.
+            threads: That read photos.
+
+        Raises:
+            StageError: if a photo is missing or broken.
+        """
+        points = load_points(dataset)
+        believed = points.xyz[(points.track_lengths >= LEAST_TRACK) & (points.errors_px <= MOST_ERROR_PX)]
+        cameras = [view.camera for view in views]
+
+        def photo(index: int) -> SkyPhoto:
+            camera, pixels, mask = reduced_view(views[index], WORK_MEGAPIXELS)
+            drawn = reduced_sky(views[index], WORK_MEGAPIXELS)
+            return SkyPhoto(camera, pixels, None if mask is None else ~mask, drawn)
+
+        up = up_of(cameras, photo, believed, threads)
+        masks = find_skies(cameras, photo, believed, up, threads)
+        shown = [index for index, mask in enumerate(masks) if mask.any()]
+        if not shown:
+            return None
+        colours = first_colours(((photo(index), masks[index].unpacked()) for index in shown), up)
+        return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
+
+    def composite(
+        self, rendered: Render, camera: Camera, seen: SeenSky | None, background: RGB, elsewhere: RGB
+    ) -> Float[Tensor, "h w 3"]:
+        """The render as the photo shows it: before the sky where that may be seen, before ``elsewhere`` where not.
+
+        With the sky behind a wall, too, whatever of the wall is as bright as the sky would be left transparent.
+
+        Args:
+            rendered: Over ``background``.
+            camera: A training photo's.
+            seen: Its sky, from ``seen``.
+            background: Stays behind everything below the horizon.
+            elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
+        """
+        behind = self.panorama.behind(camera, background)
+        if seen is None:
+            return laid_over(rendered.colour, rendered.alpha, background, behind.detach())
+        flat = Panorama(self.panorama.up, behind.new_tensor(elsewhere).expand_as(self.panorama.colours))
+        behind = torch.where(seen.mask[:, :, None], behind, behind.detach())
+        behind = torch.where(seen.around[:, :, None], behind, flat.behind(camera, background))
+        return laid_over(rendered.colour, rendered.alpha, background, behind)
+
+    def penalty(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None, opacity_weight: float) -> Float[Tensor, ""]:
+        """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness."""
+        loss = SMOOTHNESS * roughness(self.panorama.colours)
+        return loss if seen is None else loss + opacity_weight * torch.where(seen.mask, alpha, 0.0).mean()
+
+    def seen(self, camera: Camera) -> SeenSky | None:
+        """The sky of a training photo at the size of ``camera``; None where it shows none."""
+        found = self._masks.get(camera.name)
+        if found is None:
+            return None
+        share = found.unpacked().astype(np.float32)
+        wider = np.asarray(cv2.dilate(share, np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)))
+        return SeenSky(_surely(share, camera), _surely(wider, camera))
+
+    def step(self, share: float) -> None:
+        """Step the colours against their gradient, which is dropped.
+
+        Args:
+            share: Of the schedule that is done, 0..1.
+        """
+        rate = math.exp(math.log(FIRST_RATE) * (1.0 - share) + math.log(LAST_RATE) * share)
+        self.descend({_COLOURS: rate})
+        self.panorama.colours.detach().clamp_(0.0, 1.0)
+
+
+def _surely(share: Float32[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
+    if share.shape != (camera.height, camera.width):
+        shrinks = camera.height < share.shape[0]
+        way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        share = np.asarray(cv2.resize(share, (camera.width, camera.height), interpolation=way), np.float32)
+    return torch.from_numpy(share > SURE)
+
+
+def roughness(colours: Float[Tensor, "cells 3"]) -> Float[Tensor, ""]:
+    """Mean squared difference between neighbouring cells, all around and up and down."""
+    grid = colours.reshape(ROWS, COLUMNS, 3)
+    along, up = grid - grid.roll(1, dims=1), grid[1:] - grid[:-1]
+    return 0.5 * (along.square().mean() + up.square().mean())
+
+
+def first_colours(
+    skies: Iterable[tuple[SkyPhoto, Bool[np.ndarray, "h w"]]], up: Float64[np.ndarray, " 3"]
+) -> Float32[np.ndarray, "cells 3"]:
+    """Each cell's mean colour over the photos' skies; the others' filled smoothly from their neighbours.
+
+    Args:
+        skies: Photos and their masks; what the user's masks leave out has no colour.
+        up: The panorama's pole.
+    """
+    total = np.zeros((ROWS * COLUMNS, 4))
+    for photo, mask in skies:
+        shown = mask if photo.ignored is None else mask & ~photo.ignored
+        cells, weights = cells_of(directions(photo.camera)[shown], up)
+        colour = photo.pixels[shown] / 255.0
+        for channel in range(3):
+            total[:, channel] += _sums(cells, weights * colour[:, channel, None])
+        total[:, 3] += _sums(cells, weights)
+    return filled(total)
+
+
+def filled(total: Float64[np.ndarray, "cells 4"]) -> Float32[np.ndarray, "cells 3"]:
+    """Colours from sums of colour and weight; cells of little weight become the mean of their neighbours."""
+    known = (total[:, 3] >= LEAST_EVIDENCE).reshape(ROWS, COLUMNS, 1)
+    whole = total[:, :3].sum(axis=0) / max(total[:, 3].sum(), 1e-12)
+    mean = (total[:, :3] / np.maximum(total[:, 3:], 1e-12)).reshape(ROWS, COLUMNS, 3)
+    grid = np.where(known, mean, whole)
+    for _ in range(FILL_ROUNDS):
+        padded = np.pad(grid, ((1, 1), (0, 0), (0, 0)), mode="edge")
+        around = padded[:-2] + padded[2:] + np.roll(grid, 1, axis=1) + np.roll(grid, -1, axis=1)
+        grid = np.where(known, grid, 0.25 * around)
+    return np.asarray(grid.reshape(-1, 3).astype(np.float32))
+
+
+def _sums(cells: Int64[np.ndarray, "n 4"], values: Shaped[np.ndarray, "n 4"]) -> Float64[np.ndarray, " cells"]:
+    sums = np.bincount(cells.ravel(), values.ravel(), minlength=ROWS * COLUMNS)
+    return sums.astype(np.float64)  # of nothing, they are integers

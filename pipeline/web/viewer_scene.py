@@ -1,0 +1,202 @@
+"""What `viewer.html` shows of a run: cameras, photos, points, sky and CRS in the world frame; and the page itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View, load_points, load_views
+from splatpipe.pipeline.photos.images import Pixels, read_image
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import Panorama
+from splatpipe.pipeline.splat.spz import SPZ_FROM_Z_UP, spz_bytes
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.georeference import scene_box
+from splatpipe.pipeline.survey.local_crs import local_crs
+from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.web.viewer import ViewerCamera, ViewerScene, ViewerSky, viewer_page
+
+PAGE, SPLAT = "viewer.html", "splat.spz"
+THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows; of more photos than the next, less
+MOST_LARGE_THUMBS = 300
+JPEG_QUALITY = 74
+SKY_ROWS = 64  # twice the panorama's: what interpolating twice blurs is not seen
+CLEARLY_TILTED = 0.6  # of the upward direction, in the picture: seen from rather above, no edge is clearly the top
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a model was trained to be rendered.
+
+    Attributes:
+        antialias: With opacities that allow for the blur on screen.
+        background: Red, green, blue, 0..1.
+        near: Of the near plane, model units.
+        sky: Behind it all; None for none.
+    """
+
+    antialias: bool
+    background: tuple[float, float, float]
+    near: float
+    sky: Panorama | None = None
+
+
+def look_of(options: RenderOptions, sky: Panorama | None) -> Look:
+    """What of the rasterizer's options (see `as_trained`) counts in the page as well."""
+    return Look(options.antialias, options.background, options.near, sky)
+
+
+def viewer_scene(
+    dataset: Path, frame: Frame, look: Look, held_out: Collection[str] = (), gaussians: int = 0, title: str = "3D model"
+) -> ViewerScene:
+    """Collect what the page shows besides the splat.
+
+    Args:
+        dataset: The folder that `undistort` left.
+        frame: georef's.
+        look: How the model is rendered.
+        held_out: Names of the photos that were not trained on.
+        gaussians: How many there are.
+        title: The page's.
+
+    Raises:
+        StageError: if the dataset cannot be read.
+    """
+    views, points = load_views(dataset), load_points(dataset)
+    in_world = frame.world_from_model.apply(points.xyz)
+    height = THUMB_HEIGHT if len(views) <= MOST_LARGE_THUMBS else SMALL_THUMB_HEIGHT
+    cameras = tuple(_shown(view, frame, height, view.camera.name in held_out) for view in views)
+    crs = None
+    if frame.origin is not None:
+        centres = np.array([shown.camera.centre() for shown in cameras]).reshape(-1, 3)
+        crs = local_crs(open_world(frame), scene_box(in_world, centres))
+    return ViewerScene(
+        title=title,
+        cameras=cameras,
+        points=in_world,
+        point_colours=points.rgb,
+        gaussians=gaussians,
+        metres=frame.origin is not None,
+        crs=crs,
+        antialias=look.antialias,
+        background=look.background,
+        near=look.near * float(frame.world_from_model.scale),
+        sky=None if look.sky is None else _sky(look.sky, frame),
+        note=frame.note,
+    )
+
+
+def write_viewer(folder: Path, scene: ViewerScene, gaussians: Gaussians, largest_bytes: float) -> None:
+    """Write the page, and the splat beside it where the page would be too large with it.
+
+    Args:
+        folder: Where to.
+        scene: What it shows.
+        gaussians: In the world frame, finite.
+        largest_bytes: Of a page that carries its splat.
+    """
+    splat = viewer_splat(gaussians, scene.antialias)
+    fits = 4 * len(splat) <= 3 * largest_bytes  # base64; a page of gigabytes is not even tried
+    page = viewer_page(scene, splat) if fits else ""
+    if not fits or len(page.encode()) > largest_bytes:
+        (folder / SPLAT).write_bytes(splat)
+        page = viewer_page(scene, SPLAT)
+    (folder / PAGE).write_text(page, encoding="utf-8")
+
+
+def viewer_splat(gaussians: Gaussians, antialias: bool) -> bytes:
+    """The SPZ file that the page draws.
+
+    Args:
+        gaussians: In the world frame (z up), finite.
+        antialias: Whether their opacities allow for the blur on screen.
+    """
+    turn = torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64)
+    return spz_bytes(gaussians.transformed(1.0, turn, torch.zeros(3, dtype=torch.float64)), antialias)
+
+
+def upright(camera: Camera) -> tuple[Camera, int]:
+    """The camera turned by quarters so that its picture's top is where the world's up (+z) is.
+
+    Returns:
+        The camera of the turned picture, and the quarter turns anticlockwise, as ``np.rot90`` takes them.
+    """
+    up_right, up_down = float(camera.cam_from_world[0, 2]), float(camera.cam_from_world[1, 2])
+    if math.hypot(up_right, up_down) < CLEARLY_TILTED:
+        return camera, 0
+    turns = round(math.atan2(up_right, -up_down) / (math.pi / 2.0)) % 4
+    for _ in range(turns):
+        camera = _quarter(camera)
+    return camera, turns
+
+
+def _quarter(camera: Camera) -> Camera:
+    """Its picture turned anticlockwise: what was right is up."""
+    turn = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return replace(
+        camera,
+        width=camera.height,
+        height=camera.width,
+        fx=camera.fy,
+        fy=camera.fx,
+        cx=camera.cy,
+        cy=camera.width - camera.cx,
+        cam_from_world=turn @ camera.cam_from_world,
+    )
+
+
+def _shown(view: View, frame: Frame, height: int, held_out: bool) -> ViewerCamera:
+    camera, turns = upright(_in_world(view.camera, frame))
+    picture = np.rot90(read_image(view.image_path, _reduced(camera, height)), turns)
+    return ViewerCamera(camera, _thumb(picture, height), held_out)
+
+
+def _in_world(camera: Camera, frame: Frame) -> Camera:
+    similarity = frame.world_from_model
+    pose = np.eye(4)
+    pose[:3, :3] = camera.cam_from_world[:3, :3] @ np.asarray(similarity.rotation).T
+    pose[:3, 3] = -pose[:3, :3] @ similarity.apply(camera.centre()[None])[0]
+    return replace(camera, cam_from_world=pose)
+
+
+def _reduced(camera: Camera, height: int) -> int:
+    """How OpenCV is to read a photo: reduced while decoding, still of twice the thumb's size; that is far faster."""
+    room = min(camera.width, camera.height) // (2 * height)
+    steps = ((8, cv2.IMREAD_REDUCED_COLOR_8), (4, cv2.IMREAD_REDUCED_COLOR_4), (2, cv2.IMREAD_REDUCED_COLOR_2))
+    return int(next((flag for factor, flag in steps if room >= factor), cv2.IMREAD_COLOR))
+
+
+def _thumb(picture: Pixels, height: int) -> bytes:
+    scale = min(1.0, height / picture.shape[0])
+    size = [max(1, round(scale * side)) for side in (picture.shape[1], picture.shape[0])]
+    small = cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise StageError("A photo's small picture could not be coded as JPEG.")
+    return bytes(data)
+
+
+def _sky(sky: Panorama, frame: Frame) -> ViewerSky:
+    """The panorama by directions of the world."""
+    elevation = (np.arange(SKY_ROWS) + 0.5) / SKY_ROWS * math.pi - math.pi / 2.0
+    azimuth = (np.arange(2 * SKY_ROWS) + 0.5) / SKY_ROWS * math.pi - math.pi
+    rays = _directions(elevation, azimuth) @ np.asarray(frame.world_from_model.rotation)  # rows: Rᵀ ray
+    colours = sky.at(rays).detach().clamp(0.0, 1.0).numpy()
+    return ViewerSky(np.rint(colours * 255.0).astype(np.uint8))
+
+
+def _directions(
+    elevation: Float64[np.ndarray, " rows"], azimuth: Float64[np.ndarray, " columns"]
+) -> Float64[np.ndarray, "rows columns 3"]:
+    rows, columns = np.meshgrid(elevation, azimuth, indexing="ij")
+    return np.stack([np.cos(rows) * np.cos(columns), np.cos(rows) * np.sin(columns), np.sin(rows)], axis=2)

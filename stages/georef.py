@@ -1,0 +1,185 @@
+"""Georef: the frame that a model lies in, and how well: from control and the photos' positions or, without them, from
+how cameras are held. The model goes on byte for byte unless control bends it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
+from splatpipe.pipeline.sfm.sparse_model import write_model
+from splatpipe.pipeline.survey.accuracy import Placed, accuracy_json, control_json, no_control
+from splatpipe.pipeline.survey.blunders import gsd_m
+from splatpipe.pipeline.survey.control import ByControl, Capture, place_by_control
+from splatpipe.pipeline.survey.crs import parse_vertical
+from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.frames import Frame, save_frame
+from splatpipe.pipeline.survey.gps import georeference, read_positions, tell
+from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
+from splatpipe.pipeline.survey.model import SparseModel, copy_model, read_model
+from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.place import Site, Targets, stations_of
+from splatpipe.pipeline.survey.surveyed_points import load_survey
+from splatpipe.pipeline.survey.world import in_crs
+
+DATUM_STEP_M = 1.0  # between two vertical datums; less may be the receiver's error
+
+
+def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write the parts frame (``frame.json``), model, control (``control.json``) and accuracy (``accuracy.json``).
+
+    Raises:
+        SplatpipeError: if the model cannot be read or has no photos, or the control is not of this capture.
+    """
+    source = inputs["sparse.model"]
+    report.progress(0, 3, "reading the model", "steps")
+    photos = load_photo_list(inputs["ingest.photos"]).by_name()
+    model = read_model(source, photos)
+    positions = read_positions(inputs["ingest.positions"])
+    report.progress(1, 3, "fitting the positions", "steps")
+    frame = _by_positions(config, model, positions, photos, report)
+    report.progress(2, 3, "fitting the control", "steps")
+    controlled = None
+    if inputs["source.control"].is_file():
+        survey = load_survey(inputs["source.control"], config, photos, model, report)
+        priors = _focal_priors(inputs["ingest.cameras"], model, photos)
+        capture = Capture(model, positions, photos, priors, inputs.settings.get("sparse.lens") == "held")
+        try:
+            controlled = place_by_control(survey, capture, None if isinstance(frame, str) else frame, config, report)
+        except NoPlaceError as error:
+            frame = str(error) if isinstance(frame, str) else frame
+            report.warning(
+                f"Control cannot place the model: {error}.", "Mark more control points, each in several photos."
+            )
+    if controlled is not None:
+        frame = controlled.frame
+    if isinstance(frame, str):
+        report.warning(f"Arbitrary scale: {frame}.", "Lengths and heights in this result have no unit.")
+        frame = arbitrary_frame(model, positions, frame)
+    frame = _declared(frame, config, controlled)
+    save_frame(frame, out / "frame.json")
+    accuracy = _write_accuracy(config, out, controlled, (model, positions, frame), photos, report)
+    if controlled is not None and controlled.bent is not None:
+        write_model(controlled.bent, out / "sparse" / "0")
+    else:
+        copy_model(source, out / "sparse" / "0", may_link=inputs.photos_dir not in source.parents)
+    report.progress(3, 3, "fitting the control", "steps")
+    return _summary(frame, controlled, accuracy)
+
+
+def _by_positions(
+    config: GeorefConfig, model: SparseModel, positions: Positions, photos: Mapping[str, Photo], report: Reporter
+) -> Frame | str:
+    """The frame that the positions give, or why they give none."""
+    try:
+        frame, fit = georeference(model, positions, config.max_position_error_m, photos)
+    except NoPlaceError as error:
+        return str(error)
+    tell(frame, fit, model, positions, report)
+    return frame
+
+
+def _declared(frame: Frame, config: GeorefConfig, controlled: ByControl | None) -> Frame:
+    """The frame with the CRS and the vertical datum that were declared."""
+    stated = controlled.survey.crs.text if controlled is not None else ""
+    if controlled is None and config.vertical != "auto":
+        frame = replace(frame, vertical_datum=parse_vertical(config.vertical))
+    return in_crs(frame, config.crs, stated, config.approximate_crs)
+
+
+def _focal_priors(path: Path, model: SparseModel, photos: Mapping[str, Photo]) -> dict[int, float]:
+    """Focal lengths that the metadata know, in the model's pixels, by COLMAP's camera id."""
+    try:
+        groups = json.loads(path.read_text(encoding="utf-8"))["cameras"]
+        known = {k: (group["focal_px"], group["width"]) for k, group in enumerate(groups) if group["has_prior"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SplatpipeError(f"The cameras {path} cannot be read: {error}", "Run with --rerun ingest.") from error
+    priors = {}
+    for name, number in zip(model.names, model.image_ids, strict=True):
+        camera = model.reconstruction.cameras[model.reconstruction.images[number].camera_id]
+        if name in photos and photos[name].camera in known:
+            focal, width = known[photos[name].camera]
+            priors[camera.camera_id] = focal * camera.width / width
+    return priors
+
+
+def _write_accuracy(
+    config: GeorefConfig,
+    out: Path,
+    controlled: ByControl | None,
+    alone: tuple[SparseModel, Positions, Frame],
+    photos: Mapping[str, Photo],
+    report: Reporter,
+) -> JSON:
+    """Write ``control.json`` and ``accuracy.json``; returns the latter."""
+    if controlled is not None:
+        control = control_json(controlled.survey, controlled.site, controlled.placed, photos, config.mark_sigma_px)
+        gsd = gsd_m(controlled.survey, controlled.placed.model, controlled.placed.world_from_model.scale)
+        accuracy = accuracy_json(controlled.survey, controlled.site, controlled.placed, gsd or None)
+        _tell_heights(accuracy["tables"], report)
+    else:
+        control = no_control()
+        accuracy = _accuracy_of_positions(*alone)
+    for name, value in (("control.json", control), ("accuracy.json", accuracy)):
+        text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
+        (out / name).write_text(text + "\n", encoding="utf-8")
+    return accuracy
+
+
+def _tell_heights(tables: JSON, report: Reporter) -> None:
+    """Warn of check points whose heights are in another datum than the positions', where no control joins the two."""
+    check = tables["check"]
+    if tables["control"] is None and check is not None and abs(check["mean_m"][2] or 0.0) > DATUM_STEP_M:
+        report.warning(
+            f"The check points' heights differ from the positions' by {check['mean_m'][2]:+.1f} m on average.",
+            "They may be in another vertical datum. Control points with heights would tell the offset.",
+        )
+
+
+def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Frame) -> JSON:
+    placed = Placed(model, frame.world_from_model, np.zeros((0, 3)))
+    if frame.kind != "enu" or frame.origin is None:
+        return accuracy_json(None, None, placed, None)
+    stations = stations_of(model, positions, frame)
+    nothing = Targets(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+    site = Site(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))
+    placed = replace(placed, offsets=_stated_offsets(frame, stations.flights))
+    gsd = model.gsd(frame.world_from_model.scale)
+    return accuracy_json(None, site, placed, gsd, frame.residuals["uncertainty"])
+
+
+def _stated_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:
+    """The offsets that the fit of positions gave the flights."""
+    found = {int(flight["flight"]): flight["offset_m"] for flight in frame.residuals.get("flights", [])}
+    return np.array([found.get(flight, [0.0, 0.0, 0.0]) for flight in flights], dtype=np.float64).reshape(-1, 3)
+
+
+def _summary(frame: Frame, controlled: ByControl | None, accuracy: JSON) -> Summary:
+    residuals = {key: value for key, value in frame.residuals.items() if key.startswith("rmse")}
+    summary: dict[str, JSON] = {
+        "kind": frame.kind,
+        "note": frame.note,
+        "positions_used": frame.residuals.get("photos_used", 0),
+        "positions_left_out": len(frame.left_out),
+        **residuals,
+    }
+    if controlled is not None:
+        roles = [point.role for point in controlled.survey.points]
+        summary |= {
+            "control_points": roles.count("control"),
+            "check_points": roles.count("check"),
+            "points_left_out": roles.count("left_out"),
+            "model_bent": controlled.bent is not None,
+            "moved_px": controlled.moved_px,
+            "focal_held": list(controlled.focal_held),
+            "control_sigmas_times": controlled.sigma_factor,
+            "tables": accuracy["tables"],
+        }
+    return summary

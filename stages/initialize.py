@@ -1,0 +1,146 @@
+"""initialize: a Gaussian for each point of the sparse model, as big as its neighbours are far."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.mvs.dense import DensePoints, dense_points
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_views, split_views
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.splat.sh import rgb_to_dc
+
+Doubles = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+
+SH_DEGREE = 3
+NEIGHBOURS = 3
+SMALLEST_PER_EXTENT = 1e-6  # size of a point on top of others, over the scene's size
+TINY = 1e-12  # a scene of one point at its camera has a size, too
+QUERY_CHUNK = 65_536
+KD_TREE_SINGLE = 4  # FLANN_INDEX_KDTREE_SINGLE: one exact tree, without random choices
+LEAF_SIZE = 10
+EXACT = -1  # FLANN_CHECKS_UNLIMITED
+
+
+def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `init.ply`: isotropic Gaussians at the sparse points, in the model's frame.
+
+    Raises:
+        SplatpipeError: if the model has no points.
+    """
+    points = load_points(inputs["undistort.dataset"])
+    usable = np.flatnonzero(np.isfinite(points.xyz).all(axis=1))
+    if usable.size == 0:
+        raise SplatpipeError(
+            "The sparse model has no points to start from.",
+            hint="Export it with its points (points3D.bin), or start from the photos.",
+        )
+    chosen = choose_points(points, usable, config.max_gaussians)
+    if chosen.size < usable.size:
+        report.warning(
+            f"{usable.size - chosen.size} of {usable.size} sparse points are left out (initialize.max_gaussians)."
+        )
+    views = load_views(inputs["undistort.dataset"])
+    centres = np.array([view.camera.centre() for view in views])
+    xyz, rgb = points.xyz[chosen], points.rgb[chosen]
+    summary = {}
+    if config.dense == "sweep":
+        more = _sweep(views, config, inputs, out, report)
+        xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
+        summary = {"points": int(chosen.size), "dense_points": len(more)}
+    sizes = point_sizes(xyz, centres, config.max_angle, report)
+    write_splat(out / "init.ply", make_gaussians(xyz, rgb, sizes, config.opacity))
+    return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
+
+
+def _sweep(views: list[View], config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> DensePoints:
+    """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
+    names = [view.camera.name for view in views]
+    kept, _ = split_views(names, inputs.settings["evaluate.every"], inputs.settings["evaluate.views"])
+    used = [view for view in views if view.camera.name in set(kept)]
+    dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
+    return dense_points(dataset, used, config.dense_points, out, threads, report)
+
+
+def choose_points(points: Points, usable: npt.NDArray[np.int64], limit: int) -> npt.NDArray[np.int64]:
+    """At most ``limit`` of the usable points, the longest tracks first, in their old order.
+
+    Args:
+        points: All of them.
+        usable: Rows to choose from.
+        limit: How many.
+    """
+    if usable.size <= limit:
+        return usable
+    ranked = np.lexsort((usable, points.errors_px[usable], -points.track_lengths[usable].astype(np.int64)))
+    return np.sort(usable[ranked[:limit]])
+
+
+def point_sizes(xyz: Doubles, centres: Doubles, max_angle: float, report: Reporter | None = None) -> Doubles:
+    """Mean distance of each point to its three nearest neighbours elsewhere, capped for outliers.
+
+    Args:
+        xyz: (n, 3) points, world units.
+        centres: (m, 3) camera centres, m > 0.
+        max_angle: No size above this share of the distance to the nearest camera.
+        report: Told of progress.
+
+    Returns:
+        (n,) sizes, world units, all above 0.
+    """
+    origin = np.median(xyz, axis=0)
+    points, cameras = (np.ascontiguousarray(where - origin, np.float32) for where in (xyz, centres))
+    extent = float(np.abs(points).max()) + float(np.linalg.norm(cameras, axis=1).max())
+    places, place_of = np.unique(points, axis=0, return_inverse=True)
+    sizes = max_angle * _distances(cameras, places, 1)[:, 0]
+    neighbours = min(NEIGHBOURS, len(places) - 1)
+    if neighbours > 0:  # the nearest place is the point's own
+        sizes = np.minimum(sizes, _distances(places, places, neighbours + 1, report)[:, 1:].mean(axis=1))
+    sizes = np.maximum(sizes, SMALLEST_PER_EXTENT * max(extent, TINY))
+    return np.asarray(sizes[place_of.reshape(-1)])
+
+
+def _distances(targets: Singles, points: Singles, count: int, report: Reporter | None = None) -> Doubles:
+    """(n, count) distances from each point to its nearest targets, ascending."""
+    tree = cv2.flann_Index(targets, {"algorithm": KD_TREE_SINGLE, "leaf_max_size": LEAF_SIZE})
+    distances = np.empty((len(points), count))
+    for start in range(0, len(points), QUERY_CHUNK):
+        chunk = slice(start, start + QUERY_CHUNK)
+        _, squares = tree.knnSearch(points[chunk], count, params={"checks": EXACT})
+        distances[chunk] = np.sqrt(squares.astype(np.float64))
+        if report is not None:
+            report.progress(min(start + QUERY_CHUNK, len(points)), len(points), "measuring neighbours", "points")
+    return distances
+
+
+def make_gaussians(xyz: Doubles, rgb: npt.NDArray[np.uint8], sizes: Doubles, opacity: float) -> Gaussians:
+    """Isotropic Gaussians of one opacity, with the points' colours and no view dependence.
+
+    Args:
+        xyz: (n, 3) world units.
+        rgb: (n, 3) 8-bit colours.
+        sizes: (n,) standard deviations, world units.
+        opacity: In (0, 1).
+    """
+    count = len(xyz)
+    sh = torch.zeros(count, (SH_DEGREE + 1) ** 2, 3)
+    sh[:, 0] = rgb_to_dc(torch.from_numpy(rgb.astype(np.float32) / np.float32(255.0)))
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1.0
+    scales = torch.from_numpy(np.log(sizes).astype(np.float32))
+    return Gaussians(
+        means=torch.from_numpy(xyz.astype(np.float32)),
+        log_scales=scales[:, None].repeat(1, 3),
+        quats=quats,
+        opacity_logits=torch.full((count,), float(np.log(opacity / (1.0 - opacity)))),
+        sh=sh,
+    )
