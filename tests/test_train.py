@@ -37,7 +37,6 @@ TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "filter_3d": True,
     "antialias": True,
     "dropout": 0.2,
-    "max_anisotropy": 5.0,
     "spread_weight": 0.05,
     "prune_free_space": 2,
     "robust": 0.1,

@@ -108,8 +108,6 @@ class TrainConfig(StageConfig):
     """Step only Gaussians that the photo saw; off: all of them, as first published (momentum goes on unseen)."""
     spread_weight: NonNegativeFloat = 0.0
     """Weight of the spread of the depths along a pixel's ray in the loss: layers become one surface. Tried: 0.05."""
-    max_anisotropy: NonNegativeFloat = 0.0
-    """No axis of a Gaussian is longer than this many times its middle one (at least 1): no needles. 0: no limit."""
     dropout: Literal["auto"] | Annotated[float, Field(ge=0.0, le=0.9)] = "auto"
     """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian).
     Auto: 0.2 up to 16 photos, evenly less up to 32, from there on 0."""

@@ -32,7 +32,6 @@ from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.regularise import limit_needles
 from splatpipe.pipeline.train.robust import Robust, share_at
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.smoothing import REFRESH_EVERY, Sampling, raw_opacity_limits, smoothed
@@ -157,7 +156,6 @@ class TrainState:
         for tensor in tensors.values():
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))
-        limit_needles(self.gaussians.log_scales.detach(), options)
         self.density.stepped(self.gaussians.detach(), options, means_rate, self.iteration + 1)
 
     def end_epoch(self, iteration: int, photos: int, options: TrainConfig) -> None:

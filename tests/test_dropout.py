@@ -1,93 +1,19 @@
-"""Few views: no needles, dropout."""
+"""Dropout, for few views."""
 
-import hashlib
 import math
-import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.dropout import dropped, share_at
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.regularise import limit_needles
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.stages import initialize, train
 
-sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-import tiny_scene
-
-QUICK = tiny_scene.plain(iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=5)
-TECHNIQUES: dict[str, dict[str, object]] = {
-    "needles": {"max_anisotropy": 1.2},
-    "dropout": {"dropout": 0.3},
-}
 FRONT = Camera("front", 32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `dataset` and `init.ply`."""
-    folder = tmp_path_factory.mktemp("scene")
-    tiny_scene.write_dataset(folder / "dataset", masked="flight 1/photo_5.png")
-    initialize.run(
-        InitializeConfig(), Inputs({"undistort.dataset": folder / "dataset"}, folder), folder, tiny_scene.Recorder()
-    )
-    return folder
-
-
-def trained(scene: Path, out: Path, config: TrainConfig) -> str:
-    """The digest of what a training leaves."""
-    out.mkdir(exist_ok=True)
-    parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-    settings = {"evaluate.every": 4, "evaluate.views": ""}
-    train.run(config, Inputs(parts, scene, settings, Machine("cpu", 2)), out, tiny_scene.Recorder())
-    return hashlib.sha256((out / "model.ply").read_bytes() + (out / "history.json").read_bytes()).hexdigest()
-
-
-@pytest.fixture(scope="module")
-def plain(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The digest of a training without any of the techniques."""
-    return trained(scene, tmp_path_factory.mktemp("plain"), QUICK)
-
-
-class Killed(BaseException):
-    """Stands for a kill: nothing of the trainer catches it."""
-
-
-@pytest.mark.parametrize("technique", list(TECHNIQUES))
-def test_killed_training_with_a_technique_ends_with_the_same_bits(
-    scene: Path, plain: str, tmp_path: Path, technique: str
-) -> None:
-    config = QUICK.model_copy(update=TECHNIQUES[technique])
-    whole = trained(scene, tmp_path / "whole", config)
-    assert whole != plain
-    step: Callable[[TrainState, Plan, TrainingPhoto], None] = loop.train_step
-
-    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
-        if state.iteration == 34:
-            raise Killed
-        step(state, plan, photo)
-
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
-        patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "train_step", dying)
-        trained(scene, tmp_path / "killed", config)
-    assert trained(scene, tmp_path / "killed", config) == whole
-    assert bool(read_splat(tmp_path / "whole/model.ply").finite().all())
 
 
 def wall(depth: float, count: int = 30) -> Gaussians:
@@ -101,17 +27,6 @@ def wall(depth: float, count: int = 30) -> Gaussians:
     gaussians.quats = torch.randn(count, 4, generator=generator)
     gaussians.opacity_logits = 1.0 + torch.rand(count, generator=generator)
     return gaussians
-
-
-def test_needles_are_cut_and_discs_are_not() -> None:
-    scales = torch.tensor([[9.0, 1.0, 1.0], [1.0, 0.5, 8.0], [9.0, 9.0, 0.01], [1.0, 2.0, 3.0]])
-    logs = torch.log(scales)
-    limit_needles(logs, TrainConfig(max_anisotropy=4.0))
-    expected = torch.tensor([[4.0, 1.0, 1.0], [1.0, 0.5, 4.0], [9.0, 9.0, 0.01], [1.0, 2.0, 3.0]])
-    torch.testing.assert_close(torch.exp(logs), expected)
-    before = logs.clone()
-    limit_needles(logs, TrainConfig())
-    assert torch.equal(logs, before)
 
 
 def test_share_of_dropped_gaussians_rises_to_the_option_and_they_are_not_projected() -> None:
