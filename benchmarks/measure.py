@@ -22,6 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import torch
 from ceilings import measure_ceilings
 from rasterizing import contributing_pairs, raster_alone
@@ -32,7 +33,7 @@ from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import IMAGES, MODEL, View, load_model, load_views, mask_path
+from splatpipe.pipeline.photos.dataset import IMAGES, MODEL, View, load_views, mask_path
 from splatpipe.pipeline.photos.images import load_colour, load_mask
 from splatpipe.pipeline.raster import _native, rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
@@ -240,7 +241,7 @@ def prepare(
     for link, target in ((IMAGES, IMAGES), ("masks", "masks"), ("sparse", points)):
         if (data / target).is_dir():
             (whole / link).symlink_to((data / target).resolve())
-    model = load_model(whole)
+    model = pycolmap.Reconstruction(whole / MODEL)
     views = load_views(whole)
     kept = views[:photos]
     for view in views[len(kept) :]:

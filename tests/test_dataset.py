@@ -1,5 +1,6 @@
 """Pinhole views, and how a dataset's views are read and divided."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,54 @@ def test_a_missing_broken_or_distorted_model_is_a_failed_stage(tmp_path: Path) -
     cut.write_bytes(cut.read_bytes()[:20])
     with pytest.raises(StageError):
         load_views(tmp_path / "cut")
+
+
+def test_a_model_is_read_as_pycolmap_reads_it_to_the_bit(tmp_path: Path) -> None:
+    generator = np.random.default_rng(7)
+    model = pycolmap.Reconstruction()
+    for number in range(1, 31):
+        kind, count = ("PINHOLE", 4) if number % 2 else ("SIMPLE_PINHOLE", 3)
+        lens = pycolmap.Camera(
+            camera_id=number, model=kind, width=40, height=30, params=generator.uniform(20, 60, count)
+        )
+        model.add_camera_with_trivial_rig(lens)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(generator.normal(size=3)), generator.normal(size=3) * 1e3)
+        model.add_image_with_trivial_frame(pycolmap.Image(f"{number}.jpg", np.zeros((5, 2)), number, number), pose)
+    for keypoint in range(5):
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(int(n), keypoint) for n in generator.choice(30, 3, replace=False) + 1]
+        )
+        model.add_point3D(generator.normal(size=3), track, generator.integers(0, 255, 3).astype(np.uint8))
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(tmp_path / "sparse" / "0")
+    again = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    for view in load_views(tmp_path):
+        image = again.find_image_with_name(view.camera.name)
+        assert np.array_equal(view.camera.cam_from_world[:3], image.cam_from_world().matrix())
+        assert np.array_equal(view.camera.k(), image.camera.calibration_matrix())
+    points = [again.points3D[number] for number in sorted(again.points3D)]
+    ours = load_points(tmp_path)
+    assert np.array_equal(ours.xyz, [point.xyz for point in points])
+    assert np.array_equal(ours.rgb, [point.color for point in points])
+    assert ours.errors_px.tolist() == [point.error for point in points]
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_hostile_model_is_refused_and_never_more_than_its_bytes_are_read(tmp_path: Path, name: str) -> None:
+    """Every file cut short anywhere, too long, or with a claim of 2^60 entries at any of its 64-bit words."""
+    write_model(tmp_path)
+    path = tmp_path / "sparse" / "0" / name
+    sound = path.read_bytes()
+    huge = (1 << 60).to_bytes(8, "little")
+    broken = [sound[:length] for length in range(len(sound))] + [sound + b"\0", huge + sound[8:]]
+    for data in broken:
+        path.write_bytes(data)
+        with pytest.raises(StageError, match="sparse/0"):
+            load_points_and_tracks(tmp_path)
+    for start in range(8, len(sound) - 7):
+        path.write_bytes(sound[:start] + huge + sound[start + 8 :])
+        with contextlib.suppress(StageError):  # a claim that does not fit; elsewhere it is a number like any other
+            load_points_and_tracks(tmp_path)
 
 
 def test_every_eighth_view_is_held_out_starting_with_the_first() -> None:

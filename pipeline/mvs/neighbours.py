@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_model
+from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 
 BEST_ANGLE_DEG = 10.0  # between two rays: less of it is imprecise, with more of it a place looks unlike
 NARROW_DEG = 4.0  # spread of the weight below the best angle
@@ -45,17 +45,9 @@ def load_tracks(dataset: Path, names: Sequence[str]) -> Tracks:
     Raises:
         StageError: if the model is broken.
     """
-    model = load_model(dataset)
-    numbers = sorted(model.points3D)
-    xyz = np.array([model.points3D[number].xyz for number in numbers], np.float64).reshape(-1, 3)
-    finite = np.asarray(np.isfinite(xyz).all(axis=1))
-    row_of = {number: row for row, number in enumerate(numbers) if finite[row]}
-    images = {image.name: image for image in model.images.values()}
-    seen = []
-    for name in names:
-        ids = {point.point3D_id for point in images[name].points2D if point.has_point3D()}
-        seen.append(np.array(sorted(row_of[number] for number in ids if number in row_of), np.int64))
-    return Tracks(xyz, tuple(seen))
+    points, seen = load_points_and_tracks(dataset)
+    finite = np.asarray(np.isfinite(points.xyz).all(axis=1))
+    return Tracks(points.xyz, tuple(rows[finite[rows]] for rows in (seen[name] for name in names)))
 
 
 def neighbours(tracks: Tracks, cameras: Sequence[Camera], most: int) -> list[list[int]]:

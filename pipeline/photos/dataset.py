@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.colmap_model import Cloud, Photo, read_cloud, read_photos
 from splatpipe.pipeline.photos.names import NameFinder
 
 IMAGES = "images"
@@ -19,6 +20,8 @@ MASKS = "masks"
 SKY_MASKS = "sky_masks"
 MODEL = "sparse/0"
 NAMES_SHOWN = 5  # of a list in a message
+
+Model = TypeVar("Model")
 
 
 @dataclass(frozen=True)
@@ -68,20 +71,6 @@ def mask_path(dataset: Path, name: str, folder: str = MASKS) -> Path:
     return dataset / folder / PurePosixPath(f"{name}.png")
 
 
-def load_model(dataset: Path) -> pycolmap.Reconstruction:
-    """Read `sparse/0`.
-
-    Raises:
-        StageError: if it is not there or broken.
-    """
-    try:
-        return pycolmap.Reconstruction(dataset / MODEL)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise StageError(
-            f"The dataset's {MODEL} cannot be read: {error}", hint="Run again with --rerun-from undistort."
-        ) from error
-
-
 def load_views(dataset: Path) -> list[View]:
     """The dataset's photos with their cameras, sorted by name.
 
@@ -91,30 +80,16 @@ def load_views(dataset: Path) -> list[View]:
     Raises:
         StageError: if the model is broken or not PINHOLE.
     """
-    model = load_model(dataset)
-    views = [_view(dataset, image) for image in model.images.values() if image.has_pose]
+    views = [_view(dataset, photo) for photo in _read(read_photos, dataset)]
     return sorted(views, key=lambda view: view.camera.name)
 
 
-def _view(dataset: Path, image: pycolmap.Image) -> View:
-    camera = image.camera
-    if camera.model_name not in ("PINHOLE", "SIMPLE_PINHOLE"):
-        raise StageError(f"The dataset's camera of {image.name} is {camera.model_name}, not PINHOLE.")
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().matrix()
-    mask, sky = (mask_path(dataset, image.name, folder) for folder in (MASKS, SKY_MASKS))
+def _view(dataset: Path, photo: Photo) -> View:
+    mask, sky = (mask_path(dataset, photo.name, folder) for folder in (MASKS, SKY_MASKS))
+    lens = photo.camera
     return View(
-        Camera(
-            image.name,
-            int(camera.width),
-            int(camera.height),
-            float(camera.focal_length_x),
-            float(camera.focal_length_y),
-            float(camera.principal_point_x),
-            float(camera.principal_point_y),
-            pose,
-        ),
-        image_path(dataset, image.name),
+        Camera(photo.name, lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, photo.cam_from_world),
+        image_path(dataset, photo.name),
         mask if mask.is_file() else None,
         sky_path=sky if sky.is_file() else None,
     )
@@ -129,7 +104,7 @@ def load_points(dataset: Path) -> Points:
     Raises:
         StageError: if the model is broken.
     """
-    return _points(load_model(dataset))
+    return _points(_read(read_cloud, dataset))
 
 
 def load_points_and_tracks(dataset: Path) -> tuple[Points, dict[str, Int64[np.ndarray, " _"]]]:
@@ -141,23 +116,33 @@ def load_points_and_tracks(dataset: Path) -> tuple[Points, dict[str, Int64[np.nd
     Raises:
         StageError: if the model is broken.
     """
-    model = load_model(dataset)
-    numbers = np.array(sorted(model.points3D), np.int64)
-    tracks = {}
-    for image in model.images.values():
-        observed = [point.point3D_id for point in image.points2D if point.has_point3D()]
-        tracks[image.name] = np.searchsorted(numbers, np.unique(np.array(observed, np.int64)))
-    return _points(model), tracks
+    cloud = _read(read_cloud, dataset)
+    tracks = {photo.name: _rows(cloud, photo) for photo in _read(read_photos, dataset)}
+    return _points(cloud), tracks
 
 
-def _points(model: pycolmap.Reconstruction) -> Points:
-    points = [model.points3D[number] for number in sorted(model.points3D)]
-    return Points(
-        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        track_lengths=np.array([point.track.length() for point in points], np.int64),
-        errors_px=np.array([point.error for point in points], np.float64),
-    )
+def _rows(cloud: Cloud, photo: Photo) -> Int64[np.ndarray, " _"]:
+    """Which rows of the points a photo observes."""
+    observed = np.unique(photo.points)
+    rows = np.searchsorted(cloud.ids, observed)
+    if observed.size and not np.array_equal(cloud.ids[np.minimum(rows, len(cloud.ids) - 1)], observed):
+        raise _broken(f"{photo.name} observes points that are not there")
+    return rows
+
+
+def _points(cloud: Cloud) -> Points:
+    return Points(cloud.xyz, cloud.rgb, cloud.track_lengths, cloud.errors_px)
+
+
+def _read(read: Callable[[Path], Model], dataset: Path) -> Model:
+    try:
+        return read(dataset / MODEL)
+    except (OSError, ValueError) as error:
+        raise _broken(str(error)) from error
+
+
+def _broken(why: str) -> StageError:
+    return StageError(f"The dataset's {MODEL} cannot be read: {why}", hint="Run again with --rerun-from undistort.")
 
 
 def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str], list[str]]:

@@ -1,0 +1,207 @@
+"""COLMAP's binary model of pinhole photos, read without COLMAP: training and rendering run where pycolmap is not.
+
+The format is that of COLMAP's documentation ("Output format", binary): little-endian, lengths first. What is read is
+checked against the file's size before memory is taken for it.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+CAMERAS, IMAGES, POINTS = "cameras.bin", "images.bin", "points3D.bin"
+SIMPLE_PINHOLE, PINHOLE = 0, 1  # COLMAP's numbers of the models, with 3 and 4 parameters
+LONGEST_NAME_BYTES = 4096
+UNMATCHED = -1  # the id of no point: all 64 bits set
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I4d3dI")
+_POINT = struct.Struct("<Q3d3BdQ")
+_OBSERVATION = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
+_ELEMENT_BYTES = 8  # of a track: two 32-bit numbers
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera: its size and, in pixels, its focal lengths and principal point."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photo of the model.
+
+    Attributes:
+        name: Its name.
+        camera: Its camera.
+        cam_from_world: Its pose.
+        points: Ids of the points that it observes, a keypoint each, in the order of its keypoints.
+    """
+
+    name: str
+    camera: Pinhole
+    cam_from_world: Float64[np.ndarray, "4 4"]
+    points: Int64[np.ndarray, " _"]
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """The points, by ascending id.
+
+    Attributes:
+        ids: COLMAP's numbers.
+        xyz: World units.
+        rgb: Colours.
+        errors_px: Mean reprojection errors; -1 where not known.
+        track_lengths: Photos that observe each.
+    """
+
+    ids: Int64[np.ndarray, " n"]
+    xyz: Float64[np.ndarray, "n 3"]
+    rgb: UInt8[np.ndarray, "n 3"]
+    errors_px: Float64[np.ndarray, " n"]
+    track_lengths: Int64[np.ndarray, " n"]
+
+
+def read_photos(folder: Path) -> list[Photo]:
+    """The posed photos of a model, by ascending id.
+
+    Args:
+        folder: With `cameras.bin` and `images.bin`.
+
+    Raises:
+        OSError: if a file cannot be read.
+        ValueError: if one is broken, or a camera is no pinhole.
+    """
+    cameras = _read_cameras(_File(folder / CAMERAS))
+    file = _File(folder / IMAGES)
+    photos: dict[int, Photo] = {}
+    for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size)):
+        number, *pose, camera = file.take(_IMAGE)
+        name = file.name()
+        if camera not in cameras:
+            raise ValueError(f"{IMAGES}: {name} has a camera that is not there")
+        observed = file.array(_OBSERVATION)["point"]
+        photos[number] = Photo(name, cameras[camera], _matrix(np.array(pose)), observed[observed != UNMATCHED])
+    file.end()
+    return [photo for _, photo in sorted(photos.items())]
+
+
+def read_cloud(folder: Path) -> Cloud:
+    """The points of a model.
+
+    Args:
+        folder: With `points3D.bin`.
+
+    Raises:
+        OSError: if the file cannot be read.
+        ValueError: if it is broken.
+    """
+    file = _File(folder / POINTS)
+    rows: dict[int, tuple[float, ...]] = {}
+    for _ in range(file.count(_POINT.size)):
+        number, *values, length = file.take(_POINT)
+        file.skip(length * _ELEMENT_BYTES)
+        rows[number] = (*values, length)
+    file.end()
+    ids = sorted(rows)
+    table = np.array([rows[number] for number in ids], np.float64).reshape(-1, 8)
+    return Cloud(
+        np.array(ids, np.uint64).astype(np.int64),
+        table[:, :3].copy(),
+        table[:, 3:6].astype(np.uint8),
+        table[:, 6].copy(),
+        table[:, 7].astype(np.int64),
+    )
+
+
+def _read_cameras(file: _File) -> dict[int, Pinhole]:
+    cameras = {}
+    for _ in range(file.count(_CAMERA.size)):
+        number, kind, width, height = file.take(_CAMERA)
+        if kind not in (SIMPLE_PINHOLE, PINHOLE):
+            raise ValueError(f"camera {number} is not PINHOLE (COLMAP's model {kind})")
+        *focal, cx, cy = file.take(struct.Struct("<4d" if kind == PINHOLE else "<3d"))
+        cameras[number] = Pinhole(width, height, focal[0], focal[-1], cx, cy)
+    file.end()
+    return cameras
+
+
+def _matrix(pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "4 4"]:
+    """A pose as a matrix, from its quaternion (w, x, y, z) and translation.
+
+    The sums are those of Eigen's ``toRotationMatrix``, so that COLMAP's matrices come out to the bit.
+    """
+    if not np.isfinite(pose).all():
+        raise ValueError(f"{IMAGES}: a pose that is not finite")
+    w, x, y, z = pose[:4].tolist()
+    tx, ty, tz = 2.0 * x, 2.0 * y, 2.0 * z
+    twx, twy, twz, txx, txy, txz = tx * w, ty * w, tz * w, tx * x, ty * x, tz * x
+    tyy, tyz, tzz = ty * y, tz * y, tz * z
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1.0 - (tyy + tzz), txy - twz, txz + twy],
+        [txy + twz, 1.0 - (txx + tzz), tyz - twx],
+        [txz - twy, tyz + twx, 1.0 - (txx + tyy)],
+    ]
+    matrix[:3, 3] = pose[4:]
+    return matrix
+
+
+class _File:
+    """Bytes of an untrusted file, taken one after the other."""
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb") as file:
+            self._data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+        self._name, self._at = path.name, 0
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        start = self._at
+        self.skip(layout.size)
+        return layout.unpack_from(self._data, start)
+
+    def skip(self, length: int) -> None:
+        if length > len(self._data) - self._at:
+            raise ValueError(f"{self._name} ends too early")
+        self._at += length
+
+    def count(self, least_bytes: int) -> int:
+        """A number of entries, each of which takes so many bytes at least."""
+        (number,) = self.take(_COUNT)
+        if number * least_bytes > len(self._data) - self._at:
+            raise ValueError(f"{self._name} claims {number} entries, more than it has bytes for")
+        return int(number)
+
+    def array(self, kind: np.dtype[np.void]) -> np.ndarray:
+        """Entries of one kind, their number before them."""
+        number = self.count(kind.itemsize)
+        start = self._at
+        self.skip(number * kind.itemsize)
+        return np.frombuffer(self._data, kind, number, start)
+
+    def name(self) -> str:
+        """Text up to its zero."""
+        window = bytes(self._data[self._at : self._at + LONGEST_NAME_BYTES])
+        length = window.find(0)
+        if length < 0:
+            raise ValueError(f"{self._name} has a name without an end")
+        self._at += length + 1
+        return window[:length].decode("utf-8")  # UnicodeDecodeError is a ValueError
+
+    def end(self) -> None:
+        if self._at != len(self._data):
+            raise ValueError(f"{self._name} goes on after its last entry")
