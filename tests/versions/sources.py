@@ -1,0 +1,156 @@
+"""The sources that a stage's body reaches, and their digest.
+
+Reached is the module of the body and all that it imports of splatpipe, wherever the import stands, with the packages
+they lie in. A package counts with what lies in its folder besides Python: kernels, scripts, templates. Comments,
+docstrings and formatting of Python and C++ do not count.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+PACKAGE = "splatpipe"
+NAMED_MODULE = re.compile(rf"{PACKAGE}(\.\w+)+(?=(:\w+)?$)")  # a module that is imported by its name in a string
+MADE_FOLDERS = ("dist", "node_modules", "__pycache__")
+UNCOUNTED = (".py", ".pyi", ".so", ".pyc", ".typed")  # Python's are read as modules, or say nothing of the answer
+RECORD = "versions.toml"  # lies in a package that all stages reach, and holds the digests
+UNSAID = ("ctx", "kind", "type_comment")  # of a syntax tree: they follow from the rest or from the formatting
+CPP = (".cpp", ".h", ".cu")
+CPP_PIECES = re.compile(r"""(?P<text>"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|//[^\n]*|/\*.*?\*/""", re.DOTALL)
+BLANKS = re.compile(r"(?<=\w)\s+(?=\w)|(?P<needless>\s+)")
+
+
+class Sources:
+    """The Python modules below a folder that has ``pipeline`` and ``stages``.
+
+    Args:
+        root: The folder: a checkout, or what was taken from one.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def digest(self, entry: str) -> str:
+        """sha256 (hex) of all that a body reaches.
+
+        Args:
+            entry: The body, ``module:function``.
+        """
+        pieces = []
+        for module in sorted(self.reached(entry.partition(":")[0])):
+            file = self._file(module)
+            assert file is not None
+            pieces.append([module, _module_digest(file.read_text(encoding="utf-8"))])
+            if file.name == "__init__.py":
+                pieces += [[f"{module}/{name}", digest] for name, digest in data_digests(file.parent).items()]
+        return sha(pieces)
+
+    def reached(self, module: str) -> set[str]:
+        """The module itself and all that it imports, directly or not; those that only type checkers import are not."""
+        found: set[str] = set()
+        ahead = {module}
+        while ahead:
+            name = ahead.pop()
+            found.add(name)
+            above = name.rpartition(".")[0]
+            named = {above, *self._imports(name)} if above else self._imports(name)
+            ahead |= {other for other in named if other not in found and self._file(other)}
+        return found
+
+    def _file(self, module: str) -> Path | None:
+        package, *rest = module.split(".")
+        path = self._root.joinpath(*rest)
+        if package != PACKAGE or not rest:
+            return None
+        return next(
+            (file for file in (path / "__init__.py", path.with_name(f"{path.name}.py")) if file.is_file()), None
+        )
+
+    def _imports(self, module: str) -> set[str]:
+        file = self._file(module)
+        assert file is not None, f"there is no module {module}"
+        package = module if file.name == "__init__.py" else module.rpartition(".")[0]
+        return _imports(file.read_text(encoding="utf-8"), package)
+
+
+@cache
+def _tree(text: str) -> ast.Module:
+    return ast.parse(text)
+
+
+@cache
+def _imports(text: str, package: str) -> set[str]:
+    found = set()
+    for node in _run_nodes(_tree(text)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*above, *filter(None, [node.module])])
+            found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+        elif (
+            isinstance(node, ast.Constant) and isinstance(node.value, str) and (named := NAMED_MODULE.match(node.value))
+        ):
+            found.add(named.group())
+    return {name for name in found if name.split(".")[0] == PACKAGE}
+
+
+def _run_nodes(node: ast.AST) -> Iterator[ast.AST]:
+    """All nodes but those that only type checkers look at."""
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if not (isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING")):
+            yield from _run_nodes(child)
+
+
+@cache
+def _module_digest(text: str) -> str:
+    return sha(_shape(_tree(text)))
+
+
+def _shape(node: Any) -> Any:
+    """A syntax tree as JSON, the same in all versions of Python: what is empty is left out, and so are docstrings."""
+    if isinstance(node, ast.AST):
+        fields = {name: value for name, value in ast.iter_fields(node) if name not in UNSAID}
+        said = {name: _shape(value) for name, value in fields.items() if value is not None and value != []}
+        return [type(node).__name__, {name: value for name, value in said.items() if value != []}]
+    if isinstance(node, list):
+        return [_shape(item) for item in node if not _is_docstring(item)]
+    return f"{type(node).__name__} {node!r}"
+
+
+def _is_docstring(node: Any) -> bool:
+    """A text that stands for itself: a docstring of a module, class, function, field or constant."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def data_digests(folder: Path) -> dict[str, str]:
+    """Digests of what lies in a package besides Python, by the names in there; packages in it have theirs."""
+    return {name: _data_digest(path) for name, path in _data(folder)}
+
+
+def _data(folder: Path) -> Iterator[tuple[str, Path]]:
+    for path in sorted(folder.iterdir()):
+        if path.is_dir() and path.name not in MADE_FOLDERS and not (path / "__init__.py").is_file():
+            yield from ((f"{path.name}/{name}", file) for name, file in _data(path))
+        elif path.is_file() and path.suffix not in UNCOUNTED and path.name != RECORD and not path.name.startswith("."):
+            yield path.name, path
+
+
+def _data_digest(path: Path) -> str:
+    if path.suffix not in CPP:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    bare = CPP_PIECES.sub(lambda piece: piece["text"] or " ", path.read_text(encoding="utf-8"))
+    return sha(BLANKS.sub(lambda blank: "" if blank["needless"] else " ", bare))
+
+
+def sha(value: Any) -> str:
+    """sha256 (hex) of a JSON value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,134 @@
+"""Trees of sources that can run beside each other: of a commit, and of the working folder, each with its kernels."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sources import PACKAGE, data_digests, sha
+
+FOLDERS = ("pipeline", "stages", "configs", "demo")  # as pyproject.toml maps them
+KERNELS = Path("pipeline/raster/native")
+PAGES = Path("pipeline/web")
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Sources as they are imported.
+
+    Attributes:
+        path: What PYTHONPATH is to have.
+        command: The module of the command line.
+    """
+
+    path: Path
+    command: str
+
+    @property
+    def root(self) -> Path:
+        """The folder that has ``pipeline`` and ``stages``."""
+        return self.path / PACKAGE
+
+    def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run Python so that ``splatpipe`` is this tree's; what it prints is kept for an error."""
+        environment = {**os.environ, "PYTHONPATH": str(self.path), "PYTHONDONTWRITEBYTECODE": "1"}
+        return subprocess.run(
+            [sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False
+        )
+
+
+def git(checkout: Path, *arguments: str) -> bytes:
+    """What git says; an error where it fails."""
+    return subprocess.run(["git", "-C", str(checkout), *arguments], capture_output=True, check=True).stdout
+
+
+def take_commit(checkout: Path, commit: str, folder: Path) -> Tree:
+    """The sources of a commit, without what is built from them."""
+    packed = git(checkout, "archive", commit, *FOLDERS)
+    with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
+        archive.extractall(folder / PACKAGE, filter="data")
+    return Tree(folder, _command(git(checkout, "show", f"{commit}:pyproject.toml").decode()))
+
+
+def take_working(checkout: Path, folder: Path) -> Tree:
+    """The sources as they lie in the working folder, new files, too."""
+    listed = git(checkout, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--", *FOLDERS)
+    for name in filter(None, listed.decode().split("\0")):
+        if (checkout / name).is_file():
+            target = folder / PACKAGE / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(checkout / name, target)
+    return Tree(folder, _command((checkout / "pyproject.toml").read_text(encoding="utf-8")))
+
+
+def _command(project: str) -> str:
+    script: str = tomllib.loads(project)["project"]["scripts"][PACKAGE]
+    return script.partition(":")[0]
+
+
+def complete(trees: Sequence[Tree], working: Tree, builds: Path, say: Say) -> None:
+    """Give trees their kernels and the pages' scripts: those that are installed, else newly built ones.
+
+    Args:
+        trees: The trees.
+        working: That of the working folder; what is installed was built from it.
+        builds: Where what had to be built is kept.
+        say: Takes what goes on.
+    """
+    installed = _installed()
+    for tree in trees:
+        native = tree.root / KERNELS.parent
+        same = data_digests(tree.root / KERNELS) == data_digests(working.root / KERNELS)
+        for library in (installed / KERNELS.parent if same else _build(tree, builds, say)).glob("_native*.so"):
+            shutil.copy2(library, native)
+        shutil.copytree(installed / PAGES / "dist", tree.root / PAGES / "dist")
+        _run([sys.executable, str(tree.root / PAGES / "build.py")])  # does nothing where dist/ is of these sources
+
+
+def _installed() -> Path:
+    """The folder of the ``splatpipe`` that this Python imports, which was built."""
+    found = importlib.util.find_spec(f"{PACKAGE}.pipeline")
+    assert found is not None and found.origin is not None
+    return Path(found.origin).resolve().parent.parent
+
+
+def _build(tree: Tree, builds: Path, say: Say) -> Path:
+    """Build a tree's kernels, once; the folder that has them."""
+    kernels = tree.root / KERNELS
+    folder = builds / sha(data_digests(kernels))[:16]
+    if any(folder.glob("_native*.so")):
+        return folder
+    say("building the kernels of that state (a minute or two, once)")
+    programs = Path(sys.prefix) / "bin"
+    nanobind = subprocess.check_output([sys.executable, "-m", "nanobind", "--cmake_dir"], text=True).strip()
+    defines = [
+        "CMAKE_BUILD_TYPE=Release",
+        f"CMAKE_MAKE_PROGRAM={programs / 'ninja'}",
+        f"Python_EXECUTABLE={sys.executable}",
+        f"nanobind_DIR={nanobind}",
+        *filter(None, [os.environ.get("SKBUILD_CMAKE_DEFINE")]),  # where the Makefile has fetched Python's headers
+    ]
+    work = folder / "work"
+    made = [str(programs / "cmake"), "-S", str(kernels), "-B", str(work), "-G", "Ninja"]
+    _run([*made, *(f"-D{define}" for define in defines)])
+    _run([str(programs / "cmake"), "--build", str(work), "--target", "_native"])
+    for library in work.glob("_native*.so"):
+        shutil.copy2(library, folder)
+    shutil.rmtree(work)
+    return folder
+
+
+def _run(command: Sequence[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
