@@ -30,8 +30,7 @@ from measure import SilentReporter
 from tables import Row, print_table
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.engine.session import load_run
-from splatpipe.pipeline.engine.store import open_store
+from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import Capture
 from splatpipe.pipeline.sfm.judging import judge
@@ -39,6 +38,7 @@ from splatpipe.pipeline.sfm.ladder import climb
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.verified import Verified, read_verified
+from splatpipe.stages.line import LINE, MATCHES
 
 GUESS = 1.2  # of the longer side: COLMAP's where nothing is known
 PLACED = 0.9  # of the photos
@@ -172,12 +172,9 @@ def error_m(model: pycolmap.Reconstruction, truth: Truth) -> float:
 
 def open_capture(out: Path, scratch: Path) -> Capture:
     """What the stage `sparse` would see of a run."""
-    photos_dir, _ = load_run(out)
-    store = open_store(out, create=False)
-    parts = {}
-    for stage in ("ingest", "features", "matches"):
-        parts |= store.artifacts(stage)[-1].parts
-    at = {name: part.path for name, part in parts.items()}
+    folder = open_run_folder(out, LINE)
+    photos_dir, _ = folder.settings()
+    at = {name: part.path for name, part in folder.lineage(MATCHES).items()}
     return Capture(
         database=at["matches.database"],
         features=at["features.database"],

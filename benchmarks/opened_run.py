@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float32
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.session import load_run
-from splatpipe.pipeline.engine.store import Part, open_store
+from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.store import Part
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_views, split_views
 from splatpipe.pipeline.photos.images import Pixels, reduced_camera
@@ -20,8 +20,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import Model, as_trained, render_pixels
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
-
-STAGES = ("ingest", "georef", "undistort", "train")
+from splatpipe.stages.line import EXPORT, LINE, TRAIN
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +65,13 @@ def open_run(out: Path) -> OpenedRun:
     """Read what a run left, up to training at least.
 
     Raises:
-        UsageError: if it is not there, or there are several and it is not clear which is meant.
+        UsageError: if it is not there.
     """
-    photos_dir, table = load_run(out)
-    store = open_store(out, create=False)
-    parts: dict[str, Part] = {}
-    for stage in STAGES:
-        found = store.artifacts(stage)
-        if len(found) != 1:
-            raise UsageError(
-                f"{out} holds {len(found)} artifacts of {stage}, not one.",
-                hint=f"Run to the end of training, or drop what is stale: splatpipe clean {out}",
-            )
-        parts |= found[0].parts
+    folder = open_run_folder(out, LINE)
+    photos_dir, table = folder.settings()
+    parts = folder.lineage(EXPORT, TRAIN)
+    if "train.model" not in parts:
+        raise UsageError(f"{out} has no trained splat.", hint="Run to the end of training.")
     gaussians = read_splat(parts["train.model"].path)
     options, megapixels = as_trained(parts["train.plan"].path, gaussians)
     views = load_views(parts["undistort.dataset"].path)

@@ -15,9 +15,9 @@ import pytest
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
-from splatpipe.pipeline.engine.lineage import delivered, lineage
+from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.runner import Line, Outcome, survey
-from splatpipe.pipeline.engine.session import Request, load_run, open_session, survey_line
+from splatpipe.pipeline.engine.session import Request, open_session, survey_line
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.engine.store import open_store
 
@@ -260,6 +260,23 @@ def test_a_commit_cut_between_its_renames_is_finished(numbers: Path, out: Path) 
     assert not partial.exists()
 
 
+def test_what_changed_while_a_stage_read_it_becomes_no_artifact(numbers: Path, out: Path) -> None:
+    """Its key would say that it was made from what was there before."""
+    changed = (numbers / "b.txt").read_text()
+
+    def meddle(event: Event) -> None:
+        if (event.kind, event.stage) == ("stage_started", "read"):
+            (numbers / "b.txt").write_text("30")
+
+    with (
+        pytest.raises(SplatpipeError, match="photos changed while the stage read"),
+        open_session(request_of(numbers, out), meddle) as runner,
+    ):
+        runner.walk()
+    (numbers / "b.txt").write_text(changed)
+    assert walk(request_of(numbers, out))[0].artifacts["add"].summary == {"total": 21}
+
+
 def test_survey_says_why(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     standings = list(survey(*survey_line(request_of(numbers, out, add={"offset": 5}))))
@@ -282,9 +299,8 @@ def test_clean_removes_only_what_nothing_asks_for(numbers: Path, out: Path) -> N
 
 def test_the_run_can_be_taken_up_from_its_out_alone(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out, add={"offset": 3}))
-    photos, table = load_run(out)
-    assert photos == numbers
-    assert resolve(arithmetic.LineConfig, [table]).add.offset == 3
+    photos, config = open_run_folder(out, arithmetic.LINE).config(arithmetic.LineConfig)
+    assert photos == numbers and config.add.offset == 3
 
 
 def test_out_that_cannot_be_used(numbers: Path, tmp_path: Path) -> None:
@@ -353,7 +369,7 @@ def test_a_refused_stage_leaves_the_configuration_as_it_was(numbers: Path, out: 
     changed = request_of(numbers, out, add={"offset": 1})
     with pytest.raises(UsageError), open_session(changed, lambda event: None) as runner:
         runner.run_alone("tell")
-    assert resolve(arithmetic.LineConfig, [load_run(out)[1]]).add.offset == 0
+    assert open_run_folder(out, arithmetic.LINE).config(arithmetic.LineConfig)[1].add.offset == 0
 
 
 def test_looking_writes_nothing(numbers: Path, out: Path) -> None:
@@ -386,12 +402,60 @@ def test_what_belongs_together_is_found_without_configuration_and_source(numbers
     walk(request_of(numbers, out, add={"offset": 2}))
     walk(request_of(numbers, out))  # reused: what OUT shows is not the newest
     shutil.rmtree(numbers)
-    store = open_store(out, create=False)
-    made = delivered(store, arithmetic.TELL)
-    assert made is not None and (made.folder / "telling.txt").read_text() == (out / "telling.txt").read_text()
-    parts = lineage(store, made)
+    folder = open_run_folder(out, arithmetic.LINE)
+    parts = folder.lineage(arithmetic.TELL)
+    assert parts["tell.telling"].path.read_text() == (out / "telling.txt").read_text()
     assert parts["add.total"].path.read_text() == "21" and {"read.numbers", "count.count"} <= parts.keys()
     (out / "telling.txt").write_text("something else")
-    newest = delivered(store, arithmetic.TELL)
-    assert newest is not None and lineage(store, newest)["add.total"].path.read_text() == "23"
-    assert delivered(open_store(out, create=False), replace(arithmetic.TELL, name="none")) is None
+    none = replace(arithmetic.TELL, name="none")
+    assert folder.lineage(none, arithmetic.TELL)["add.total"].path.read_text() == "23" and folder.lineage(none) == {}
+
+
+def test_contents_are_what_the_last_run_made_and_nothing_that_contradicts_it(numbers: Path, out: Path) -> None:
+    first = walk(request_of(numbers, out))[0].artifacts
+    second = walk(request_of(numbers, out, add={"offset": 2}))[0].artifacts
+    folder, keys = open_run_folder(out, arithmetic.LINE), {name: artifact.key for name, artifact in first.items()}
+    for config, known, made in (
+        (request_of(numbers, out).config, {}, first),
+        (request_of(numbers, out, add={"offset": 2}).config, {}, second),
+        (None, keys, first),
+        (None, {}, second),
+    ):
+        assert folder.contents(config, known).artifacts == made
+    begun = folder.contents(None, keys | {"add": "f" * 64})  # and has not come to its end
+    assert set(begun.parts) == {"read.numbers", "read.left_out"}
+    assert begun == folder.contents(None, keys, {"add"})
+    shutil.rmtree(first["read"].folder)
+    assert folder.contents(None, keys).artifacts == {}
+
+
+def test_what_no_stage_ever_left_came_from_the_users_folder(numbers: Path, out: Path) -> None:
+    """As a reconstruction does, which takes the place of the stage that would have made it."""
+    made = dict(walk(request_of(numbers, out))[0].artifacts)
+    shutil.rmtree(made.pop("read").folder)
+    assert open_run_folder(out, arithmetic.LINE).contents(None, {}).artifacts == made
+
+
+def test_unfinished_work_is_found_where_it_lies(numbers: Path, out: Path) -> None:
+    events: list[Event] = []
+    request = request_of(numbers, out, count={"fail": "raise"})
+    with pytest.raises(StageError), open_session(request, events.append) as runner:
+        runner.walk()
+    keys = {event.stage: event.data["key"] for event in events if "key" in event.data}
+    contents = open_run_folder(out, arithmetic.LINE).contents(None, keys, {"count"})
+    assert (contents.working["count"] / "checkpoint").read_text() == "3"
+
+
+def test_deliverables_are_files_that_are_there_and_that_a_stage_left(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    folder = open_run_folder(out, arithmetic.LINE)
+    (out / "notes.txt").write_text("mine")
+    assert folder.deliverables() == ["telling.txt"]
+    (out / "telling.txt").unlink()
+    assert folder.deliverables() == []
+
+
+def test_folder_is_at_work_as_long_as_a_session_is_open(numbers: Path, out: Path) -> None:
+    with open_session(request_of(numbers, out), lambda event: None):
+        assert open_run_folder(out, arithmetic.LINE).at_work
+    assert not open_run_folder(out, arithmetic.LINE).at_work

@@ -17,6 +17,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.events import Event
+from splatpipe.pipeline.engine.session import Request, open_session
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Summary
 from splatpipe.pipeline.photos.camera_groups import focal_prior
@@ -31,6 +33,8 @@ from splatpipe.pipeline.photos.photo_list import (
     photo_root,
 )
 from splatpipe.stages.ingest import run
+from splatpipe.stages.line import LINE
+from splatpipe.stages.options import LineConfig
 
 WIDTH, HEIGHT = 400, 300
 JPEG_ERROR = 12  # grey values, of a smooth picture at quality 95
@@ -114,6 +118,16 @@ def save(path: Path, seed: int = 0, size: tuple[int, int] = (WIDTH, HEIGHT), **o
         options = {"format": "JPEG", "quality": 95, "subsampling": 0, **options}
     Image.fromarray(pixels).save(path, **options)
     return pixels
+
+
+def replace_in_silence(path: Path) -> None:
+    """Another content of the same size, with the same time of modification, in the same file."""
+    before, data = path.stat(), bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    with path.open("r+b") as file:
+        file.write(data)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (before.st_size, before.st_mtime_ns)
 
 
 @pytest.fixture
@@ -325,9 +339,29 @@ def test_decoding_tells_when_a_photo_has_changed_since(folder: Path) -> None:
     save(folder / "a.jpg", 1, (WIDTH, WIDTH))
     with pytest.raises(SplatpipeError, match=r"a\.jpg is not what it was"):
         result.pixels("a.jpg")
+    replace_in_silence(folder / "b.jpg")
+    with pytest.raises(SplatpipeError, match=r"b\.jpg is not what it was when the photos were checked: it was rep"):
+        result.pixels("b.jpg")
     (folder / "b.jpg").unlink()
     with pytest.raises(SplatpipeError, match=r"b\.jpg is not what it was"):
         result.pixels("b.jpg")
+
+
+def test_photo_replaced_in_silence_is_refused_by_the_stage_that_reads_it(folder: Path, tmp_path: Path) -> None:
+    """After ingest, before the keypoints: they would be those of another photo than the key says."""
+    save(folder / "c.png", 3)
+
+    def meddle(event: Event) -> None:
+        if (event.kind, event.stage) == ("stage_started", "features"):
+            replace_in_silence(folder / "b.jpg")
+
+    request = Request(LINE, LineConfig(), folder, tmp_path / "run", Machine("cpu", 1))
+    with pytest.raises(SplatpipeError, match=r"b\.jpg is not what it was"), open_session(request, meddle) as runner:
+        runner.walk(until="features")
+    assert runner.outcome.ran == ["ingest"] and runner.outcome.failed == "features"
+    with open_session(request, lambda event: None) as again:
+        again.walk(until="ingest")
+    assert again.outcome.ran == ["ingest"]  # size and times are as before, and it is found to be another all the same
 
 
 def test_twins_are_left_out(folder: Path) -> None:

@@ -47,10 +47,11 @@ def wait(page: Page, until: Callable[[Any], bool]) -> Any:
 
 
 def wait_for_work(out: Path) -> None:
-    from splatpipe.pipeline.app.view.opened import open_run
+    from splatpipe.pipeline.engine.run_folder import open_run_folder
+    from splatpipe.stages.line import LINE
 
     deadline = time.monotonic() + PATIENCE_S
-    while not open_run(out).is_at_work() and time.monotonic() < deadline:
+    while not open_run_folder(out, LINE).at_work and time.monotonic() < deadline:
         time.sleep(0.1)
 
 

@@ -20,13 +20,14 @@ from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.demo.truth import true_poses
 from splatpipe.pipeline.app.view.job import open_job
 from splatpipe.pipeline.app.view.marking import Marking, WrongRequestError
-from splatpipe.pipeline.app.view.opened import open_run
 from splatpipe.pipeline.app.view.photo import without_metadata
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.control_file import read_control_file
 from splatpipe.pipeline.survey.level import Positions
+from splatpipe.stages.line import LINE
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from served import Served, linked_copy, serving
@@ -349,7 +350,7 @@ def test_a_phone_shows_and_marks_by_touch(marking: tuple[Served, Path], open_pag
 def test_what_cannot_be_marked_is_told(gps_run: Path, tmp_path: Path) -> None:
     def told(points: Path | None = None) -> str:
         with pytest.raises(SplatpipeError) as caught:
-            Marking(open_job(open_run(gps_run), points))
+            Marking(open_job(open_run_folder(gps_run, LINE), points))
         return f"{caught.value.message} {caught.value.hint}"
 
     (gps_run.parent / "photos of a house" / "gcp_list.txt").unlink(missing_ok=True)
@@ -375,7 +376,7 @@ def test_what_cannot_be_marked_is_told(gps_run: Path, tmp_path: Path) -> None:
 
 def test_three_points_make_a_frame_where_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
     """Before that nothing is expected anywhere; then every other point is, to a few pixels. A wrong mark is told."""
-    job = open_job(open_run(gps_run), gps_run.parent / "points.csv")
+    job = open_job(open_run_folder(gps_run, LINE), gps_run.parent / "points.csv")
     text = ControlText.begin(tmp_path / "gcp_list.txt", "EPSG:32633", False, NameFinder(job.photos))
     marking = Marking(replace(job, frame=None, positions=Positions({}, {}), text=text))
     assert not marking.overview()["placed"]

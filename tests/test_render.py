@@ -16,9 +16,8 @@ from playwright.sync_api import Browser
 
 from splatpipe.pipeline.app.renders import Shot, Wanted, render_run
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.lineage import delivered, lineage
+from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.engine.store import open_store
 from splatpipe.pipeline.film.camera_path import cameras_along
 from splatpipe.pipeline.film.filming import coloured_depth, coloured_normals, open_scene
 from splatpipe.pipeline.film.keyframe_file import read_keyframes
@@ -37,7 +36,7 @@ from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.stages import flythrough
-from splatpipe.stages.line import EXPORT
+from splatpipe.stages.line import EXPORT, LINE
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -60,10 +59,7 @@ def rendered(out: Path, *arguments: object) -> dict[str, object]:
 
 @pytest.fixture(scope="module")
 def parts(demo_run: Path) -> dict[str, Path]:
-    store = open_store(demo_run, create=False)
-    made = delivered(store, EXPORT)
-    assert made is not None
-    return {name: part.path for name, part in lineage(store, made).items()}
+    return {name: part.path for name, part in open_run_folder(demo_run, LINE).lineage(EXPORT).items()}
 
 
 def test_every_run_leaves_a_film_that_a_browser_plays(demo_run: Path, parts: dict[str, Path], browser: Browser) -> None:

@@ -140,16 +140,9 @@ def stage(
     as_json: JsonOption = False,
 ) -> None:
     """Run one stage again on an existing OUT, and nothing else."""
-    from splatpipe.pipeline.engine.config import known
-    from splatpipe.pipeline.engine.session import load_run
-    from splatpipe.stages.options import LineConfig
-
     with Ending(out, as_json) as done:
         check_stage(name)
-        photos, table = load_run(out)
-        resolved = overrides(None, assignments, None).resolve(known(LineConfig, table))
-        request = request_of(photos, out, resolved, device, threads)
-        with RunSession(request) as runner:
+        with RunSession(existing(out, overrides(None, assignments, None).tables, device, threads)) as runner:
             done.outcome = runner.outcome
             runner.run_alone(name)
 
@@ -167,15 +160,10 @@ def georef(
     as_json: JsonOption = False,
 ) -> None:
     """Place a finished run anew: other control points, another CRS. What does not change is reused."""
-    from splatpipe.pipeline.engine.config import known
-    from splatpipe.pipeline.engine.session import load_run
-    from splatpipe.stages.options import LineConfig
-
     with Ending(out, as_json) as done:
-        photos, table = load_run(out)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
-        resolved = overrides(None, assignments, None).resolve(known(LineConfig, table), *control)
-        with RunSession(request_of(photos, out, resolved, device, threads)) as runner:
+        tables = [*control, *overrides(None, assignments, None).tables]
+        with RunSession(existing(out, tables, device, threads)) as runner:
             done.outcome = runner.outcome
             runner.walk()
 
@@ -250,11 +238,11 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
     """Write OUT/report.html anew, from what is there."""
     from splatpipe.pipeline.app.console import say
     from splatpipe.pipeline.app.report import make_report
-    from splatpipe.pipeline.engine.session import LOG_FILE
-    from splatpipe.pipeline.engine.store import open_store
+    from splatpipe.pipeline.engine.run_folder import LOG_FILE, open_run_folder
+    from splatpipe.stages.line import LINE
 
     with Ending(out, as_json) as done:
-        open_store(out, create=False)
+        open_run_folder(out, LINE)
         path = make_report(out, out / LOG_FILE)
         done.told = {"outputs": [str(path)]}
     say(str(path))

@@ -66,7 +66,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     if device == "cuda":
         raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
-        import splatpipe.pipeline.raster.isa  # noqa: F401
+        import splatpipe.pipeline.raster  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)
     return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
 
@@ -78,13 +78,14 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def existing(out: Path) -> Request:
-    from splatpipe.pipeline.engine.config import known
-    from splatpipe.pipeline.engine.session import load_run
+def existing(out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0) -> Request:
+    """What ran in OUT, to be run again, with what is to be otherwise."""
+    from splatpipe.pipeline.engine.run_folder import open_run_folder
+    from splatpipe.stages.line import LINE
     from splatpipe.stages.options import LineConfig
 
-    photos, table = load_run(out)
-    return request_of(photos, out, Overrides([]).resolve(known(LineConfig, table)))
+    photos, config = open_run_folder(out, LINE).config(LineConfig, *tables)
+    return request_of(photos, out, config, device, threads)
 
 
 def check_stage(name: str) -> None:

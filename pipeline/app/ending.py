@@ -49,7 +49,7 @@ class Ending:
         """Have the report written; what is wrong with it is told, and changes nothing about the run."""
         from splatpipe.pipeline.app.console import say
         from splatpipe.pipeline.app.report import make_report
-        from splatpipe.pipeline.engine.session import LOG_FILE
+        from splatpipe.pipeline.engine.run_folder import LOG_FILE
 
         until_s = error.at_s + STOP_S if isinstance(error, Stopped) else None
         try:

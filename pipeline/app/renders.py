@@ -15,9 +15,8 @@ import numpy as np
 from splatpipe.pipeline.app.console import RunConsole
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
-from splatpipe.pipeline.engine.lineage import delivered, lineage
+from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.engine.store import open_store
 from splatpipe.pipeline.film.camera_path import Lens, Route, cameras_along
 from splatpipe.pipeline.film.filming import (
     LEAST_SIDE,
@@ -39,7 +38,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.stages.evaluate import flat_stems
-from splatpipe.stages.line import EXPORT, FLYTHROUGH, TRAIN
+from splatpipe.stages.line import EXPORT, FLYTHROUGH, LINE, TRAIN
 
 ORBIT_STILLS = 12
 FOLDER = "renders"  # below OUT
@@ -266,9 +265,7 @@ def _parts(out: Path) -> dict[str, Path]:
     Raises:
         UsageError: if training is not done.
     """
-    store = open_store(out, create=False)
-    made = delivered(store, EXPORT) or delivered(store, TRAIN)
-    found = {} if made is None else {name: part.path for name, part in lineage(store, made).items()}
+    found = {name: part.path for name, part in open_run_folder(out, LINE).lineage(EXPORT, TRAIN).items()}
     missing = [name for name in READ if name not in found]
     if missing:
         raise UsageError(

@@ -13,7 +13,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.stage import JSON, Stage
 
 Table = dict[str, JSON]
 Model = TypeVar("Model", bound=BaseModel)
@@ -172,6 +172,13 @@ def lookup(config: BaseModel, dotted: str) -> JSON:
     """The value of ``section.option``."""
     section, _, option = dotted.partition(".")
     return getattr(getattr(config, section), option)
+
+
+def settings_of(config: BaseModel, stage: Stage) -> tuple[Table, Table]:
+    """A stage's own options without those that name files, and the ones it borrows, by their dotted names."""
+    section: BaseModel = getattr(config, stage.name)
+    own = section.model_dump(mode="json", exclude=set(stage.files))
+    return own, {name: lookup(config, name) for name in stage.borrows}
 
 
 def dump(table: Mapping[str, JSON]) -> str:

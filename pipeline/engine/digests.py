@@ -15,6 +15,7 @@ from splatpipe.pipeline.engine.stage import JSON
 
 BLOCK_BYTES = 1 << 20
 UNREADABLE = "unreadable"  # stands for the digest of a file that ingest will leave out with the reason
+KNOWN = 4  # facts of a file by which its digest is known again
 MAX_SOURCE_FILES = 1_000_000  # a folder with more is somebody's home, not a capture
 
 
@@ -82,7 +83,9 @@ def _digest_or_unreadable(path: Path) -> str:
 
 
 class HashTable:
-    """Remembers the sha256 of files by path, size, mtime and inode, so that gigabytes are read once.
+    """Remembers the sha256 of files by path, size, times and inode, so that gigabytes are read once.
+
+    The time of the last change of the inode is among them: no program sets it, whatever it makes of the mtime.
 
     Args:
         path: Where the table is kept (JSON); a broken one is started anew.
@@ -95,7 +98,7 @@ class HashTable:
         self._known: dict[str, list[JSON]] = {}
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
-            self._known = {str(key): list(value) for key, value in table.items() if len(value) == 4}
+            self._known = {str(key): list(value) for key, value in table.items() if len(value) == KNOWN + 1}
         except (OSError, ValueError, AttributeError, TypeError):
             pass  # no table or a broken one costs one more reading of the photos, nothing else
 
@@ -114,11 +117,11 @@ class HashTable:
         for name, path in files.items():
             try:
                 status = path.stat()
-                wanted[name] = [status.st_size, status.st_mtime_ns, status.st_ino]
+                wanted[name] = [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
             except OSError:
-                wanted[name] = [-1, -1, -1]
+                wanted[name] = [-1] * KNOWN
             known = self._known.get(str(path))
-            if known is None or known[:3] != wanted[name]:
+            if known is None or known[:KNOWN] != wanted[name]:
                 unread.append(name)
         with ThreadPoolExecutor(max(1, threads)) as pool:
             for done, (name, sha) in enumerate(
@@ -127,9 +130,9 @@ class HashTable:
                 self._known[str(files[name])] = [*wanted[name], sha]
                 if progress:
                     progress(done, len(unread))
-        found = digest(sorted([name, self._known[str(path)][3]] for name, path in files.items()))
+        found = digest(sorted([name, self._known[str(path)][KNOWN]] for name, path in files.items()))
         if unread and self._remember:
-            self._known = {path: known for path, known in self._known.items() if known[3] != UNREADABLE}
+            self._known = {path: known for path, known in self._known.items() if known[KNOWN] != UNREADABLE}
             self._save()
         return found
 

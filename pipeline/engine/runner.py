@@ -15,7 +15,7 @@ from typing import Literal
 
 from pydantic import BaseModel
 
-from splatpipe.pipeline.engine.config import lookup
+from splatpipe.pipeline.engine.config import settings_of
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, UsageError, exit_code
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
@@ -55,14 +55,8 @@ class Line:
 
     def inputs_of(self, stage: Stage, parts: Mapping[str, Part]) -> StageInputs:
         """What a stage's key is made of."""
-        section: BaseModel = getattr(self.config, stage.name)
-        return StageInputs(
-            stage.name,
-            stage.version,
-            section.model_dump(mode="json", exclude=set(stage.files)),
-            {name: lookup(self.config, name) for name in stage.borrows},
-            {name: parts[name].digest for name in stage.reads},
-        )
+        reads = {name: parts[name].digest for name in stage.reads}
+        return StageInputs(stage.name, stage.version, *settings_of(self.config, stage), reads)
 
 
 @dataclass(frozen=True)
@@ -136,6 +130,7 @@ class Runner:
         executor: Runs the bodies.
         machine: Device and threads.
         sink: Takes the events.
+        source_now: Digests of the external parts as they are at this moment.
         save_config: Keeps the configuration in OUT; called once it is known that something can run with it.
         outcome: What was done so far, also when it ends in an error.
     """
@@ -145,6 +140,7 @@ class Runner:
     executor: Executor
     machine: Machine
     sink: Sink
+    source_now: Callable[[], Mapping[str, str]]
     save_config: Callable[[BaseModel], None]
     outcome: Outcome = field(default_factory=Outcome)
 
@@ -250,6 +246,7 @@ class Runner:
                     out=str(partial),
                 )
                 result = self.executor.run(task, self.sink)
+                self._check_source(stage)
                 summary: Summary = result.pop("summary")
                 run = {
                     **result,
@@ -271,6 +268,20 @@ class Runner:
         data: dict[str, JSON] = {"message": told[0], "hint": told[1], "exit_code": exit_code(error), "key": inputs.key}
         data |= {"seconds": round(seconds, 3), "peak_memory_bytes": self.executor.peak_memory_bytes()}
         return Event("stage_failed", inputs.stage, data)
+
+    def _check_source(self, stage: Stage) -> None:
+        """An artifact's key says what it was made from, so that has to be what the stage read."""
+        read = [name for name in stage.reads if name in self.line.source]
+        if not read:
+            return
+        now = self.source_now()
+        changed = [name for name in read if now.get(name, "") not in ("", self.line.source[name].digest)]
+        if changed:
+            what = "The photos" if "source.photos" in changed else self.line.source[changed[0]].path.name
+            raise SplatpipeError(
+                f"{what} changed while the stage {stage.name} read them.",
+                hint="Run again, when nobody writes there any more: what was made before is reused.",
+            )
 
     def _check_space(self) -> None:
         free = shutil.disk_usage(self.store.out).free

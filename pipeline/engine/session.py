@@ -12,20 +12,16 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from splatpipe.pipeline.engine.config import Table, dump, load_file
+from splatpipe.pipeline.engine.config import dump
 from splatpipe.pipeline.engine.digests import HashTable
 from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
 from splatpipe.pipeline.engine.executor import Executor
+from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_FILE
 from splatpipe.pipeline.engine.runner import Line, Runner
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Machine, Stage
 from splatpipe.pipeline.engine.store import Part, Store, locked, open_store
-
-CONFIG_FILE = "config.toml"
-LOG_FILE = "splatpipe.log"
-EVENTS_FILE = "events.jsonl"
 
 
 @dataclass(frozen=True)
@@ -72,8 +68,10 @@ def open_session(request: Request, show: Sink) -> Iterator[Runner]:
                 log(event)
                 show(event)
 
-            line = _open_line(request, store, EventReporter("source", sink), remember=True)
-            yield Runner(line, store, executor, request.machine, sink, partial(_save_config, store, source.folder))
+            digests = partial(_digests, request, store, EventReporter("source", sink), remember=True)
+            line = _open_line(request, digests())
+            save = partial(_save_config, store, source.folder)
+            yield Runner(line, store, executor, request.machine, sink, digests, save)
         except BaseException:
             executor.stop()
             raise
@@ -86,19 +84,25 @@ def open_session(request: Request, show: Sink) -> Iterator[Runner]:
 def survey_line(request: Request) -> tuple[Line, Store]:
     """The line and the store of an existing OUT, for looking and not for running."""
     store = open_store(request.out, create=False)
-    return _open_line(request, store, EventReporter("source", _unheard), remember=False), store
+    return _open_line(request, _digests(request, store, EventReporter("source", _unheard), remember=False)), store
 
 
 def _unheard(_event: Event) -> None:
     """The sink of a look that nobody waits for."""
 
 
-def _open_line(request: Request, store: Store, report: EventReporter, *, remember: bool) -> Line:
+def _open_line(request: Request, digests: Mapping[str, str]) -> Line:
     source = open_source(request.photos, request.out, request.stages, request.config)
-    table = HashTable(store.stages / "photos-index.json", remember=remember)
-    digests = source.digests(table, request.machine.threads, report)
     parts = {name: Part(source.part_path(name), value) for name, value in digests.items()}
     return Line(request.stages, request.config, parts, source.folder)
+
+
+def _digests(request: Request, store: Store, report: EventReporter, *, remember: bool) -> dict[str, str]:
+    """Those of the external parts, of which only what changed since the last time is read."""
+    source = open_source(request.photos, request.out, request.stages, request.config)
+    return source.digests(
+        HashTable(store.stages / "photos-index.json", remember=remember), request.machine.threads, report
+    )
 
 
 def _worker_environment(threads: int) -> dict[str, str]:
@@ -114,21 +118,3 @@ def _worker_environment(threads: int) -> dict[str, str]:
 def _save_config(store: Store, photos: Path, config: BaseModel) -> None:
     head = {"photos": os.fsdecode(photos), "splatpipe": importlib.metadata.version("splatpipe")}
     write_durably(store.out / CONFIG_FILE, dump({**head, **config.model_dump(mode="json")}))
-
-
-def load_run(out: Path) -> tuple[Path, Table]:
-    """The photos' folder and the configuration that a run left in OUT.
-
-    Raises:
-        UsageError: if OUT holds no run.
-    """
-    open_store(out, create=False)
-    try:
-        table = load_file(out / CONFIG_FILE)
-    except UsageError as error:
-        raise UsageError(error.message, hint=f"Run again: splatpipe run PHOTOS {out}") from error
-    photos = table.pop("photos", None)
-    table.pop("splatpipe", None)
-    if not isinstance(photos, str) or not all(isinstance(section, Mapping) for section in table.values()):
-        raise UsageError(f"{out / CONFIG_FILE} is not what a run leaves.", hint="Run again: splatpipe run PHOTOS OUT")
-    return Path(photos), table

@@ -20,6 +20,7 @@ from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
 FORMAT = 1  # of what lies under OUT; raised when older versions could no longer read it
 KEY_CHARACTERS = 16  # of a folder's name: 64 bits tell the few artifacts of one OUT apart
+LOCK_FILE = ".lock"  # below stages/; it stays there, and only who holds it works
 LOCK_PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
 MIN_FREE_BYTES = 16 << 20
 
@@ -105,6 +106,22 @@ class Store:
         found = [_read_artifact(folder) for folder in self.stages.glob(f"{stage}-*")]
         whole = [artifact for artifact in found if artifact is not None]
         return sorted(whole, key=lambda artifact: float(artifact.manifest["finished_s"]), reverse=True)
+
+    def is_locked(self) -> bool:
+        """Whether a splatpipe works here now."""
+        try:
+            descriptor = os.open(self.stages / LOCK_FILE, os.O_RDONLY | os.O_NOFOLLOW)
+        except OSError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a run that begins now waits for longer
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        finally:
+            os.close(descriptor)
+        return False
 
     def working_folder(self, stage: Stage, key: str) -> Path:
         """Where a stage of that key works until it is done; it need not be there."""
@@ -347,7 +364,7 @@ def locked(store: Store) -> Iterator[int]:
     Raises:
         UsageError: if another process works in it.
     """
-    descriptor = os.open(store.stages / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
+    descriptor = os.open(store.stages / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         deadline = time.monotonic() + LOCK_PATIENCE_S
         while True:

@@ -10,7 +10,7 @@ from jaxtyping import Shaped, UInt8
 from PIL import Image
 
 from splatpipe.pipeline.photos.check import CheckedPhoto, deep_pixels, stored_orientation
-from splatpipe.pipeline.photos.photo_list import load_stored, open_picture
+from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, read_checked
 
 PNG_LEVEL = 1  # zlib's fastest: half the size at ten times the time is no bargain for an intermediate file
 FULL_RANGE = 65535.0
@@ -44,7 +44,7 @@ def read_8bit(
     Returns:
         (h, w, 3) RGB or (h, w) grey, uint8; and the opacity, 0 to 255, or None for an opaque picture.
     """
-    data = photo.path.read_bytes()
+    data = read_checked(photo.path, photo.name, photo.sha256)
     with open_picture(BytesIO(data)) as picture:
         orientation = stored_orientation(photo.exif, picture)
         if scale is not None:

@@ -7,9 +7,11 @@ PNG that ingest converted it to.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -128,6 +130,36 @@ def photo_path(photo: Photo, part: Path, photos_dir: Path) -> Path:
     return _inside(photo_root(photos_dir), photo.name)
 
 
+def photo_bytes(photo: Photo, part: Path, photos_dir: Path) -> bytes:
+    """The file whose pixels stand for a photo, read; its own only as it was when it was checked.
+
+    Raises:
+        SplatpipeError: if the file is gone or is no longer the one that was checked.
+    """
+    sha256 = photo.sha256 if photo.converted is None else None
+    return read_checked(photo_path(photo, part, photos_dir), photo.name, sha256)
+
+
+def read_checked(path: Path, name: str, sha256: str | None = None) -> bytes:
+    """Read a file whole, and refuse another content than it had, whatever its size and its times are.
+
+    Args:
+        path: The file.
+        name: What people call it.
+        sha256: Of its bytes when it was checked; None for a file of ours, which nobody else writes.
+
+    Raises:
+        SplatpipeError: if it is gone or was replaced.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise _changed(name, str(error)) from error
+    if sha256 not in (None, hashlib.sha256(data).hexdigest()):
+        raise _changed(name, "it was replaced")
+    return data
+
+
 def decode(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read a photo's pixels.
 
@@ -142,8 +174,7 @@ def decode(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h w
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
     """
-    path = photo_path(photo, part, photos_dir)
-    pixels = _read(path, "RGB", photo.name)
+    pixels = _decoded(photo_bytes(photo, part, photos_dir), "RGB", photo.name)
     if pixels.shape != (photo.height, photo.width, 3):
         raise _changed(photo.name, f"it is {pixels.shape[1]} × {pixels.shape[0]} px now")
     return pixels
@@ -166,7 +197,7 @@ def decode_sky_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None
 def _decode_mask(photo: Photo, file: str | None, part: Path) -> UInt8[np.ndarray, "h w"] | None:
     if file is None:
         return None
-    mask = _read(_inside(part, file), "L", file)
+    mask = _decoded(read_checked(_inside(part, file), file), "L", file)
     if mask.shape != (photo.height, photo.width):
         raise _changed(file, f"it is {mask.shape[1]} × {mask.shape[0]} px now")
     return mask
@@ -208,10 +239,10 @@ def unturn(picture: Image.Image, orientation: int) -> Image.Image:
     return picture if method is None else picture.transpose(method)
 
 
-def _read(path: Path, mode: str, name: str) -> np.ndarray:
+def _decoded(data: bytes, mode: str, name: str) -> np.ndarray:
     try:
         # What is read here was written by ingest or found plain by it: never a turned TIFF.
-        with open_picture(path) as picture:
+        with open_picture(BytesIO(data)) as picture:
             return np.array(picture.convert(mode))
     except (OSError, ValueError, SyntaxError) as error:
         raise _changed(name, str(error)) from error

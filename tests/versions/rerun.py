@@ -14,11 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.engine.config import known, resolve
+from splatpipe.pipeline.engine.config import known, load_file, resolve
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.runner import Outcome, Runner
-from splatpipe.pipeline.engine.session import Request, load_run, open_session
+from splatpipe.pipeline.engine.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine, Stage
 from splatpipe.pipeline.engine.store import Artifact, Part
 from splatpipe.stages.line import LINE
@@ -27,7 +27,7 @@ from splatpipe.stages.options import LineConfig
 
 def main(job: Mapping[str, Any]) -> None:
     """Run the stages of a job, and those whose parts the earlier run lacks."""
-    _, table = load_run(Path(job["earlier"]))
+    table = load_file(Path(job["earlier"]) / "config.toml")
     config = resolve(LineConfig, [known(LineConfig, table)])
     artifacts = _artifacts(Path(job["earlier"]))
     out = Path(job["out"])

@@ -59,8 +59,13 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     Raises:
         MachineError: if it could not be written.
     """
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.report", str(out)]
-    command += [] if until_s is None else ["--hurry"]
+    command = [
+        sys.executable,
+        "-m",
+        "splatpipe.pipeline.app.report",
+        str(out),
+        *([] if until_s is None else ["--hurry"]),
+    ]
     path = out / REPORT_FILE
     before = _stamp(path)
     began_s = time.monotonic()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.app.report.story import Story, read_story
-from splatpipe.pipeline.engine.config import known, lookup
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.session import EVENTS_FILE, load_run
-from splatpipe.pipeline.engine.stage import Stage
-from splatpipe.pipeline.engine.store import Artifact, Store
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, Contents, RunFolder, open_run_folder
+from splatpipe.pipeline.engine.store import Artifact
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
@@ -47,7 +44,7 @@ class Holdings:
         story: What happened.
         config: The options as they were; None where they cannot be read.
         photos_dir: The user's folder; None where nobody knows.
-        artifacts: Those that belong together, by stage.
+        contents: The artifacts that belong together.
         deliverables: Files in OUT for people.
     """
 
@@ -55,13 +52,17 @@ class Holdings:
     story: Story
     config: LineConfig | None
     photos_dir: Path | None
-    artifacts: Mapping[str, Artifact]
+    contents: Contents
     deliverables: Sequence[Deliverable]
+
+    @property
+    def artifacts(self) -> Mapping[str, Artifact]:
+        """Those that belong together, by stage."""
+        return self.contents.artifacts
 
     def part(self, name: str) -> Path | None:
         """Where a part lies, e.g. ``georef.frame``; None if it was not made."""
-        artifact = self.artifacts.get(name.partition(".")[0])
-        found = artifact.parts.get(name) if artifact is not None else None
+        found = self.contents.parts.get(name)
         return None if found is None else found.path
 
     def read(self, name: str) -> Any:
@@ -90,11 +91,8 @@ class Holdings:
         Raises:
             ValueError: if it is no JSON, or far too large.
         """
-        story = self.story.stages.get(stage)
-        if story is None or not story.key:
-            return {}
-        path = Store(self.out).working_folder(next(each for each in LINE if each.name == stage), story.key) / file
-        return read_json(path) if path.is_file() else {}
+        folder = self.contents.working.get(stage)
+        return read_json(folder / file) if folder is not None and (folder / file).is_file() else {}
 
     def summary(self, stage: str) -> Mapping[str, Any]:
         """What a stage returned; empty where it did not finish."""
@@ -121,70 +119,28 @@ def open_holdings(out: Path) -> Holdings:
     """Look at a run's folder, which may be that of a running, a stopped or a failed one.
 
     Args:
-        out: The folder; it has `stages/`.
+        out: The folder.
+
+    Raises:
+        UsageError: if there is no run in it.
     """
-    store = Store(out)
-    story = read_story(out / EVENTS_FILE, running=_is_locked(store))
-    config, photos_dir = _configuration(out)
-    artifacts = _belonging(store, story, config)
-    return Holdings(out, story, config, photos_dir, artifacts, _deliverables(store, artifacts))
+    run = open_run_folder(out, LINE)
+    story = read_story(run.out / EVENTS_FILE, running=run.at_work)
+    config, photos_dir = _configuration(run)
+    unfinished = {name for name, stage in story.stages.items() if stage.state in BAD}
+    contents = run.contents(config, story.keys, unfinished)
+    return Holdings(run.out, story, config, photos_dir, contents, _deliverables(run, contents))
 
 
-def _configuration(out: Path) -> tuple[LineConfig | None, Path | None]:
+def _configuration(run: RunFolder) -> tuple[LineConfig | None, Path | None]:
     try:
-        photos_dir, table = load_run(out)
-        return LineConfig.model_validate(known(LineConfig, table)), photos_dir
-    except (SplatpipeError, ValueError):
+        photos_dir, config = run.config(LineConfig)
+    except SplatpipeError:
         return None, None
+    return config, photos_dir
 
 
-def _is_locked(store: Store) -> bool:
-    try:
-        with (store.stages / ".lock").open("rb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
-
-
-def _belonging(store: Store, story: Story, config: LineConfig | None) -> dict[str, Artifact]:
-    """Of each stage the artifact that the last run made or would reuse; none that a later stage's inputs contradict."""
-    chosen: dict[str, Artifact] = {}
-    digests: dict[str, str] = {}
-    for stage in LINE:
-        happened = story.stages.get(stage.name)
-        if happened is not None and happened.state in BAD:
-            continue
-        for artifact in store.artifacts(stage.name):
-            key = story.keys.get(stage.name)
-            if _belongs(artifact, stage, config, digests) and (not key or artifact.key == key):
-                chosen[stage.name] = artifact
-                digests |= {name: part.digest for name, part in artifact.parts.items()}
-                break
-    return chosen
-
-
-def _belongs(artifact: Artifact, stage: Stage, config: LineConfig | None, digests: Mapping[str, str]) -> bool:
-    inputs = artifact.manifest["inputs"]
-    reads = {name: value for name, value in inputs["reads"].items() if not name.startswith("source.")}
-    if any(digests.get(name) != value for name, value in reads.items()):
-        return False
-    if config is None or inputs["version"] != stage.version:  # an older version's options are not compared
-        return True
-    section = getattr(config, stage.name).model_dump(mode="json", exclude=set(stage.files))
-    borrowed = {name: lookup(config, name) for name in stage.borrows}
-    return bool(inputs["config"] == section and inputs["borrowed"] == borrowed)
-
-
-def _deliverables(store: Store, chosen: Mapping[str, Artifact]) -> list[Deliverable]:
-    found: dict[str, Deliverable] = {}
-    for stage in LINE:
-        for artifact in [*filter(None, [chosen.get(stage.name)]), *store.artifacts(stage.name)]:
-            for name in artifact.deliverables(stage):
-                path = store.out / name
-                if name.as_posix() not in found and path.is_file():
-                    current = artifact is chosen.get(stage.name)
-                    found[name.as_posix()] = Deliverable(name.as_posix(), path.stat().st_size, current)
-    return sorted(found.values(), key=lambda file: file.name)
+def _deliverables(run: RunFolder, contents: Contents) -> list[Deliverable]:
+    made = [(stage, contents.artifacts[stage.name]) for stage in LINE if stage.name in contents.artifacts]
+    current = {name.as_posix() for stage, artifact in made for name in artifact.deliverables(stage)}
+    return [Deliverable(name, (run.out / name).stat().st_size, name in current) for name in sorted(run.deliverables())]

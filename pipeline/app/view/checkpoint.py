@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import torch
 
-from splatpipe.pipeline.app.view.opened import Opened
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.run_folder import Contents
 from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.photos.images import reduced_view
 from splatpipe.pipeline.raster import rasterizer
@@ -62,7 +62,7 @@ class Shown:
     iteration: int
 
 
-def newest(opened: Opened) -> Source | None:
+def newest(opened: Contents) -> Source | None:
     """The furthest that a training has come; None before it can begin."""
     if "train.model" in opened.parts:
         part = opened.parts["train.model"]
@@ -96,7 +96,7 @@ def iteration_of(source: Source) -> int | None:
         return None
 
 
-def load(source: Source, opened: Opened) -> Shown:
+def load(source: Source, opened: Contents) -> Shown:
     """Read a model for drawing.
 
     Raises:
@@ -113,7 +113,7 @@ def load(source: Source, opened: Opened) -> Shown:
     return Shown(gaussians, sky, options, megapixels, iteration_of(source) or 0)
 
 
-def views_of(opened: Opened) -> tuple[View, ...]:
+def views_of(opened: Contents) -> tuple[View, ...]:
     """The photos that are trained on and measured with; none before they are undistorted."""
     part = opened.parts.get("undistort.dataset")
     if part is None:
@@ -144,7 +144,7 @@ def pictures(shown: Shown, view: View, threads: int) -> tuple[bytes, bytes]:
     return _jpeg(render), _jpeg(photo)
 
 
-def viewer(shown: Shown, source: Source, opened: Opened, name: str) -> tuple[str, bytes]:
+def viewer(shown: Shown, source: Source, opened: Contents, name: str) -> tuple[str, bytes]:
     """The 3D viewer's page of a model, and the splat that it loads from beside it, called ``SPLAT``.
 
     Args:
@@ -167,7 +167,7 @@ def viewer(shown: Shown, source: Source, opened: Opened, name: str) -> tuple[str
     return viewer_page(scene, SPLAT), viewer_splat(gaussians, scene.antialias)
 
 
-def _from_checkpoint(path: Path, opened: Opened) -> tuple[Gaussians, Panorama | None]:
+def _from_checkpoint(path: Path, opened: Contents) -> tuple[Gaussians, Panorama | None]:
     """The Gaussians as they are rendered; of a large file, only what that takes is read."""
     try:
         with np.load(path, allow_pickle=False) as archive:

@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.app.view.opened import Run
+from splatpipe.pipeline.app.view.log import RunLog, contents_of
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.source import AUTO, NONE, open_source
 from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
@@ -65,7 +66,7 @@ class Job:
         return 0.5 if self.config.pixel_origin == "centre" else 0.0
 
 
-def open_job(run: Run, points_file: Path | None) -> Job:
+def open_job(run: RunFolder, points_file: Path | None) -> Job:
     """Read all that marking takes.
 
     Args:
@@ -75,22 +76,24 @@ def open_job(run: Run, points_file: Path | None) -> Job:
     Raises:
         SplatpipeError: if the run is not so far, or there are no points, or they do not fit together.
     """
-    photos_dir, config = run.config()
+    photos_dir, config = run.config(LineConfig)
     source = open_source(photos_dir, run.out, LINE, _without_missing_control(config))
-    opened = run.look()
-    missing = [name for name in ("ingest.photos", "ingest.positions", "sparse.model") if name not in opened.parts]
+    parts = {name: part.path for name, part in contents_of(run, RunLog(run.out, EVENTS_FILE)).parts.items()}
+    if source.model is not None:
+        parts["sparse.model"] = source.model
+    missing = [name for name in ("ingest.photos", "ingest.positions", "sparse.model") if name not in parts]
     if missing:
         raise UsageError(
             f"{run.out} has no sparse model yet, and marking takes one to know where to look.",
             hint=f"Run first: splatpipe run {photos_dir} {run.out} --until georef",
         )
-    photos = load_photo_list(opened.parts["ingest.photos"].path).by_name()
+    photos = load_photo_list(parts["ingest.photos"]).by_name()
     text, points = _text_and_points(run, source.named.get(CONTROL), points_file, (source.folder, config.georef), photos)
     crs = parse_crs(text.table.crs)
-    model = read_model(opened.parts["sparse.model"].path, photos)
-    positions = read_positions(opened.parts["ingest.positions"].path)
+    model = read_model(parts["sparse.model"], photos)
+    positions = read_positions(parts["ingest.positions"])
     command = _command(run, text.path, config.georef.control, source.named.get(CONTROL))
-    places = (source.folder, opened.parts["ingest.photos"].path)
+    places = (source.folder, parts["ingest.photos"])
     frame = _frame(model, positions, config.georef, photos)
     return Job(points, crs, photos, *places, model, positions, frame, config.georef, text, command)
 
@@ -111,7 +114,7 @@ def _frame(model: SparseModel, positions: Positions, config: GeorefConfig, photo
 
 
 def _text_and_points(
-    run: Run,
+    run: RunFolder,
     control: Path | None,
     points_file: Path | None,
     place: tuple[Path, GeorefConfig],
@@ -156,14 +159,14 @@ def _together(known: Sequence[SurveyedPoint], stated: Sequence[SurveyedPoint], p
     return tuple(by_name.values())
 
 
-def _new_file(run: Run, folder: Path, config: GeorefConfig, name: str) -> Path:
+def _new_file(run: RunFolder, folder: Path, config: GeorefConfig, name: str) -> Path:
     """Where a control file begins: with the photos or, where nobody may write there, in OUT."""
     if config.control not in (AUTO, NONE):
         return Path(config.control)
     return (folder if os.access(folder, os.W_OK) else run.out) / name
 
 
-def _command(run: Run, path: Path, setting: str, control: Path | None) -> str:
+def _command(run: RunFolder, path: Path, setting: str, control: Path | None) -> str:
     """What takes the marks into the result; a file that the run finds by itself need not be named."""
     named = GEOREF.files["control"].names
     found = control is not None or (setting == AUTO and path.name in named and path.parent != run.out)

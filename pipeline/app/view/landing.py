@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
-from splatpipe.pipeline.app.view.files import NotThereError, open_inside
+from splatpipe.pipeline.app.view.files import NotThereError, is_inside, open_inside
 from splatpipe.pipeline.app.view.log import RunLog
-from splatpipe.pipeline.app.view.opened import REPORT, Run
-from splatpipe.pipeline.engine.session import EVENTS_FILE
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 
+REPORT = "report.html"  # the one thing for people in OUT that no stage delivers
 VIEWER = "viewer.html"
 LARGEST_METRICS = 64 << 20
 WHAT = {
@@ -31,7 +31,12 @@ WHAT = {
 SHOWN_IN_BROWSER = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
 
 
-def landing(run: Run, marking: bool) -> dict[str, Any]:
+def fetchable(run: RunFolder) -> tuple[str, ...]:
+    """The files that may be fetched, relative to OUT: the report, and what stages deliver to people."""
+    return tuple(name for name in (REPORT, *run.deliverables()) if is_inside(run.out, name))
+
+
+def landing(run: RunFolder, marking: bool) -> dict[str, Any]:
     """What the landing page says.
 
     Args:
@@ -40,8 +45,8 @@ def landing(run: Run, marking: bool) -> dict[str, Any]:
     """
     log = RunLog(run.out, EVENTS_FILE)
     log.read()
-    names = run.deliverables()
-    at_work = run.is_at_work()
+    names = fetchable(run)
+    at_work = run.at_work
     state = _state(log, at_work)
     return {
         "name": run.name,
@@ -99,7 +104,7 @@ def _figures(metrics: Mapping[str, JSON]) -> list[dict[str, str]]:
     ]
 
 
-def _read_json(run: Run, name: str) -> Mapping[str, JSON]:
+def _read_json(run: RunFolder, name: str) -> Mapping[str, JSON]:
     try:
         file = open_inside(run.out, name)
         with os.fdopen(file.descriptor, "rb") as stream:
@@ -109,7 +114,7 @@ def _read_json(run: Run, name: str) -> Mapping[str, JSON]:
     return found if isinstance(found, dict) else {}
 
 
-def _file(run: Run, name: str) -> dict[str, Any]:
+def _file(run: RunFolder, name: str) -> dict[str, Any]:
     size = (run.out / name).lstat().st_size
     shown = PurePosixPath(name).suffix in SHOWN_IN_BROWSER
     return {"name": name, "size": _bytes(size), "text": WHAT.get(name, ""), "shown": shown}

@@ -10,10 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatpipe.pipeline.app.view.log import RunLog
-from splatpipe.pipeline.app.view.opened import Opened, Run
+from splatpipe.pipeline.app.view.log import RunLog, contents_of
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.session import EVENTS_FILE
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, Contents, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.dataset import View
 
@@ -33,11 +32,11 @@ class Live:
         run: The run.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RunFolder) -> None:
         self._run = run
         self._lock = threading.Lock()
         self._log = RunLog(run.out, EVENTS_FILE)
-        self._opened = Opened({}, {}, {})
+        self._opened = Contents()
         self._looked_s = -LOOK_EVERY_S
         self._renderer = ThreadPoolExecutor(1, "render")  # one at a time
         self._model: tuple[str, Shown] | None = None
@@ -65,7 +64,7 @@ class Live:
                 model["in_3d"] = source.plan is not None
             return {
                 "name": self._run.name,
-                "at_work": self._run.is_at_work(),
+                "at_work": self._run.at_work,
                 "finished": log.finished,
                 "started_s": log.started_s,
                 "last_s": log.last_s,
@@ -116,7 +115,7 @@ class Live:
             self._viewer = source.stamp, page.encode(), splat
         return self._viewer[1:]
 
-    def _load(self, source: Source, opened: Opened) -> Shown:
+    def _load(self, source: Source, opened: Contents) -> Shown:
         from splatpipe.pipeline.app.view import checkpoint
 
         if self._model is None or self._model[0] != source.stamp:
@@ -143,12 +142,12 @@ class Live:
             self._pictures.popitem(last=False)
         return made
 
-    def _look(self) -> tuple[Opened, tuple[View, ...]]:
+    def _look(self) -> tuple[Contents, tuple[View, ...]]:
         """What there is, at most so old; called with the lock held."""
         from splatpipe.pipeline.app.view import checkpoint
 
         if time.monotonic() - self._looked_s >= LOOK_EVERY_S:
-            self._opened = self._run.look()
+            self._opened = contents_of(self._run, self._log)
             self._looked_s = time.monotonic()
             part = self._opened.parts.get("undistort.dataset")
             path = None if part is None else part.path

@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.app.view.files import NotThereError, open_inside
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.stages.options import LineConfig
 
 LONGEST_LINE = 1 << 18
 READ_AT_ONCE = 8 << 20
@@ -104,6 +107,7 @@ class RunLog:
     def __init__(self, out: Path, name: str) -> None:
         self._out, self._name = out, name
         self._inode, self._offset, self._rest = "", 0, b""
+        self.keys: dict[str, str] = {}  # the last known one of each stage, in any run
         self._begin()
 
     def _begin(self) -> None:
@@ -124,6 +128,7 @@ class RunLog:
             inode = file.tag.partition("-")[0]
             if inode != self._inode or file.size < self._offset:
                 self._inode, self._offset, self._rest = inode, 0, b""
+                self.keys = {}
                 self._begin()
             while self._offset < file.size:
                 chunk = os.pread(file.descriptor, READ_AT_ONCE, self._offset)
@@ -165,7 +170,14 @@ class RunLog:
         elif stage in self.stages:
             self._stage_event(kind, self.stages[stage], data, time_s)
 
+    @property
+    def unfinished(self) -> set[str]:
+        """Stages that the last run began and did not end."""
+        return {name for name, stage in self.stages.items() if stage.state in ("running", "failed")}
+
     def _stage_event(self, kind: str, state: StageState, data: Mapping[str, JSON], time_s: float) -> None:
+        if "key" in data:
+            self.keys[state.name] = str(data["key"])
         if kind == "progress":
             state.progress(data, time_s)
         elif kind == "stage_started":
@@ -174,3 +186,18 @@ class RunLog:
             state.state, state.seconds = kind.removeprefix("stage_").replace("finished", "done"), float(data["seconds"])
         elif kind == "stage_failed":
             state.state, state.message = "failed", f"{data['message']} {data.get('hint', '')}".strip()
+
+
+def contents_of(run: RunFolder, log: RunLog) -> Contents:
+    """What there is of a run now.
+
+    Args:
+        run: The run.
+        log: Its log; it is read on.
+    """
+    log.read()
+    try:
+        _, config = run.config(LineConfig)
+    except SplatpipeError:
+        config = None
+    return run.contents(config, log.keys, log.unfinished)

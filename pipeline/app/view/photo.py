@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from splatpipe.pipeline.photos.photo_list import Photo, decode, open_picture, photo_path
+from splatpipe.pipeline.photos.photo_list import Photo, decode, open_picture, photo_bytes
 
 LARGEST_BYTES = 256 << 20
 SOI, SOS, APP0, APP1, APP15, COMMENT, APP2, APP14 = 0xD8, 0xDA, 0xE0, 0xE1, 0xEF, 0xFE, 0xE2, 0xEE
@@ -31,14 +31,14 @@ def shown_photo(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes, str]
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
     """
-    path = photo_path(photo, part, photos_dir)
+    data = photo_bytes(photo, part, photos_dir)
     try:
-        if path.stat().st_size <= LARGEST_BYTES:
-            with open_picture(path) as picture:
+        if len(data) <= LARGEST_BYTES:
+            with open_picture(io.BytesIO(data)) as picture:
                 plain = picture.format == "JPEG" and picture.mode in PLAIN_MODES
                 plain = plain and picture.size == (photo.width, photo.height)
             if plain:
-                return without_metadata(path.read_bytes()), "image/jpeg"
+                return without_metadata(data), "image/jpeg"
     except (OSError, ValueError, SyntaxError):
         pass  # told by the reader below
     pixels = decode(photo, part, photos_dir)

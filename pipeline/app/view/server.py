@@ -23,11 +23,12 @@ from starlette.types import ASGIApp
 
 from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, NotThereError, open_inside
 from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, Guard
-from splatpipe.pipeline.app.view.landing import landing
+from splatpipe.pipeline.app.view.landing import fetchable, landing
 from splatpipe.pipeline.app.view.live import Live
-from splatpipe.pipeline.app.view.opened import Run, open_run
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, Stopped
+from splatpipe.pipeline.engine.run_folder import RunFolder, open_run_folder
 from splatpipe.pipeline.web import asset
+from splatpipe.stages.line import LINE
 
 ADDRESS = "127.0.0.1"
 MARKING_PORT = (
@@ -73,14 +74,14 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
         SplatpipeError: if there is no run, or nothing to mark.
         MachineError: if the port is taken.
     """
-    run = open_run(out)
+    run = open_run_folder(out, LINE)
     listening = _listen_for_marks() if options.mark and options.port == 0 else _listen(options.port)
     live, token = Live(run), secrets.token_urlsafe(32)
     pages = Pages(run, live, token)
     try:
         routes = [*(_marking(pages, options, say) if options.mark else ()), *pages.routes()]
         start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
-        start += "mark" if options.mark else "live" if run.is_at_work() else ""
+        start += "mark" if options.mark else "live" if run.at_work else ""
         _take_signals_back()
 
         def ready() -> None:
@@ -192,7 +193,7 @@ class Pages:
 
     marking = False
 
-    def __init__(self, run: Run, live: Live, token: str) -> None:
+    def __init__(self, run: RunFolder, live: Live, token: str) -> None:
         self.run, self.live, self.token = run, live, token
         folder = Path(__file__).parent / "pages"
         self._templates = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True)
@@ -257,7 +258,7 @@ class Pages:
     def _file(self, request: Request) -> Response:
         """A file that the run delivers: its name is compared, and nothing is made of it."""
         path = request.path_params["path"]
-        if path not in self.run.deliverables():
+        if path not in fetchable(self.run):
             raise HTTPException(404)
         try:
             file = open_inside(self.run.out, path)
