@@ -76,7 +76,7 @@ def base_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
         f"train.iterations={arguments.iterations}",
         f"train.max_gaussians={arguments.max_gaussians}",
         f"undistort.max_megapixels={arguments.megapixels!r}",
-        "evaluate.every=4",
+        "split.every=4",
         *base_of(arguments.variants),
         *split(arguments.base),
     )
@@ -197,7 +197,7 @@ def followed(case: Case, sets: Sequence[str], dataset: Path, arguments: argparse
     facts |= {"json": out / CURVE, "iterations": config.train.iterations}
     facts |= {"max-gaussians": config.train.max_gaussians}
     words = [word for key, value in facts.items() for word in (f"--{key}", str(value))]
-    command = Command(name, (str(FOLLOW), *words, "--held-out", config.evaluate.views, "--set", *sets), out / "log")
+    command = Command(name, (str(FOLLOW), *words, "--held-out", config.split.views, "--set", *sets), out / "log")
     key = digest([case.key, arguments.curve])
     return Case(case.variant, case.capture, case.seed, key, command, out, followed=True)
 

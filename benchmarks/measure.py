@@ -33,7 +33,7 @@ from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import IMAGES, MODEL, View, load_views, mask_path
+from splatpipe.pipeline.photos.dataset import IMAGES, MODEL, Split, View, load_views, mask_path
 from splatpipe.pipeline.photos.images import load_colour, load_mask
 from splatpipe.pipeline.raster import _native, rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
@@ -156,7 +156,7 @@ def time_case(case: Case) -> Row:
     )
     views = load_views(Path(case.dataset))
     start = read_splat(Path(case.splat))
-    plan = make_plan(config, views, 0, "", len(start))
+    plan = make_plan(config, views, Split(tuple(view.camera.name for view in views)), len(start))
     warmup = max(case.warmup, len(views))
     steps = warmup + case.repeats
     if steps >= int(plan.options.densify_from):

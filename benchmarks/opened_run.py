@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.store import Part
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, load_views, split_views
+from splatpipe.pipeline.photos.dataset import View, load_split, load_views
 from splatpipe.pipeline.photos.images import Pixels, reduced_camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import Model, as_trained, render_pixels
@@ -45,7 +45,7 @@ class OpenedRun:
     options: rasterizer.RenderOptions
     megapixels: float | None
     views: list[View]
-    held_out: list[str]
+    held_out: tuple[str, ...]
 
     def camera(self, view: View) -> Camera:
         """A view's, at the size of training."""
@@ -68,16 +68,14 @@ def open_run(out: Path) -> OpenedRun:
         UsageError: if it is not there.
     """
     folder = open_run_folder(out, LINE)
-    photos_dir, table = folder.settings()
+    photos_dir, _ = folder.settings()
     parts = folder.lineage(EXPORT, TRAIN)
     if "train.model" not in parts:
         raise UsageError(f"{out} has no trained splat.", hint="Run to the end of training.")
     gaussians = read_splat(parts["train.model"].path)
-    options, megapixels = as_trained(parts["train.plan"].path, gaussians)
+    options, megapixels = as_trained(parts["train.rendering"].path, gaussians)
     views = load_views(parts["undistort.dataset"].path)
-    rule = table["evaluate"]
-    names = [view.camera.name for view in views]
-    _, held_out = split_views(names, rule["every"], rule["views"])
+    held_out = load_split(parts["split.views"].path).held_out
     sky = read_panorama(parts["train.sky"].path) if "train.sky" in parts else None  # runs of before there were skies
     return OpenedRun(out, photos_dir, parts, (gaussians, sky), options, megapixels, views, held_out)
 

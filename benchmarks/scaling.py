@@ -40,7 +40,7 @@ from measure import (
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.dataset import Split, load_views
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
@@ -102,7 +102,7 @@ def write_start(dataset: Path, count: int, wanted: float, threads: int) -> Path:
     views = load_views(dataset)
     path = dataset / f"{count}.ply"
     with same_bits(threads):
-        plan = make_plan(TrainConfig(), views, 0, "", count)
+        plan = make_plan(TrainConfig(), views, Split(tuple(view.camera.name for view in views)), count)
         made = scattered(read_splat(dataset / "init.ply"), count)
         write_splat(path, sized(made, [view.camera for view in views], plan, wanted))
     return path
@@ -127,11 +127,13 @@ def stage_case(case: Case) -> Row:
     )
     loop.CHECKPOINT_SECONDS, loop.CHECKPOINT_SHARE = 0.0, math.inf  # one after every iteration but the last
     parts = {"undistort.dataset": Path(case.dataset), "initialize.splat": start}
-    settings = {"evaluate.every": 0, "evaluate.views": ""}
+    names = [view.camera.name for view in load_views(Path(case.dataset))]
+    parts["split.views"] = start.with_suffix(".split.json")
+    parts["split.views"].write_text(Split(tuple(names)).to_json(), encoding="utf-8")
     out = start.with_suffix("")
     out.mkdir()
     wall, cpu = time.perf_counter(), time.process_time()
-    summary = train.run(config, Inputs(parts, out, settings, Machine("cpu", case.threads)), out, SilentReporter())
+    summary = train.run(config, Inputs(parts, out, machine=Machine("cpu", case.threads)), out, SilentReporter())
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     grown = summary["gaussians"] > MEMORY_START * cap
     if not (grown and (out / loop.CHECKPOINT).exists()):

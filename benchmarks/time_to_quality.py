@@ -8,7 +8,6 @@ are reduced and the start is made before, as the stages before training do it.
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,10 +17,10 @@ from measure import Row, SilentReporter, machine, parse, parser, prepare, report
 
 from splatpipe.pipeline.engine.config import parse_set, resolve
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.dataset import load_views, split_views
 from splatpipe.pipeline.photos.images import load_colour, load_mask
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.render.rendering import as_trained, render_pixels
+from splatpipe.pipeline.render.rendering import render_pixels
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.flatness import ends_at
@@ -86,7 +85,8 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     clocks, due, peak = Clocks(), arguments.every, 0
     views = load_views(dataset)
     start = read_splat(dataset / "init.ply")
-    plan = make_plan(config.train, views, config.evaluate.every, arguments.held_out, len(start))
+    split = split_views([view.camera.name for view in views], config.split.every, arguments.held_out)
+    plan = make_plan(config.train, views, split, len(start))
     trained_on = loop.views_of(plan, views)
     levels = coarse_levels(plan.options)
     with same_bits(arguments.threads):
@@ -115,10 +115,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
 def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
     """Mean PSNR, PSNR after a colour fit and SSIM of the views that were held out, as `evaluate` measures them."""
     gaussians = state.finished()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "plan.json"
-        path.write_text(plan.to_json(), encoding="utf-8")
-        options, _ = as_trained(path, gaussians)
+    options = plan.rendering().options(gaussians)
     model = (gaussians, None if state.sky is None else state.sky.panorama)
     measured = [
         measure(render_pixels(model, view.camera, options), load_colour(view), load_mask(view))
@@ -139,7 +136,7 @@ def passed(rows: list[Row], marks: list[float]) -> Iterator[Row]:
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--held-out", default="", help="photos to hold out, separated by commas; else evaluate.every")
+    options.add_argument("--held-out", default="", help="photos to hold out, separated by commas; else split.every")
     size = options.add_mutually_exclusive_group()
     size.add_argument("--megapixels", type=float, help="size that photos are reduced to")
     size.add_argument("--scale", type=float, default=1.0, help="factor on their sides instead")
@@ -150,7 +147,7 @@ def main() -> None:
     options.add_argument("--every", type=float, default=5.0, help="CPU seconds between measurements")
     options.add_argument("--marks", type=float, nargs="*", default=[], help="PSNR whose time is asked for, dB")
     options.add_argument(
-        "--set", nargs="*", default=[], metavar="SECTION.OPTION=VALUE", help="of initialize, train, evaluate"
+        "--set", nargs="*", default=[], metavar="SECTION.OPTION=VALUE", help="of split, initialize, train"
     )
     arguments = parse(options)
     facts = machine(arguments.threads)

@@ -17,7 +17,7 @@ from splatpipe.stages.options import LineConfig
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}")  # also a folder's
 PRESET = "standard"  # what `splatpipe run` takes without --preset
 # What all variants have in common: the dataset that they train on, and what they are measured against.
-SHARED = ("features.", "matches.", "sparse.", "undistort.max_megapixels", "evaluate.every", "evaluate.views")
+SHARED = ("features.", "matches.", "sparse.", "undistort.max_megapixels", "split.every", "split.views")
 
 
 @dataclass(frozen=True)

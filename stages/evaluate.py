@@ -17,7 +17,7 @@ from torch import Tensor
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_views, split_views
+from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.floaters import measure_floaters
@@ -34,23 +34,23 @@ MASKED_GREY = 128
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
-def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write `metrics.json` and `views/`: photo, render, error and mask of every held-out view.
 
     The pictures stay in the stored grid, not turned by EXIF's orientation: every figure comes out of them again.
     """
     views = load_views(inputs["undistort.dataset"])
-    _, held_out = split_views([view.camera.name for view in views], config.every, config.views)
+    held_out = load_split(inputs["split.views"]).held_out
     chosen = [view for view in views if view.camera.name in set(held_out)]
     gaussians = read_splat(inputs["train.model"])
-    options, megapixels = as_trained(inputs["train.plan"], gaussians)
+    options, megapixels = as_trained(inputs["train.rendering"], gaussians)
     sky = read_panorama(inputs["train.sky"])
     folder = out / "views"
     folder.mkdir(parents=True, exist_ok=True)
     if not chosen:
         report.warning(
             "No photo was held out, so nothing is measured.",
-            hint="Set evaluate.every or evaluate.views to hold some out.",
+            hint="Set split.every or split.views to hold some out.",
         )
     stems = flat_stems([view.camera.name for view in chosen])
     per_view = []

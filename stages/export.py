@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
-from splatpipe.pipeline.render.rendering import as_trained
+from splatpipe.pipeline.render.rendering import as_trained, load_rendering
 from splatpipe.pipeline.splat.dome import sky_dome
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
@@ -49,14 +49,13 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     torch.set_num_threads(1)  # matrix products may round differently on more
     frame = load_frame(inputs["georef.frame"])
     dataset = inputs["undistort.dataset"]
-    plan = _read_json(inputs["train.plan"])
     points = load_points(dataset)
     cameras = [view.camera for view in load_views(dataset)]
 
     report.progress(0, 4, "moving the model into its frame", "files")
     model = read_splat(inputs["train.model"])
     gaussians = in_world(model, frame)
-    comments = ply_comments(frame, bool(plan["options"]["antialias"]))
+    comments = ply_comments(frame, load_rendering(inputs["train.rendering"]).antialias)
     write_splat(out / "splat.ply", gaussians, comments)
     sky = read_panorama(inputs["train.sky"]) if config.sky else None
     (out / "sky").mkdir()
@@ -75,7 +74,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     if frame.origin is not None:
         report.note(told_in_a_line(placed))
     report.progress(2, 4, "collecting the figures", "files")
-    figures = collect_metrics(inputs, plan, points, len(cameras), len(gaussians))
+    figures = collect_metrics(inputs, points, len(cameras), len(gaussians))
     _write_json(out / "metrics.json", figures)
     report.progress(3, 4, "writing the viewer", "files")
     write_viewer_of(inputs, gaussians, out / "viewer", config)
@@ -96,7 +95,7 @@ def write_viewer_of(inputs: Inputs, gaussians: Gaussians, folder: Path, config: 
     folder.mkdir()
     if config.viewer_megabytes == 0.0:
         return
-    options, _ = as_trained(inputs["train.plan"], gaussians)
+    options, _ = as_trained(inputs["train.rendering"], gaussians)
     look = look_of(options, read_panorama(inputs["train.sky"]))
     held_out = {view["name"] for view in _read_json(inputs["evaluate.metrics"])["per_view"]}
     frame = load_frame(inputs["georef.frame"])
@@ -213,12 +212,11 @@ def _camera_spacing(centres: Doubles) -> float:
     return spacing if np.isfinite(spacing) else 1.0
 
 
-def collect_metrics(inputs: Inputs, plan: Facts, points: Points, registered: int, gaussians: int) -> Facts:
+def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: int) -> Facts:
     """The run's figures, as `metrics.json` has them.
 
     Args:
         inputs: The stage's.
-        plan: Training's.
         points: The sparse model's.
         registered: Photos placed.
         gaussians: In the splat.
@@ -231,18 +229,18 @@ def collect_metrics(inputs: Inputs, plan: Facts, points: Points, registered: int
         "points3d": len(points.xyz),
         "mean_reprojection_error_px": mean_error(inputs["georef.model"]),
         "gaussians": gaussians,
-        "iterations": train.get("iterations", plan["options"]["iterations"]),
-        "planned_iterations": plan["options"]["iterations"],
-        "time_budget_s": plan["options"]["time_budget_s"],
+        "iterations": train.get("iterations"),
+        "planned_iterations": train.get("planned_iterations"),
+        "time_budget_s": train.get("plan", {}).get("time_budget_s"),
         "train_seconds": train.get("train_seconds"),
-        "train_megapixels": plan["train_megapixels"],
+        "train_megapixels": train.get("train_megapixels"),
         "peak_memory_bytes": train.get("peak_memory_bytes"),
         "test_views": measured["test_views"],
         **measured["mean"],
         "floaters": measured["floaters"],
         "accuracy": measured["accuracy"],
         "per_view": measured["per_view"],
-        "seed": plan["options"]["seed"],
+        "seed": train.get("plan", {}).get("seed"),
         "device": train.get("device"),
         "versions": {name: _version(name) for name in VERSIONS} | {"python": platform.python_version()},
     }

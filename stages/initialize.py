@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.mvs.dense import DensePoints, dense_points
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_views, split_views
+from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_split, load_views
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import write_splat
 from splatpipe.pipeline.splat.sh import rgb_to_dc
@@ -64,9 +64,8 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
 
 def _sweep(views: list[View], config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> DensePoints:
     """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
-    names = [view.camera.name for view in views]
-    kept, _ = split_views(names, inputs.settings["evaluate.every"], inputs.settings["evaluate.views"])
-    used = [view for view in views if view.camera.name in set(kept)]
+    kept = set(load_split(inputs["split.views"]).train)
+    used = [view for view in views if view.camera.name in kept]
     dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
     return dense_points(dataset, used, config.dense_points, out, threads, report)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from splatpipe.pipeline.engine.stage import NamedFile, Stage
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.options import IngestConfig, UndistortConfig
+from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.pipeline.survey.options import GeorefConfig
@@ -82,29 +82,36 @@ UNDISTORT = Stage(
     parts={"dataset": "dataset"},
     entry="splatpipe.stages.undistort:run",
 )
+SPLIT = Stage(
+    "split",
+    version=1,
+    config=SplitConfig,
+    reads=("undistort.dataset",),
+    parts={"views": "split.json"},
+    entry="splatpipe.stages.split:run",
+)
 INITIALIZE = Stage(
     "initialize",
     version=1,
     config=InitializeConfig,
-    reads=("undistort.dataset",),
+    reads=("undistort.dataset", "split.views"),
     parts={"splat": "init.ply"},
     entry="splatpipe.stages.initialize:run",
-    borrows=("evaluate.every", "evaluate.views"),
 )
 TRAIN = Stage(
     "train",
-    version=4,
+    version=5,
     config=TrainConfig,
-    reads=("undistort.dataset", "initialize.splat"),
+    reads=("undistort.dataset", "split.views", "initialize.splat"),
     parts={
         "model": "model.ply",
         "history": "history.json",
         "plan": "plan.json",
+        "rendering": "rendering.json",
         "exposures": "exposures.json",
         "sky": "sky.npz",
     },
     entry="splatpipe.stages.train:run",
-    borrows=("evaluate.every", "evaluate.views"),
     resumable=True,
 )
 EVALUATE = Stage(
@@ -113,9 +120,10 @@ EVALUATE = Stage(
     config=EvaluateConfig,
     reads=(
         "train.model",
-        "train.plan",
+        "train.rendering",
         "train.sky",
         "undistort.dataset",
+        "split.views",
         "georef.frame",
         "georef.control",
         "georef.accuracy",
@@ -129,7 +137,7 @@ EXPORT = Stage(
     config=ExportConfig,
     reads=(
         "train.model",
-        "train.plan",
+        "train.rendering",
         "train.sky",
         "georef.frame",
         "georef.model",
@@ -155,11 +163,11 @@ FLYTHROUGH = Stage(
     "flythrough",
     version=1,
     config=FlythroughConfig,
-    reads=("train.model", "train.plan", "train.sky", "undistort.dataset"),
+    reads=("train.model", "train.rendering", "train.sky", "undistort.dataset"),
     parts={"film": "film"},
     entry="splatpipe.stages.flythrough:run",
     borrows=("train.time_budget_s",),
     deliverables=("film",),
 )
 
-LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, INITIALIZE, TRAIN, EVALUATE, EXPORT, FLYTHROUGH)
+LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, SPLIT, INITIALIZE, TRAIN, EVALUATE, EXPORT, FLYTHROUGH)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from splatpipe.pipeline.engine.stage import StageConfig
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.options import IngestConfig, UndistortConfig
+from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.pipeline.survey.options import GeorefConfig
@@ -16,12 +19,18 @@ from splatpipe.pipeline.web.options import ExportConfig
 class LineConfig(StageConfig):
     """Everything that changes the answer, a section a stage."""
 
+    gone: ClassVar[Mapping[str, str]] = {
+        "evaluate.every": "It is called split.every.",
+        "evaluate.views": "It is called split.views.",
+    }
+
     ingest: IngestConfig = IngestConfig()
     features: FeaturesConfig = FeaturesConfig()
     matches: MatchesConfig = MatchesConfig()
     sparse: SparseConfig = SparseConfig()
     georef: GeorefConfig = GeorefConfig()
     undistort: UndistortConfig = UndistortConfig()
+    split: SplitConfig = SplitConfig()
     initialize: InitializeConfig = InitializeConfig()
     train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()

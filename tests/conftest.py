@@ -18,7 +18,7 @@ DEMO = (
     "undistort.max_megapixels=0.1",
     "train.iterations=600",
     "flythrough.seconds=4.0",
-    "evaluate.every=4",
+    "split.every=4",
 )
 PATIENCE_MS = 240_000.0  # for what the browser is to show: far more than it takes, of a busy machine
 

@@ -118,7 +118,7 @@ def test_following_a_training_tells_how_far_its_end_is_below_its_best(dataset: P
         (["--variant", "wrong=train.iterations=-3"], "Variant wrong: train.iterations = -3"),
         (["--variant", "seeded=train.seed=7"], "Variant seeded: train.seed is not a variant's"),
         (["--variant", "front=sparse.min_model_size=4"], "would not act on this variant alone"),
-        (["--variant", "easy=evaluate.every=2"], "would not act on this variant alone"),
+        (["--variant", "easy=split.every=2"], "would not act on this variant alone"),
         (["--variant", "base=train.antialias=true"], "cannot be a variant's name"),
         (["--only", "nothing"], "There is no variant nothing. There are: defaults"),
         (["--base", "train.nonsense=1"], "Variant base: There is no option train.nonsense"),

@@ -199,15 +199,19 @@ def test_evaluate_leaves_it_in_its_metrics(parts: dict[str, Path], tmp_path: Pat
 
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")
     write_splat(tmp_path / "model.ply", wall())
-    plan = make_plan(TrainConfig(antialias=False), load_views(dataset), 4, "", 1)
-    (tmp_path / "plan.json").write_text(plan.to_json())
+    plan = make_plan(TrainConfig(antialias=False), load_views(dataset), tiny_scene.split_of(load_views(dataset), 4), 1)
+    (tmp_path / "rendering.json").write_text(plan.rendering().to_json())
     write_panorama(tmp_path / "sky.npz", None)
-    files = {"train.model": "model.ply", "train.plan": "plan.json", "train.sky": "sky.npz"}
+    files = {"train.model": "model.ply", "train.rendering": "rendering.json", "train.sky": "sky.npz"}
     inputs = Inputs(
-        {name: tmp_path / file for name, file in files.items()} | parts | {"undistort.dataset": dataset}, tmp_path
+        {name: tmp_path / file for name, file in files.items()}
+        | parts
+        | {"undistort.dataset": dataset}
+        | tiny_scene.split_part(dataset, 4),
+        tmp_path,
     )
     (tmp_path / "out").mkdir()
-    evaluate.run(EvaluateConfig(every=4), inputs, tmp_path / "out", tiny_scene.Recorder())
+    evaluate.run(EvaluateConfig(), inputs, tmp_path / "out", tiny_scene.Recorder())
     accuracy = json.loads((tmp_path / "out/metrics.json").read_text())["accuracy"]
     pixel_m = 4.0 * WORLD_FROM_MODEL.scale / tiny_scene.FOCAL
     assert accuracy["splat"]["tables"]["all"]["rmse_3d_m"] < pixel_m / 4.0  # no Gaussian is wider than a pixel here

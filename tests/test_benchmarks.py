@@ -79,7 +79,7 @@ def pairs_by_definition(gaussians: Gaussians, camera: Camera, options: RenderOpt
 def test_contributing_pairs_are_those_of_the_definition(dataset: Path, opacity_logit: float) -> None:
     gaussians = tiny_scene.true_model(600)
     gaussians.opacity_logits[:] = opacity_logit  # the last: pixels end early
-    plan = make_plan(tiny_scene.plain(), load_views(dataset), 0, "", len(gaussians))
+    plan = make_plan(tiny_scene.plain(), load_views(dataset), tiny_scene.split_of(load_views(dataset)), len(gaussians))
     for camera in tiny_scene.cameras()[::4]:
         counted = measure.contributing_pairs(gaussians, camera, plan, 1)
         expected = pairs_by_definition(gaussians, camera, RenderOptions(0, near=plan.near))
@@ -127,14 +127,14 @@ def test_time_to_quality_trains_and_measures_what_the_line_does(dataset: Path, t
     (row,) = found["rows"]
 
     parts = {"undistort.dataset": dataset, "initialize.splat": tmp_path / "init.ply"}
-    parts |= {"train.model": tmp_path / "model.ply", "train.plan": tmp_path / "plan.json"}
+    parts |= {"train.model": tmp_path / "model.ply", "train.rendering": tmp_path / "rendering.json"}
     parts["train.sky"] = tmp_path / "sky.npz"
-    settings = {"evaluate.every": 0, "evaluate.views": held_out}
-    inputs = Inputs(parts, tmp_path, settings, Machine("cpu", 1))
+    parts |= tiny_scene.split_part(dataset, names=held_out)
+    inputs = Inputs(parts, tmp_path, machine=Machine("cpu", 1))
     recorder = tiny_scene.Recorder()
     initialize.run(InitializeConfig(), inputs, tmp_path, recorder)
     summary = train.run(TrainConfig(iterations=iterations), inputs, tmp_path, recorder)
-    quality = evaluate.run(EvaluateConfig(every=0, views=held_out), inputs, tmp_path, recorder)
+    quality = evaluate.run(EvaluateConfig(), inputs, tmp_path, recorder)
     assert (row["iteration"], row["gaussians"]) == (iterations, summary["gaussians"])
     assert row["psnr"] == pytest.approx(quality["psnr"], abs=1e-6)
     assert row["ssim"] == pytest.approx(quality["ssim"], abs=1e-6)

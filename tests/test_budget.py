@@ -186,8 +186,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def make_inputs(scene: Path, began_s: float = 0.0) -> Inputs:
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-    settings = {"evaluate.every": 4, "evaluate.views": ""}
-    return Inputs(parts, scene, settings, Machine("cpu", 1, began_s))
+    parts |= tiny_scene.split_part(scene / "dataset", 4)
+    return Inputs(parts, scene, machine=Machine("cpu", 1, began_s))
 
 
 def read_plan(out: Path) -> Plan:
@@ -304,9 +304,9 @@ def test_photos_are_trained_on_and_measured_at_the_planned_size(
     trained(scene, out, plan, monkeypatch)
     widths = {point["width"] for point in json.loads((out / "history.json").read_text())["curve"]}
     assert len(widths) == 1 and widths.pop() < tiny_scene.WIDTH
-    parts = {"train.model": out / "model.ply", "train.plan": out / "plan.json", "train.sky": out / "sky.npz"}
-    parts["undistort.dataset"] = scene / "dataset"
-    evaluate.run(EvaluateConfig(every=4), Inputs(parts, scene), out, tiny_scene.Recorder())
+    parts = {"train.model": out / "model.ply", "train.rendering": out / "rendering.json", "train.sky": out / "sky.npz"}
+    parts |= {"undistort.dataset": scene / "dataset"} | tiny_scene.split_part(scene / "dataset", 4)
+    evaluate.run(EvaluateConfig(), Inputs(parts, scene), out, tiny_scene.Recorder())
     for view in json.loads((out / "metrics.json").read_text())["per_view"]:
         assert view["width"] * view["height"] <= 2000 and view["psnr"] > 10.0
 
@@ -336,7 +336,8 @@ from splatpipe.pipeline.train.memory import FIXED_BYTES, resident_bytes
 scene, out = Path(sys.argv[2]), Path(sys.argv[3])
 limit = resident_bytes() + FIXED_BYTES + int(sys.argv[4])
 parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-inputs = Inputs(parts, scene, {"evaluate.every": 4, "evaluate.views": ""}, Machine("cpu", 1))
+parts |= tiny_scene.split_part(scene / "dataset", 4)
+inputs = Inputs(parts, scene, machine=Machine("cpu", 1))
 config = tiny_scene.plain(iterations=40, densify_from=2, densify_every=1, densify_until=40, densify_gradient=1e-12,
                      prune_opacity=0.0, prune_extent=0.0, max_memory_bytes=limit)
 recorder = tiny_scene.Recorder()
@@ -383,7 +384,7 @@ def test_a_budget_long_enough_for_a_film_keeps_time_for_it() -> None:
     left = []
     for budget in (FILM_FROM_BUDGET_S - 1.0, FILM_FROM_BUDGET_S):
         config = TrainConfig(time_budget_s=budget)
-        plan = make_plan(config, views, 4, "", 100)
+        plan = make_plan(config, views, tiny_scene.split_of(views, 4), 100)
         scene = planning.Scene(config, tiny_scene.true_model(), views, 3, Machine())
         left.append(planning._task(plan, scene, measured, 500.0).seconds(0.5))
     assert left[0] - left[1] == pytest.approx(planning.FILM_VIEWS * 2.0 * 0.5)

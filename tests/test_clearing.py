@@ -66,7 +66,7 @@ def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: Free
 @pytest.mark.parametrize("density", ["published", "absolute", "mcmc"])
 def test_every_strategy_takes_it_away(dataset: Path, space: FreeSpace, density: str) -> None:
     config = TrainConfig.model_validate({"prune_free_space": 2, "density": density})
-    plan = make_plan(config, load_views(dataset), 0, "", 8)
+    plan = make_plan(config, load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     state = TrainState.begin(haze_and_wall(), plan)
     state.free_space = space
     state.control_density(plan.options, plan.extent, 8, LOOKS)
@@ -75,7 +75,7 @@ def test_every_strategy_takes_it_away(dataset: Path, space: FreeSpace, density: 
 
 
 def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: Path, space: FreeSpace) -> None:
-    plan = make_plan(TrainConfig(prune_free_space=2), load_views(dataset), 0, "", 8)
+    plan = make_plan(TrainConfig(prune_free_space=2), load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     step = STEPS_BETWEEN * int(plan.options.densify_every)
     after = (int(plan.options.densify_until) // step + 1) * step
     assert is_clearing_step(space, plan.options, after) and not is_clearing_step(space, plan.options, after + 1)

@@ -72,6 +72,8 @@ def test_the_line_is_whole() -> None:
         ({"train": {"iterations": -5}}, "train.iterations = -5"),
         ({"train": {"iterations": "many"}}, "train.iterations = 'many'"),
         ({"train": 5}, "train = 5"),
+        ({"evaluate": {"every": 4}}, "no option evaluate.every any more. It is called split.every."),
+        ({"evaluate": {"views": "a"}}, "no option evaluate.views any more. It is called split.views."),
         ({"features": {"extractor": "aliked"}}, "features.extractor = 'aliked'"),
     ],
 )
@@ -118,7 +120,7 @@ def test_an_unknown_preset_is_refused() -> None:
 
 def test_text_options_are_taken_as_they_are_written() -> None:
     """A photo's name such as 100_7105 is a number to TOML."""
-    assert parse_set("evaluate.views=100_7105", LineConfig) == {"evaluate": {"views": "100_7105"}}
+    assert parse_set("split.views=100_7105", LineConfig) == {"split": {"views": "100_7105"}}
 
 
 @pytest.mark.parametrize(

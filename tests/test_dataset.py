@@ -10,9 +10,11 @@ import pytest
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import (
+    Split,
     image_path,
     load_points,
     load_points_and_tracks,
+    load_split,
     load_views,
     mask_path,
     split_views,
@@ -165,14 +167,14 @@ def test_a_hostile_model_is_refused_and_never_more_than_its_bytes_are_read(tmp_p
 
 def test_every_eighth_view_is_held_out_starting_with_the_first() -> None:
     names = [f"{number:02d}" for number in range(20)]
-    training, held_out = split_views(names[::-1], 8, "")
-    assert held_out == ["00", "08", "16"]
-    assert training == sorted(set(names) - set(held_out))
-    assert split_views(names, 0, "") == (names, [])
+    found = split_views(names[::-1], 8, "")
+    assert found.held_out == ("00", "08", "16")
+    assert found.train == tuple(sorted(set(names) - set(found.held_out)))
+    assert split_views(names, 0, "") == Split(tuple(names))
 
 
 def test_named_views_are_held_out_instead() -> None:
-    assert split_views(["a b", "c", "d"], 8, " c, a b,") == (["d"], ["a b", "c"])
+    assert split_views(["a b", "c", "d"], 8, " c, a b,") == Split(("d",), ("a b", "c"))
     with pytest.raises(SplatpipeError, match="names x, which") as error:
         split_views(["a", "b"], 8, "x")
     assert "a, b" in error.value.hint
@@ -180,13 +182,25 @@ def test_named_views_are_held_out_instead() -> None:
 
 def test_views_may_be_named_without_suffix_case_and_folder() -> None:
     names = ["100_7105.JPG", "100_7106.JPG", "a/1.jpg", "b/1.jpg", "b/2.png"]
-    assert split_views(names, 8, "100_7105, A/1,2")[1] == ["100_7105.JPG", "a/1.jpg", "b/2.png"]
+    assert split_views(names, 8, "100_7105, A/1,2").held_out == ("100_7105.JPG", "a/1.jpg", "b/2.png")
     for unclear in ("1", "1.jpg", "100_710", "c/1"):
         with pytest.raises(SplatpipeError, match=f"names {unclear}, which"):
             split_views(names, 8, unclear)
-    assert split_views(["x", "x.jpg", "X.jpg"], 8, "x,x.jpg")[1] == ["x", "x.jpg"]
+    assert split_views(["x", "x.jpg", "X.jpg"], 8, "x,x.jpg").held_out == ("x", "x.jpg")
 
 
 def test_something_must_be_left_to_train_on() -> None:
     with pytest.raises(SplatpipeError, match="none is left"):
         split_views(["a", "b"], 1, "")
+
+
+def test_a_split_survives_its_file_and_a_broken_one_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "split.json"
+    for found in (Split(("a", "б c")), Split(("a",), ("d/e.jpg",))):
+        path.write_text(found.to_json(), encoding="utf-8")
+        assert load_split(path) == found
+    for text in ("", "[]", '{"train": ["a"]}', '{"train": 5, "held_out": []}'):
+        path.write_text(text)
+        with pytest.raises(StageError, match=r"split\.json") as raised:
+            load_split(path)
+        assert "--rerun-from split" in raised.value.hint

@@ -23,7 +23,7 @@ from splatpipe.stages.initialize import run
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos
 from corner_photos import FOCAL, HEIGHT, ROOM_M, WIDTH, Recorder
-from tiny_scene import write_model
+from tiny_scene import split_part, write_model
 
 PHOTOS = 6
 SPARSE_M = 1.2  # sparse points lie within this distance of the corner only
@@ -94,8 +94,9 @@ def initialized(
 ) -> tuple[dict, bytes]:
     """Summary of the stage and its file."""
     out.mkdir(parents=True)
-    settings = {"evaluate.every": 0, "evaluate.views": held_out}
-    inputs = Inputs({"undistort.dataset": dataset}, out, settings, Machine(threads=threads))
+    inputs = Inputs(
+        {"undistort.dataset": dataset} | split_part(dataset, names=held_out), out, machine=Machine(threads=threads)
+    )
     summary = run(InitializeConfig(**{"dense": "sweep", **options}), inputs, out, Recorder())
     assert [path.name for path in out.iterdir()] == ["init.ply"]
     return dict(summary), (out / "init.ply").read_bytes()

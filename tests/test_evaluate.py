@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -35,18 +36,25 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     model = tiny_scene.true_model()
     model.means = model.means + 0.01
     write_splat(folder / "model.ply", model)
-    plan = make_plan(TrainConfig(), load_views(dataset), 4, "", len(model))
-    (folder / "plan.json").write_text(plan.to_json())
+    plan = make_plan(TrainConfig(), load_views(dataset), tiny_scene.split_of(load_views(dataset), 4), len(model))
+    (folder / "rendering.json").write_text(plan.rendering().to_json())
     write_panorama(folder / "sky.npz", None)
-    parts = {"model": folder / "model.ply", "plan": folder / "plan.json", "sky": folder / "sky.npz"}
+    parts = {"model": folder / "model.ply", "rendering": folder / "rendering.json", "sky": folder / "sky.npz"}
     parts = {f"train.{name}": path for name, path in parts.items()} | {"undistort.dataset": dataset}
+    parts |= tiny_scene.split_part(dataset, 4)
     return Inputs(parts, folder)
+
+
+def held_out(inputs: Inputs, every: int, names: str = "") -> Inputs:
+    """The same with others held out."""
+    part = tiny_scene.split_part(inputs["undistort.dataset"], every, names)
+    return replace(inputs, parts={**inputs.parts, **part})
 
 
 @pytest.fixture(scope="module")
 def left(inputs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("left")
-    evaluate.run(EvaluateConfig(every=4), inputs, out, tiny_scene.Recorder())
+    evaluate.run(EvaluateConfig(), inputs, out, tiny_scene.Recorder())
     return out
 
 
@@ -68,7 +76,7 @@ def test_every_nth_view_is_measured_and_the_means_are_theirs(left: Path) -> None
 def test_floaters_are_measured_with_or_without_held_out_views(left: Path, inputs: Inputs, tmp_path: Path) -> None:
     figures = json.loads((left / "metrics.json").read_text())["floaters"]
     assert figures["depth_disagreement"]["pixels"] > 0 and 0.0 <= figures["depth_disagreement"]["median"] < 0.1
-    evaluate.run(EvaluateConfig(every=0), inputs, tmp_path, tiny_scene.Recorder())
+    evaluate.run(EvaluateConfig(), held_out(inputs, 0), tmp_path, tiny_scene.Recorder())
     assert json.loads((tmp_path / "metrics.json").read_text())["floaters"] == figures
 
 
@@ -111,7 +119,7 @@ def test_error_picture_has_a_fixed_scale_and_greys_what_is_masked() -> None:
 
 def test_without_held_out_views_it_says_so_and_leaves_valid_figures(inputs: Inputs, tmp_path: Path) -> None:
     recorder = tiny_scene.Recorder()
-    summary = evaluate.run(EvaluateConfig(every=0), inputs, tmp_path, recorder)
+    summary = evaluate.run(EvaluateConfig(), held_out(inputs, 0), tmp_path, recorder)
     assert "held out" in recorder.warnings[0]
     assert summary["test_views"] == 0 and summary["psnr"] is None
     result = json.loads((tmp_path / "metrics.json").read_text())
@@ -120,8 +128,8 @@ def test_without_held_out_views_it_says_so_and_leaves_valid_figures(inputs: Inpu
 
 
 def test_named_views_are_taken(inputs: Inputs, tmp_path: Path) -> None:
-    config = EvaluateConfig(views="flight 1/photo_2.png, flight 1/photo_7.png")
-    assert evaluate.run(config, inputs, tmp_path, tiny_scene.Recorder())["test_views"] == 2
+    named = held_out(inputs, 8, "flight 1/photo_2.png, flight 1/photo_7.png")
+    assert evaluate.run(EvaluateConfig(), named, tmp_path, tiny_scene.Recorder())["test_views"] == 2
 
 
 def test_wholly_masked_view_has_no_figures_and_the_mean_leaves_it_out() -> None:
@@ -143,8 +151,8 @@ def test_file_names_are_safe_and_unique_whatever_the_photos_are_called() -> None
 
 
 def test_broken_plan_says_what_to_do(inputs: Inputs, tmp_path: Path) -> None:
-    (tmp_path / "plan.json").write_text("{}")
-    broken = Inputs({**inputs.parts, "train.plan": tmp_path / "plan.json"}, tmp_path)
-    with pytest.raises(StageError, match=r"plan\.json") as raised:
+    (tmp_path / "rendering.json").write_text("{}")
+    broken = Inputs({**inputs.parts, "train.rendering": tmp_path / "rendering.json"}, tmp_path)
+    with pytest.raises(StageError, match=r"rendering\.json") as raised:
         evaluate.run(EvaluateConfig(), broken, tmp_path, tiny_scene.Recorder())
     assert raised.value.hint

@@ -84,19 +84,26 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     dataset = tiny_scene.write_dataset(folder / "dataset")
     model = tiny_scene.true_model()
     write_splat(folder / "model.ply", model)
-    plan = make_plan(TrainConfig(iterations=123, seed=4), load_views(dataset), 4, "", len(model))
-    (folder / "plan.json").write_text(plan.to_json())
+    plan = make_plan(
+        TrainConfig(),
+        load_views(dataset),
+        tiny_scene.split_of(load_views(dataset), 4),
+        len(model),
+    )
+    (folder / "rendering.json").write_text(plan.rendering().to_json())
     parts = {
         "train.model": folder / "model.ply",
-        "train.plan": folder / "plan.json",
+        "train.rendering": folder / "rendering.json",
         "train.sky": folder / "sky.npz",
         "undistort.dataset": dataset,
         "georef.model": dataset / "sparse/0",
         "georef.frame": write_frame(folder / "frame.json"),
     }
+    parts |= tiny_scene.split_part(dataset, 4)
     write_panorama(folder / "sky.npz", None)
-    evaluate.run(EvaluateConfig(every=4), Inputs(parts, folder), folder, tiny_scene.Recorder())
-    train = {"train_seconds": 12.5, "peak_memory_bytes": 10**9, "device": "cpu"}
+    evaluate.run(EvaluateConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    train = {"train_seconds": 12.5, "peak_memory_bytes": 10**9, "device": "cpu", "iterations": 123, "plan": {"seed": 4}}
+    train |= {"train_megapixels": round(tiny_scene.WIDTH * tiny_scene.HEIGHT / 1e6, 4)}
     parts |= {"evaluate.metrics": folder / "metrics.json"}
     return Inputs(parts, folder, summaries={"train": train})
 

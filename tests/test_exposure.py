@@ -43,10 +43,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(scene: Path, out: Path, exposure: str) -> Path:
     out.mkdir(parents=True)
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-    settings = {"evaluate.every": 0, "evaluate.views": ""}
+    parts |= tiny_scene.split_part(scene / "dataset")
     options: dict[str, object] = {"iterations": 400, "densify_gradient": 1e-3, "exposure": exposure}
     config = tiny_scene.plain(**options, lr_exposure=1e-2)
-    train.run(config, Inputs(parts, scene, settings, Machine("cpu", 2)), out, tiny_scene.Recorder())
+    train.run(config, Inputs(parts, scene, machine=Machine("cpu", 2)), out, tiny_scene.Recorder())
     return out
 
 

@@ -91,7 +91,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(scene: Path, out: Path, config: TrainConfig) -> tuple[dict[str, object], tiny_scene.Recorder]:
     out.mkdir(exist_ok=True)
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-    inputs = Inputs(parts, scene, {"evaluate.every": 4, "evaluate.views": ""}, Machine("cpu", 1))
+    parts |= tiny_scene.split_part(scene / "dataset", 4)
+    inputs = Inputs(parts, scene, machine=Machine("cpu", 1))
     recorder = tiny_scene.Recorder()
     return dict(train.run(config, inputs, out, recorder)), recorder
 

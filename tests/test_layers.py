@@ -92,14 +92,13 @@ def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:
     tiny_scene.write_dataset(tmp_path / "dataset")
     parts = {"undistort.dataset": tmp_path / "dataset"}
     initialize.run(InitializeConfig(), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())
-    parts |= {"initialize.splat": tmp_path / "init.ply"}
-    settings = {"evaluate.every": 4, "evaluate.views": ""}
+    parts |= {"initialize.splat": tmp_path / "init.ply"} | tiny_scene.split_part(tmp_path / "dataset", 4)
     found = []
     for weight in (0.0, 0.05):
         out = tmp_path / f"{weight}"
         out.mkdir()
         config = tiny_scene.plain(iterations=300, densify_gradient=1e-3, spread_weight=weight)
-        train.run(config, Inputs(parts, tmp_path, settings, Machine("cpu", 1)), out, tiny_scene.Recorder())
+        train.run(config, Inputs(parts, tmp_path, machine=Machine("cpu", 1)), out, tiny_scene.Recorder())
         model, shares = read_splat(out / "model.ply"), []
         for view in load_views(tmp_path / "dataset")[::4]:
             origin = depth_origin(model.means, view.camera)

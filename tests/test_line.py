@@ -24,7 +24,7 @@ QUICK = (
     "features.max_image_size=1000",
     "undistort.max_megapixels=0.03",
     "train.iterations=60",
-    "evaluate.every=4",
+    "split.every=4",
     "flythrough.seconds=0.2",
 )
 STAGES = [stage.name for stage in LINE]

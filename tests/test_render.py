@@ -226,9 +226,13 @@ def test_keyframes_of_the_world_are_found_in_the_models_frame(tmp_path: Path) ->
 def tiny_parts(folder: Path, dataset: Path) -> dict[str, Path]:
     model = tiny_scene.true_model()
     write_splat(folder / "model.ply", model)
-    (folder / "plan.json").write_text(make_plan(TrainConfig(), load_views(dataset), 4, "", len(model)).to_json())
+    (folder / "rendering.json").write_text(
+        make_plan(TrainConfig(), load_views(dataset), tiny_scene.split_of(load_views(dataset), 4), len(model))
+        .rendering()
+        .to_json()
+    )
     write_panorama(folder / "sky.npz", None)
-    found = {"model": folder / "model.ply", "plan": folder / "plan.json", "sky": folder / "sky.npz"}
+    found = {"model": folder / "model.ply", "rendering": folder / "rendering.json", "sky": folder / "sky.npz"}
     return {f"train.{name}": path for name, path in found.items()} | {"undistort.dataset": dataset}
 
 

@@ -250,7 +250,7 @@ def test_a_run_without_any_position_says_that_nothing_is_in_metres(
             photo.resize((800, 600)).save(photos / path.name, quality=92)  # Pillow leaves the metadata out
     (photos / "notes.jpg").write_bytes(b"no picture")
     out = tmp_path / "out"
-    done = splatpipe("run", photos, out, *sets(*QUICK, "train.iterations=30", "evaluate.every=4"), "--json")
+    done = splatpipe("run", photos, out, *sets(*QUICK, "train.iterations=30", "split.every=4"), "--json")
     assert done.returncode == 0, done.stderr
     assert str(out / "report.html") in json.loads(done.stdout)["outputs"]
     watched = open_page((out / "report.html").as_uri())

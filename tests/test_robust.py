@@ -216,7 +216,8 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
     out.mkdir(exist_ok=True)
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
     held_out = ",".join(cameras()[number].name for number in HELD_OUT)
-    inputs = Inputs(parts, scene, {"evaluate.every": 0, "evaluate.views": held_out}, Machine("cpu", 1))
+    parts |= tiny_scene.split_part(scene / "dataset", names=held_out)
+    inputs = Inputs(parts, scene, machine=Machine("cpu", 1))
     kept: list[TrainState] = []
     step = loop.train_step
 

@@ -183,9 +183,9 @@ def ideal(camera: Camera) -> np.ndarray:
 
 def trained(scene: Path, out: Path, config: TrainConfig, threads: int = 1) -> Path:
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-    settings = {"evaluate.every": 4, "evaluate.views": ""}
+    parts |= tiny_scene.split_part(scene / "dataset", 4)
     out.mkdir(exist_ok=True)
-    train.run(config, Inputs(parts, scene, settings, Machine("cpu", threads)), out, tiny_scene.Recorder())
+    train.run(config, Inputs(parts, scene, machine=Machine("cpu", threads)), out, tiny_scene.Recorder())
     return out
 
 
@@ -195,7 +195,7 @@ def digest(out: Path) -> str:
 
 def test_without_the_option_the_raw_tensors_are_rendered() -> None:
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras()]
-    plan = make_plan(TrainConfig(), views, 0, "", 1)
+    plan = make_plan(TrainConfig(), views, tiny_scene.split_of(views), 1)
     state = TrainState.begin(tiny_scene.true_model(), plan)
     assert state.rendered_model(plan.options) is state.gaussians
     assert "filter_sigmas" not in state.checkpoint("any").arrays
@@ -271,7 +271,7 @@ def models(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, G
 
 def test_no_gaussian_of_the_file_is_finer_than_its_filter(scene: Path, models: dict[str, Gaussians]) -> None:
     views = load_views(scene / "dataset")
-    plan = make_plan(QUICK, views, 4, "", 1)
+    plan = make_plan(QUICK, views, tiny_scene.split_of(views, 4), 1)
     sampling = sampling_of(plan, [view for view in views if view.camera.name in set(plan.train_views)])
     assert sampling is not None
     finest = {}

@@ -31,7 +31,7 @@ from splatpipe.stages import initialize, train
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "sky.npz"]
+PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "rendering.json", "sky.npz"]
 TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "exposure": "affine",
     "filter_3d": True,
@@ -59,8 +59,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def make_inputs(scene: Path, threads: int = 1, device: str = "cpu", every: int = 4) -> Inputs:
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-    settings = {"evaluate.every": every, "evaluate.views": ""}
-    return Inputs(parts, scene, settings, Machine(device, threads))
+    parts |= tiny_scene.split_part(scene / "dataset", every)
+    return Inputs(parts, scene, machine=Machine(device, threads))
 
 
 def digest(out: Path) -> str:
@@ -197,7 +197,7 @@ def test_going_on_with_another_instruction_set_is_told(
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         die_at(patch, 20, killed)
         trained(scene, tmp_path)
-    monkeypatch.setattr(loop.raster, "isa_name", lambda: "other")
+    monkeypatch.setattr(loop.rasterizer, "isa_name", lambda: "other")
     recorder = tiny_scene.Recorder()
     train.run(QUICK, make_inputs(scene), tmp_path, recorder)
     assert len(recorder.warnings) == 1 and "goes on with other" in recorder.warnings[0]
@@ -283,7 +283,8 @@ def test_photos_of_the_wrong_size_or_broken_are_named(scene: Path, tmp_path: Pat
     victim = dataset / "images/flight 1/photo_1.png"
     for content in (b"", b"not a picture"):
         victim.write_bytes(content)
-        parts = {"undistort.dataset": dataset, "initialize.splat": scene / "init.ply"}
-        settings = {"evaluate.every": 4, "evaluate.views": ""}
+        parts = {"undistort.dataset": dataset, "initialize.splat": scene / "init.ply"} | tiny_scene.split_part(
+            dataset, 4
+        )
         with pytest.raises(SplatpipeError, match=r"photo_1\.png"):
-            train.run(QUICK, Inputs(parts, tmp_path, settings), tmp_path, tiny_scene.Recorder())
+            train.run(QUICK, Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())

@@ -1,6 +1,7 @@
 """The plan and the checkpoints of training: schedules, round trips, and files that are broken."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,9 @@ from splatpipe.pipeline.train.plan import (
     scene_extent,
     sh_degree_at,
 )
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
 
 
 def camera_at(name: str, centre: tuple[float, float, float]) -> Camera:
@@ -98,7 +102,7 @@ def test_extent_is_a_tenth_more_than_the_farthest_camera() -> None:
 
 
 def test_rate_of_positions_falls_exponentially_with_the_extent() -> None:
-    plan = make_plan(TrainConfig(iterations=100, lr_boost=1.0), views(), 0, "", 9)
+    plan = make_plan(TrainConfig(iterations=100, lr_boost=1.0), views(), tiny_scene.split_of(views()), 9)
     assert means_rate(plan, 0) == pytest.approx(1.6e-4 * plan.extent)
     assert means_rate(plan, 50) == pytest.approx(1.6e-5 * plan.extent)
     assert means_rate(plan, 100) == pytest.approx(1.6e-6 * plan.extent)
@@ -107,7 +111,7 @@ def test_rate_of_positions_falls_exponentially_with_the_extent() -> None:
 def test_short_runs_take_longer_steps() -> None:
     boosts = [resolve_schedule(TrainConfig(iterations=run)).lr_boost for run in (100, 7500, 30_000, 100_000)]
     assert boosts == [4.0, 2.0, 1.0, 1.0]
-    plan = make_plan(TrainConfig(iterations=7500), views(), 0, "", 9)
+    plan = make_plan(TrainConfig(iterations=7500), views(), tiny_scene.split_of(views()), 9)
     assert means_rate(plan, 0) == pytest.approx(2.0 * 1.6e-4 * plan.extent)
     assert means_rate(plan, 7500) == pytest.approx(4.0 * 1.6e-6 * plan.extent)
 
@@ -119,20 +123,20 @@ def test_coarse_photos_come_first_in_equal_shares() -> None:
 
 
 def test_held_out_photos_are_not_trained_on() -> None:
-    plan = make_plan(TrainConfig(), views(), 2, "", 9)
+    plan = make_plan(TrainConfig(), views(), tiny_scene.split_of(views(), 2), 9)
     assert (plan.train_views, plan.test_views) == (("1.png", "3.png"), ("0.png", "2.png"))
 
 
 def test_cameras_in_one_place_are_refused_with_a_hint() -> None:
     same = [View(camera_at(f"{i}.png", (1.0, 2.0, 3.0)), Path("x"), None) for i in range(3)]
     with pytest.raises(SplatpipeError, match="one place") as raised:
-        make_plan(TrainConfig(), same, 0, "", 9)
+        make_plan(TrainConfig(), same, tiny_scene.split_of(same), 9)
     assert raised.value.hint
 
 
 def test_plan_is_written_once_and_taken_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
-    first = make_plan(TrainConfig(iterations=50), views(), 2, "", 9)
+    first = make_plan(TrainConfig(iterations=50), views(), tiny_scene.split_of(views(), 2), 9)
     assert load_or_write_plan(path, lambda: first) == first
     text = path.read_bytes()
 
@@ -150,7 +154,7 @@ def test_plan_is_written_once_and_taken_as_it_is(tmp_path: Path) -> None:
 def test_broken_plan_is_written_anew(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.json"
     path.write_text(text)
-    fresh = make_plan(TrainConfig(), views(), 2, "", 9)
+    fresh = make_plan(TrainConfig(), views(), tiny_scene.split_of(views(), 2), 9)
     assert load_or_write_plan(path, lambda: fresh) == fresh
     assert json.loads(path.read_text())["format"] == 2
 

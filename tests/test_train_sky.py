@@ -72,8 +72,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def make_inputs(scene: Path, out: Path, threads: int = 1) -> Inputs:
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
-    parts |= {"train.model": out / "model.ply", "train.plan": out / "plan.json", "train.sky": out / "sky.npz"}
-    return Inputs(parts, scene, {"evaluate.every": 3, "evaluate.views": ""}, Machine("cpu", threads))
+    parts |= tiny_scene.split_part(scene / "dataset", 3)
+    parts |= {"train.model": out / "model.ply", "train.rendering": out / "rendering.json", "train.sky": out / "sky.npz"}
+    return Inputs(parts, scene, machine=Machine("cpu", threads))
 
 
 def trained(scene: Path, out: Path, config: TrainConfig = QUICK, threads: int = 1) -> tuple[str, tiny_scene.Recorder]:
@@ -190,7 +191,7 @@ def test_training_clears_the_sky_of_gaussians_and_held_out_photos_gain(scene: Pa
     for sky in ("off", "model"):
         out = tmp_path / sky
         trained(scene, out, config.model_copy(update={"sky": sky}))
-        summary = evaluate.run(EvaluateConfig(every=3), make_inputs(scene, out), out, tiny_scene.Recorder())
+        summary = evaluate.run(EvaluateConfig(), make_inputs(scene, out), out, tiny_scene.Recorder())
         quality[sky] = (opacity_in_sky(scene, out / "model.ply"), float(str(summary["psnr"])))
     assert opacity_in_sky(scene, scene / "init.ply") > 0.15
     assert quality["model"][0] < 0.05 < quality["off"][0]
@@ -248,7 +249,7 @@ def test_held_out_views_are_rendered_with_the_sky(scene: Path, tmp_path: Path) -
     model = read_splat(tmp_path / "model.ply")
     model.opacity_logits = torch.full_like(model.opacity_logits, -20.0)
     write_splat(tmp_path / "model.ply", model)
-    evaluate.run(EvaluateConfig(every=3), make_inputs(scene, tmp_path), tmp_path, tiny_scene.Recorder())
+    evaluate.run(EvaluateConfig(), make_inputs(scene, tmp_path), tmp_path, tiny_scene.Recorder())
     sky = read_panorama(tmp_path / "sky.npz")
     assert sky is not None
     camera = load_views(scene / "dataset")[0].camera
@@ -262,7 +263,10 @@ def test_a_budget_measures_iterations_with_the_sky_and_leaves_it_as_it_was(scene
     views, start = load_views(scene / "dataset"), read_splat(scene / "init.ply")
     sky = SkyModel.begin(views, scene / "dataset", 1)
     assert sky is not None
-    plan, before = make_plan(QUICK, views, 0, "", len(start)), sky.panorama.colours.detach().clone()
+    plan, before = (
+        make_plan(QUICK, views, tiny_scene.split_of(views), len(start)),
+        sky.panorama.colours.detach().clone(),
+    )
     moved = []
 
     def step(state: TrainState, trial: Plan, photo: TrainingPhoto) -> None:

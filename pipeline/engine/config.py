@@ -137,6 +137,8 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
 def _describe(model: type[BaseModel], location: tuple[int | str, ...], kind: str, message: str, value: JSON) -> str:
     dotted = ".".join(str(key) for key in location)
     if kind == "extra_forbidden":
+        if dotted in (gone := getattr(model, "gone", {})):
+            return f"There is no option {dotted} any more. {gone[dotted]}"
         close = difflib.get_close_matches(dotted, list(option_names(model)), n=1, cutoff=0.5)
         return f"There is no option {dotted}." + (f" Did you mean {close[0]}?" if close else "")
     return f"{dotted} = {value!r}: {message[0].lower()}{message[1:]}."

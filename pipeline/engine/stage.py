@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict
 
@@ -18,7 +18,12 @@ class StageConfig(BaseModel):
     """Base of every stage's configuration: what changes the answer. Unknown keys are refused.
 
     The docstring under each field is its help text.
+
+    Attributes:
+        gone: Options that there were, by their dotted names, with a sentence on what takes their place.
     """
+
+    gone: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False, strict=True
@@ -64,7 +69,7 @@ class Stage:
         reads: Names of the parts it reads, e.g. ``ingest.photos``; ``source.photos`` is the user's folder.
         parts: What it leaves: part name to the file or folder below the stage's own folder.
         entry: ``module:function`` of the body, a ``Body``.
-        borrows: Settings of other stages that its answer depends on, e.g. ``evaluate.every``.
+        borrows: Settings of other stages that its answer depends on, e.g. ``train.time_budget_s``.
         resumable: Its partial folder is kept after a kill, for the body to go on from.
         files: Files of the user's by the option that names them (``auto``, ``none`` or a path). Their content is in the
             key and the option is not: the body knows the part alone.

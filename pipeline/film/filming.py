@@ -66,14 +66,14 @@ def open_scene(parts: Mapping[str, Path], threads: int) -> TrainedScene:
     """Read what training left.
 
     Args:
-        parts: `train.model`, `train.plan`, `train.sky` and `undistort.dataset`.
+        parts: `train.model`, `train.rendering`, `train.sky` and `undistort.dataset`.
         threads: That read photos, where these have to tell which way is up.
 
     Raises:
         StageError: if one is broken.
     """
     gaussians = read_splat(parts["train.model"])
-    options, megapixels = as_trained(parts["train.plan"], gaussians)
+    options, megapixels = as_trained(parts["train.rendering"], gaussians)
     sky = read_panorama(parts["train.sky"])
     views = load_views(parts["undistort.dataset"])
     points, tracks = load_points_and_tracks(parts["undistort.dataset"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -145,7 +146,7 @@ def _broken(why: str) -> StageError:
     return StageError(f"The dataset's {MODEL} cannot be read: {why}", hint="Run again with --rerun-from undistort.")
 
 
-def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str], list[str]]:
+def split_views(names: Sequence[str], every: int, views: str) -> Split:
     """Divide photos into those to train on and those held out for evaluation.
 
     Args:
@@ -153,9 +154,6 @@ def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str]
         every: Every n-th in name order, starting with the first, is held out; 0 for none.
         views: Names to hold out instead, separated by commas; empty for the rule above. Case, suffix and folder may be
             left out where one photo alone is alike.
-
-    Returns:
-        Names to train on and names held out, each in name order.
 
     Raises:
         SplatpipeError: if a name is unknown or not clear, or if nothing is left to train on.
@@ -167,7 +165,7 @@ def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str]
         found = {name: find(name) for name in sorted(stated)}
         if unknown := [name for name, photo in found.items() if photo is None]:
             raise SplatpipeError(
-                f"evaluate.views names {some(unknown)}, which the model does not have, or more than once.",
+                f"split.views names {some(unknown)}, which the model does not have, or more than once.",
                 hint=f"Its photos are called like {some(ordered)}.",
             )
         wanted = {photo for photo in found.values() if photo is not None}
@@ -177,9 +175,40 @@ def split_views(names: Sequence[str], every: int, views: str) -> tuple[list[str]
     if not training:
         raise SplatpipeError(
             f"All {len(ordered)} photos are held out, so none is left to train on.",
-            hint="Raise evaluate.every, or set it to 0.",
+            hint="Raise split.every, or set it to 0.",
         )
-    return training, [name for name in ordered if name in wanted]
+    return Split(tuple(training), tuple(name for name in ordered if name in wanted))
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which photos are trained on and which are held out: decided once, for all who ask.
+
+    Attributes:
+        train: Names to train on, in name order.
+        held_out: Names that training never sees, in name order.
+    """
+
+    train: tuple[str, ...]
+    held_out: tuple[str, ...] = ()
+
+    def to_json(self) -> str:
+        """The text of `split.json`."""
+        fields = {"train": self.train, "held_out": self.held_out}
+        return json.dumps(fields, indent=1, ensure_ascii=False) + "\n"
+
+
+def load_split(path: Path) -> Split:
+    """Read what `split` left.
+
+    Raises:
+        StageError: if it is not that.
+    """
+    try:
+        fields = json.loads(path.read_text(encoding="utf-8"))
+        return Split(tuple(map(str, fields["train"])), tuple(map(str, fields["held_out"])))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from split.") from error
 
 
 def some(names: Sequence[str]) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from splatpipe.pipeline.engine.ranges import PositiveInt
+from splatpipe.pipeline.engine.ranges import NonNegativeInt, PositiveInt
 from splatpipe.pipeline.engine.stage import StageConfig
 
 
@@ -30,3 +30,10 @@ class IngestConfig(StageConfig):
 class UndistortConfig(StageConfig):
     max_megapixels: Annotated[float, Field(gt=0.005, le=200.0)] = 0.5
     """Photos are reduced to this size for training and evaluation."""
+
+
+class SplitConfig(StageConfig):
+    every: NonNegativeInt = 8
+    """Every n-th registered photo in name order, starting with the first, is held out of training; 0 for none."""
+    views: str = ""
+    """Names of photos to hold out instead, separated by commas."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,25 +23,64 @@ Model = tuple[Gaussians, Panorama | None]
 SURFACE = 0.5  # least alpha of a pixel that shows one, as for the median depth
 
 
-def as_trained(plan: Path, gaussians: Gaussians) -> tuple[rasterizer.RenderOptions, float | None]:
-    """How the model was trained to be rendered, and the megapixels that photos were reduced to, from `plan.json`.
+@dataclass(frozen=True)
+class Rendering:
+    """How a model is to be rendered, known before it is trained.
 
-    Raises:
-        StageError: if the plan is not one.
+    Attributes:
+        antialias: With opacities that allow for the blur on screen.
+        background: What is behind it, red, green, blue, 0..1.
+        near: Of the near plane, world units.
+        megapixels: Photos are reduced to at most so many; None where they keep the dataset's size.
     """
-    try:
-        fields = json.loads(plan.read_text(encoding="utf-8"))
-        white = fields["options"]["background"] == "white"
-        options = rasterizer.RenderOptions(
+
+    antialias: bool
+    background: tuple[float, float, float]
+    near: float
+    megapixels: float | None
+
+    def to_json(self) -> str:
+        """The text of `rendering.json`."""
+        return json.dumps(asdict(self), indent=1) + "\n"
+
+    def options(self, gaussians: Gaussians) -> rasterizer.RenderOptions:
+        """The rasterizer's, for a model of its degree."""
+        return rasterizer.RenderOptions(
             sh_degree=gaussians.sh_degree,
-            background=(1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0),
-            antialias=bool(fields["options"]["antialias"]),
-            near=float(fields["near"]),
+            background=self.background,
+            antialias=self.antialias,
+            near=self.near,
             depth=False,
         )
-        return options, None if fields["megapixels"] is None else float(fields["megapixels"])
+
+
+def load_rendering(path: Path) -> Rendering:
+    """Read what `train` left.
+
+    Raises:
+        StageError: if it is not that.
+    """
+    try:
+        fields = json.loads(path.read_text(encoding="utf-8"))
+        red, green, blue = map(float, fields["background"])
+        megapixels = None if fields["megapixels"] is None else float(fields["megapixels"])
+        return Rendering(bool(fields["antialias"]), (red, green, blue), float(fields["near"]), megapixels)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StageError("Training's plan.json cannot be read.", hint="Run again with --rerun-from train.") from error
+        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from train.") from error
+
+
+def as_trained(rendering: Path, gaussians: Gaussians) -> tuple[rasterizer.RenderOptions, float | None]:
+    """How the model was trained to be rendered, and the megapixels that photos were reduced to.
+
+    Args:
+        rendering: `train.rendering`.
+        gaussians: The model.
+
+    Raises:
+        StageError: if the file is broken.
+    """
+    found = load_rendering(rendering)
+    return found.options(gaussians), found.megapixels
 
 
 def render_pixels(model: Model, camera: Camera, options: rasterizer.RenderOptions) -> Pixels:

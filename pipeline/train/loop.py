@@ -11,10 +11,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.photos.dataset import View, load_split, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.raster.threads import same_bits
@@ -64,9 +65,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     dataset = inputs["undistort.dataset"]
     views = load_views(dataset)
     start = read_splat(inputs["initialize.splat"])
-    every, names = inputs.settings["evaluate.every"], inputs.settings["evaluate.views"]
-
-    free = make_plan(config, views, every, names, len(start))
+    free = make_plan(config, views, load_split(inputs["split.views"]), len(start))
     trained_on = views_of(free, views)
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
 
@@ -76,6 +75,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     with same_bits(inputs.machine.threads):
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
         plan = load_or_write_plan(out / "plan.json", make)
+        write_durably(out / "rendering.json", plan.rendering().to_json())
         if budgeted(plan):
             report.note(plan.described())
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
@@ -102,6 +102,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         "peak_memory_bytes": peak_memory_bytes(),
         "device": "cpu",
         "instruction_set": rasterizer.isa_name(),
+        "plan": plan.options.model_dump(mode="json") | {"initial_gaussians": plan.initial_gaussians},
     } | write_side_models(out, state, plan.options)
 
 

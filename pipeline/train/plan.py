@@ -14,7 +14,8 @@ import numpy as np
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, split_views
+from splatpipe.pipeline.photos.dataset import Split, View
+from splatpipe.pipeline.render.rendering import Rendering
 from splatpipe.pipeline.train.options import TrainConfig
 
 PLAN_FORMAT = 2
@@ -84,6 +85,12 @@ class Plan:
         """The plan as canonical JSON."""
         fields = asdict(self) | {"format": PLAN_FORMAT, "options": self.options.model_dump(mode="json")}
         return json.dumps(fields, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+
+    def rendering(self) -> Rendering:
+        """How the model is to be rendered: a random background is black."""
+        white = self.options.background == "white"
+        behind = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+        return Rendering(self.options.antialias, behind, self.near, self.megapixels)
 
     def digest(self) -> str:
         """sha256 of ``to_json``: names the plan in its checkpoints."""
@@ -175,21 +182,19 @@ def mean_megapixels(cameras: Sequence[Camera], most: float | None = None) -> flo
     return round(sum(min(size, most or size) for size in pixels) / len(pixels), 4)
 
 
-def make_plan(config: TrainConfig, views: Sequence[View], every: int, names: str, gaussians: int) -> Plan:
+def make_plan(config: TrainConfig, views: Sequence[View], split: Split, gaussians: int) -> Plan:
     """Resolve a training's plan.
 
     Args:
         config: The options.
         views: All photos of the dataset.
-        every: `evaluate.every`.
-        names: `evaluate.views`.
+        split: Which of them are trained on.
         gaussians: Gaussians at the start.
 
     Raises:
-        SplatpipeError: if nothing is left to train on, a held-out name is unknown, or all cameras stand in one place.
+        SplatpipeError: if all cameras stand in one place.
     """
-    train, test = split_views([view.camera.name for view in views], every, names)
-    kept = set(train)
+    kept = set(split.train)
     cameras = [view.camera for view in views if view.camera.name in kept]
     extent = scene_extent(cameras)
     if not math.isfinite(extent) or extent <= 0.0:
@@ -198,11 +203,11 @@ def make_plan(config: TrainConfig, views: Sequence[View], every: int, names: str
             hint="Take the photos from different places, and hold out fewer of them.",
         )
     return Plan(
-        options=resolve_schedule(config, len(train)),
+        options=resolve_schedule(config, len(split.train)),
         extent=extent,
         near=NEAR_PER_EXTENT * extent,
-        train_views=tuple(sorted(train)),
-        test_views=tuple(sorted(test)),
+        train_views=split.train,
+        test_views=split.held_out,
         train_megapixels=mean_megapixels(cameras),
         initial_gaussians=gaussians,
         last_iteration=config.iterations,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pycolmap
 import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import Split, View, load_views, split_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import dc_to_rgb, rgb_to_dc
@@ -114,6 +117,19 @@ def write_model(folder: Path, views: list[Camera], xyz: np.ndarray, rgb: np.ndar
         model.add_point3D(point, track, colour)
     folder.mkdir(parents=True)
     model.write(folder)
+
+
+def split_of(views: Sequence[View], every: int = 0, names: str = "") -> Split:
+    """Which of the views are trained on."""
+    return split_views([view.camera.name for view in views], every, names)
+
+
+def split_part(dataset: Path, every: int = 0, names: str = "") -> dict[str, Path]:
+    """The part that `split` leaves of a dataset, in a file beside it."""
+    text = split_of(load_views(dataset), every, names).to_json()
+    path = dataset.parent / f"split-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
+    path.write_text(text)
+    return {"split.views": path}
 
 
 def write_dataset(folder: Path, masked: str = "", views: list[Camera] | None = None) -> Path:

@@ -95,8 +95,7 @@ def unit_of(holdings: Holdings) -> str:
 
 def held_out(holdings: Holdings) -> list[str]:
     """Names of the photos that training never saw, as far as it is known."""
-    plan = holdings.read("train.plan") or holdings.read_unfinished("train", "plan.json")
-    return [str(name) for name in plan.get("test_views", [])]
+    return [str(name) for name in holdings.read("split.views").get("held_out", [])]
 
 
 def _mapped(holdings: Holdings, geometry: Geometry) -> Chapter:

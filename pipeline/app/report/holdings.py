@@ -85,15 +85,6 @@ class Holdings:
         path = self.part(name)
         return {} if path is None else read_json(path / file)
 
-    def read_unfinished(self, stage: str, file: str) -> Any:
-        """A JSON file that a stage had written when it was stopped; an empty table where there is none.
-
-        Raises:
-            ValueError: if it is no JSON, or far too large.
-        """
-        folder = self.contents.working.get(stage)
-        return read_json(folder / file) if folder is not None and (folder / file).is_file() else {}
-
     def summary(self, stage: str) -> Mapping[str, Any]:
         """What a stage returned; empty where it did not finish."""
         artifact = self.artifacts.get(stage)

@@ -31,33 +31,32 @@ def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
     if "train" not in holdings.artifacts and (story is None or story.state == "not reached"):
         return None
     summary, history = holdings.summary("train"), holdings.read("train.history")
-    plan = holdings.read("train.plan") or holdings.read_unfinished("train", "plan.json")
+    plan, split = summary.get("plan") or {}, holdings.read("split.views")
     told = {} if story is None else dict(story.told.progress)
-    planned = summary.get("planned_iterations") or plan.get("last_iteration") or told.get("total")
+    planned = summary.get("planned_iterations") or told.get("total")
     reached = summary.get("iterations") or (None if story is None else story.reached)
     curves = _curves(holdings, history)
     gaussians = summary.get("gaussians") or _last(curves.get("gaussians", {}))
-    options = plan.get("options") or {}
     facts = [
         ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
-        ("Gaussians", f"{count(gaussians)}, {count(plan.get('initial_gaussians'))} at the beginning"),
+        ("Gaussians", f"{count(gaussians)}, {count(holdings.summary('initialize').get('gaussians'))} at the beginning"),
         (
             "Size of the photos",
-            f"{number(summary.get('train_megapixels') or plan.get('train_megapixels'), 2)} megapixels",
+            f"{number(summary.get('train_megapixels'), 2)} megapixels",
         ),
-        ("Photos", f"{len(plan.get('train_views', []))} trained on, {len(plan.get('test_views', []))} held out"),
+        ("Photos", f"{len(split.get('train', []))} trained on, {len(split.get('held_out', []))} held out"),
         ("Last loss", number(summary.get("loss") or _last(curves.get("loss", {})), 4)),
         ("Time", duration(summary.get("train_seconds") or (story.seconds if story else None))),
         ("Memory", size(summary.get("peak_memory_bytes") or (story.memory_bytes if story else None))),
         ("Device", " ".join(str(summary[name]) for name in ("device", "instruction_set") if summary.get(name))),
-        ("Seed", str(options.get("seed", _seed(holdings)))),
+        ("Seed", _seed(holdings)),
     ]
-    if not plan:
+    if not split:
         facts = [fact for fact in facts if fact[0] != "Photos"]
     chapter: Chapter = {
         "facts": [fact for fact in facts if fact[1] and not fact[1].startswith("–")],
         "finished": "train" in holdings.artifacts,
-        "plan": sorted((str(name), str(value)) for name, value in options.items()),
+        "plan": sorted((str(name), str(value)) for name, value in plan.items()),
         "charts": [],
     }
     if drawn:

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import torch
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.run_folder import Contents
-from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.photos.dataset import View, load_split, load_views
 from splatpipe.pipeline.photos.images import reduced_view
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
@@ -27,7 +27,7 @@ from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, viewer_splat
 from splatpipe.stages.export import in_world
 
-CHECKPOINT = "checkpoint.npz"
+CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
 JPEG_QUALITY = 92
 SKY, FILTER = "sky.colours", "filter_sigmas"  # arrays of a checkpoint
 
@@ -40,14 +40,14 @@ class Source:
         path: Its file.
         kind: ``initial``, ``checkpoint`` or ``model`` (finished).
         stamp: Changes with its content.
-        plan: The training's; None before there is one.
+        rendering: How it is rendered; None before training has begun.
         sky: The finished sky, beside a finished model.
     """
 
     path: Path
     kind: str
     stamp: str
-    plan: Path | None
+    rendering: Path | None
     sky: Path | None = None
 
 
@@ -64,22 +64,22 @@ class Shown:
 
 def newest(opened: Contents) -> Source | None:
     """The furthest that a training has come; None before it can begin."""
-    if "train.model" in opened.parts:
+    if {"train.model", "train.rendering"} <= set(opened.parts):
         part = opened.parts["train.model"]
-        plan, sky = opened.parts["train.plan"].path, opened.parts["train.sky"].path
-        return Source(part.path, "model", part.digest[:16], plan, sky)
+        rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
+        return Source(part.path, "model", part.digest[:16], rendering, sky)
     folder = opened.working.get("train")
     if folder is not None:
         try:
             facts = (folder / CHECKPOINT).stat()
             stamp = f"{facts.st_ino:x}-{facts.st_mtime_ns:x}"
-            return Source(folder / CHECKPOINT, "checkpoint", stamp, folder / "plan.json")
+            return Source(folder / CHECKPOINT, "checkpoint", stamp, folder / RENDERING)
         except OSError:
             pass
     if "initialize.splat" in opened.parts:
         part = opened.parts["initialize.splat"]
-        begun = folder is not None and (folder / "plan.json").is_file()
-        return Source(part.path, "initial", part.digest[:16], folder / "plan.json" if folder and begun else None)
+        begun = folder is not None and (folder / RENDERING).is_file()
+        return Source(part.path, "initial", part.digest[:16], folder / RENDERING if folder and begun else None)
     return None
 
 
@@ -107,9 +107,9 @@ def load(source: Source, opened: Contents) -> Shown:
     else:
         gaussians = read_splat(source.path)
         sky = read_panorama(source.sky) if source.sky is not None else None
-    if source.plan is None:
+    if source.rendering is None:
         return Shown(gaussians, sky, rasterizer.RenderOptions(sh_degree=gaussians.sh_degree), None, 0)
-    options, megapixels = as_trained(source.plan, gaussians)
+    options, megapixels = as_trained(source.rendering, gaussians)
     return Shown(gaussians, sky, options, megapixels, iteration_of(source) or 0)
 
 
@@ -122,13 +122,12 @@ def views_of(opened: Contents) -> tuple[View, ...]:
     return tuple(view for view in load_views(part.path) if view.image_path.resolve().is_relative_to(folder))
 
 
-def held_out_of(source: Source | None) -> Sequence[str]:
-    """Names of the photos that it is not trained on."""
-    if source is None or source.plan is None:
-        return ()
+def held_out_of(opened: Contents) -> Sequence[str]:
+    """Names of the photos that are not trained on; none before that is decided."""
+    part = opened.parts.get("split.views")
     try:
-        return [str(name) for name in json.loads(source.plan.read_text(encoding="utf-8"))["test_views"]]
-    except (OSError, ValueError, KeyError, TypeError):
+        return () if part is None else load_split(part.path).held_out
+    except StageError:
         return ()
 
 
@@ -156,12 +155,12 @@ def viewer(shown: Shown, source: Source, opened: Contents, name: str) -> tuple[s
     Raises:
         SplatpipeError: if the run is not so far that a model lies anywhere, or cannot be read.
     """
-    if source.plan is None or not {"georef.frame", "undistort.dataset"} <= set(opened.parts):
+    if source.rendering is None or not {"georef.frame", "undistort.dataset"} <= set(opened.parts):
         raise SplatpipeError("There is nothing to show in 3D yet.")
     frame = load_frame(opened.parts["georef.frame"].path)
     gaussians = in_world(shown.gaussians, frame)
     look = look_of(shown.options, shown.sky)
-    dataset, held_out = opened.parts["undistort.dataset"].path, set(held_out_of(source))
+    dataset, held_out = opened.parts["undistort.dataset"].path, set(held_out_of(opened))
     title = f"{name}, iteration {shown.iteration:,}"
     scene = viewer_scene(dataset, frame, look, held_out, len(gaussians), title)
     return viewer_page(scene, SPLAT), viewer_splat(gaussians, scene.antialias)

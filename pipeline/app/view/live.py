@@ -57,11 +57,11 @@ class Live:
             opened, views = self._look()
             log = self._log
             source = checkpoint.newest(opened)
-            held_out = set(checkpoint.held_out_of(source))
+            held_out = set(checkpoint.held_out_of(opened))
             model: JSON = None
             if source is not None and views:
                 model = {"kind": source.kind, "stamp": source.stamp, "iteration": checkpoint.iteration_of(source)}
-                model["in_3d"] = source.plan is not None
+                model["in_3d"] = source.rendering is not None
             return {
                 "name": self._run.name,
                 "at_work": self._run.at_work,

@@ -1,0 +1,21 @@
+"""split: which photos are held out of training and measured with; the only place that decides it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.dataset import load_views, split_views
+from splatpipe.pipeline.photos.options import SplitConfig
+
+
+def run(config: SplitConfig, inputs: Inputs, out: Path, _report: Reporter) -> Summary:
+    """Write `split.json`: the names of both kinds, in order.
+
+    Raises:
+        SplatpipeError: if a name is unknown or not clear, or if nothing is left to train on.
+    """
+    names = [view.camera.name for view in load_views(inputs["undistort.dataset"])]
+    found = split_views(names, config.every, config.views)
+    (out / "split.json").write_text(found.to_json(), encoding="utf-8")
+    return {"trained_on": len(found.train), "held_out": len(found.held_out)}
