@@ -35,9 +35,9 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.images import Pixels
 from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.resampling import resample
+from splatpipe.pipeline.photos.undistortion import place
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.stages.evaluate import flat_stems, mean_measures, measure
-from splatpipe.stages.undistort import place
 
 WITHIN_GSD = 2.0
 ATTACHED_M = 0.05  # in front of the house: the survey targets on its walls, also where they are seen at a slant

@@ -22,8 +22,8 @@ from playwright.sync_api import Page, sync_playwright
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.survey.handover import in_world
 from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
-from splatpipe.stages.export import in_world
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SPREAD = 0.9  # of the parent's standard deviations: how its parts lie in it

@@ -14,29 +14,25 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import torch
-import trimesh
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
 from splatpipe.pipeline.render.rendering import as_trained, load_rendering
 from splatpipe.pipeline.splat.dome import sky_dome
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
-from splatpipe.pipeline.survey.crs import utm_of
-from splatpipe.pipeline.survey.frames import Frame, load_frame
+from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.georeference import georeference, scene_box, told_in_a_line
+from splatpipe.pipeline.survey.handover import cameras_json, in_world, ply_comments, pose_in_world
+from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.web.options import ExportConfig
 from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
 
 Doubles = npt.NDArray[np.float64]
 Facts = dict[str, Any]
 
-FRUSTUM_PER_SPACING = 0.35  # depth of a drawn frustum over the distance to the next camera: they do not overlap
-FRUSTUM_COLOUR = (255, 140, 0, 255)
-GLTF_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # +Z up to glTF's +Y up
 VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy", "pyproj")
 
 
@@ -101,115 +97,6 @@ def write_viewer_of(inputs: Inputs, gaussians: Gaussians, folder: Path, config: 
     frame = load_frame(inputs["georef.frame"])
     scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out, len(gaussians), config.title)
     write_viewer(folder, scene, gaussians, config.viewer_megabytes * 1e6)
-
-
-def in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
-    """The model in the world frame: finite, its quaternions of unit length.
-
-    Args:
-        gaussians: In the model's frame.
-        frame: georef's.
-    """
-    similarity = frame.world_from_model
-    moved = gaussians.transformed(
-        float(similarity.scale),
-        torch.from_numpy(np.ascontiguousarray(similarity.rotation, np.float64)),
-        torch.from_numpy(np.ascontiguousarray(similarity.translation, np.float64)),
-    )
-    length = torch.linalg.vector_norm(moved.quats, dim=1, keepdim=True)
-    moved.quats = moved.quats / length.clamp(min=1e-30)
-    return moved.select(moved.finite() & (length[:, 0] > 0.0))
-
-
-def ply_comments(frame: Frame, antialias: bool) -> list[str]:
-    """Header lines that say in which frame the splat is."""
-    comments = [MIP_COMMENT] if antialias else []
-    if frame.origin is None:
-        return [*comments, "frame: z up, arbitrary scale and heading"]
-    origin = frame.origin
-    where = f"{origin.latitude:.9f} {origin.longitude:.9f} {origin.height_m:.4f}"
-    return [
-        *comments,
-        "frame: local east north up, metres",
-        f"origin: {where} (latitude longitude in degrees, WGS 84; height in metres, in the vertical datum)",
-        f"vertical datum: {frame.vertical_datum}",
-        f"crs: {frame.crs or utm_of(origin.latitude, origin.longitude).text} (see georef.json)",
-    ]
-
-
-def cameras_json(cameras: Sequence[Camera], frame: Frame) -> list[Facts]:
-    """The cameras as 3DGS viewers read them: world-from-camera rotation and centre, in the splat's frame."""
-    listed = []
-    for index, camera in enumerate(cameras):
-        rotation, centre = pose_in_world(camera, frame)
-        listed.append(
-            {
-                "id": index,
-                "img_name": camera.name,
-                "width": camera.width,
-                "height": camera.height,
-                "position": centre.tolist(),
-                "rotation": rotation.tolist(),
-                "fx": camera.fx,
-                "fy": camera.fy,
-            }
-        )
-    return listed
-
-
-def pose_in_world(camera: Camera, frame: Frame) -> tuple[Doubles, Doubles]:
-    """A camera's world-from-camera rotation (3, 3) and centre (3,) in the world frame."""
-    similarity = frame.world_from_model
-    rotation = np.asarray(similarity.rotation) @ camera.cam_from_world[:3, :3].T
-    return np.asarray(rotation), np.asarray(similarity.apply(camera.centre()[None])[0])
-
-
-def sparse_glb(points: Points, cameras: Sequence[Camera], frame: Frame) -> bytes:
-    """The sparse points and the cameras' frusta as binary glTF, world units, +Y up.
-
-    Args:
-        points: In the model's frame.
-        cameras: In the model's frame.
-        frame: georef's.
-    """
-    scene = trimesh.Scene()
-    usable = np.isfinite(points.xyz).all(axis=1)
-    if usable.any():
-        xyz = frame.world_from_model.apply(points.xyz[usable]) @ GLTF_FROM_WORLD.T
-        opaque = np.full((len(xyz), 1), 255, np.uint8)
-        cloud = trimesh.PointCloud(xyz, colors=np.hstack((points.rgb[usable], opaque)))
-        scene.add_geometry(cloud, geom_name="points", node_name="points")
-    if cameras:
-        scene.add_geometry(_frusta(cameras, frame), geom_name="cameras", node_name="cameras")
-    return bytes(scene.export(file_type="glb"))
-
-
-def _frusta(cameras: Sequence[Camera], frame: Frame) -> trimesh.path.Path3D:
-    poses = [pose_in_world(camera, frame) for camera in cameras]
-    depth = FRUSTUM_PER_SPACING * _camera_spacing(np.array([centre for _, centre in poses]))
-    vertices: list[Doubles] = []
-    lines: list[list[int]] = []
-    for camera, (rotation, centre) in zip(cameras, poses, strict=True):
-        u = (np.array([0.0, camera.width, camera.width, 0.0]) - camera.cx) / camera.fx
-        v = (np.array([0.0, 0.0, camera.height, camera.height]) - camera.cy) / camera.fy
-        corners = depth * np.stack((u, v, np.ones(4)), axis=1) @ rotation.T
-        first = 5 * len(lines) // 2
-        vertices.append(np.vstack((centre, centre + corners)) @ GLTF_FROM_WORLD.T)
-        ring = [first + 1, first + 2, first + 3, first + 4, first + 1]
-        lines += [ring, [first + 1, first, first + 2, first + 3, first, first + 4]]
-    entities = [trimesh.path.entities.Line(line) for line in lines]
-    colours = np.tile(np.array(FRUSTUM_COLOUR, np.uint8), (len(entities), 1))
-    return trimesh.path.Path3D(entities, vertices=np.vstack(vertices), process=False, colors=colours)
-
-
-def _camera_spacing(centres: Doubles) -> float:
-    """Median distance from a camera to its nearest neighbour elsewhere, world units; 1 for a single place."""
-    nearest = []
-    for centre in centres:
-        distance = np.linalg.norm(centres - centre, axis=1)
-        nearest.append(float(np.min(distance[distance > 0.0], initial=np.inf)))
-    spacing = float(np.median(nearest))
-    return spacing if np.isfinite(spacing) else 1.0
 
 
 def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: int) -> Facts:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +28,7 @@ from splatpipe.pipeline.photos.convert import convert_photo, save_png, scale_of
 from splatpipe.pipeline.photos.doubts import FAR_M, median_distance_m
 from splatpipe.pipeline.photos.duplicates import split_duplicates
 from splatpipe.pipeline.photos.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
+from splatpipe.pipeline.photos.names import NAMES_SHOWN, printable, some
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
     CONVERTED_DIR,
@@ -53,7 +54,6 @@ from splatpipe.pipeline.survey.photo_positions import (
 from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 
 MIN_PHOTOS = 2
-NAMES_SHOWN = 10  # in one message; left_out.json has them all
 MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly meant
 T = TypeVar("T")
 R = TypeVar("R")
@@ -176,7 +176,7 @@ def _mask(
     files = find_masks(root, kind.folder) if work.config.masks else []
     matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
     if unused:
-        names = _names([mask.label for mask in unused])
+        names = some([mask.label for mask in unused])
         work.report.warning(f"No photo is found for the mask {names}.", "A mask has its photo's name: NAME.png.")
     masked = [photo for photo in photos if photo.name in matched or photo.name in opacity]
 
@@ -189,7 +189,7 @@ def _mask(
             return problem
         save_png(values, work.part / mask_path(photo.name, kind.part))
         if kind is _MASKS and np.mean(values == 0) > MOSTLY_IGNORED:
-            return f"The mask of {_shown(photo.name)} leaves hardly anything of it: black is what is ignored."
+            return f"The mask of {printable(photo.name)} leaves hardly anything of it: black is what is ignored."
         return problem
 
     problems = _in_threads(write, masked, work, "preparing masks", "masks")
@@ -206,7 +206,7 @@ def _read(
     try:
         return None, read_mask(mask, photo, max_pixels)
     except MaskError as error:
-        return f"The mask {_shown(mask.label)} {error}; it is not used.", None
+        return f"The mask {printable(mask.label)} {error}; it is not used.", None
 
 
 def converted_path(name: str) -> str:
@@ -237,10 +237,10 @@ def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]
 def _require_photos(folder: Path, scan: Scan, photos: Sequence[CheckedPhoto], left_out: Sequence[LeftOut]) -> None:
     if len(photos) >= MIN_PHOTOS:
         return
-    listing = "".join(f"\n  {_shown(entry.name)} {entry.reason}" for entry in left_out[:NAMES_SHOWN])
+    listing = "".join(f"\n  {printable(entry.name)} {entry.reason}" for entry in left_out[:NAMES_SHOWN])
     more = f"\n  … and {len(left_out) - NAMES_SHOWN} more" if len(left_out) > NAMES_SHOWN else ""
     if photos:
-        message = f"There is only one usable photo in {folder}: {_shown(photos[0].name)}."
+        message = f"There is only one usable photo in {folder}: {printable(photos[0].name)}."
         hint = "A reconstruction needs many overlapping photos of one place, at least two."
     elif left_out:
         message = f"None of the {len(left_out)} pictures in {folder} can be used."
@@ -260,7 +260,7 @@ def _tell_left_out(left_out: Sequence[LeftOut], report: Reporter) -> None:
     for entry in left_out:
         by_reason.setdefault(entry.reason, []).append(entry.name)
     for reason, names in by_reason.items():
-        report.warning(f"Left out: {_names(names)} {reason}.")
+        report.warning(f"Left out: {some(names)} {reason}.")
 
 
 def _lenses(
@@ -290,13 +290,13 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
     report.note(f"{path.name}: positions of {len(places.by_name)} of {len(photos)} photos, in {places.note}.")
     if places.unknown:
         report.warning(
-            f"{path.name} names photos that are not there, or twice: {_names(places.unknown)}.",
+            f"{path.name} names photos that are not there, or twice: {some(places.unknown)}.",
             "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
         )
     others = [photo.name for photo in photos if photo.name not in places.by_name and photo.exif.gps is not None]
     if others:
         report.warning(
-            f"{path.name} does not name {_names(others)}: their own positions count, as a flight of its own.",
+            f"{path.name} does not name {some(others)}: their own positions count, as a flight of its own.",
             "Add them to the file if it has better ones.",
         )
     both = [(places.by_name[photo.name], photo.exif.gps) for photo in photos if photo.name in places.by_name]
@@ -330,10 +330,10 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
 def _tell_positions(positions: PositionList, report: Reporter) -> None:
     if positions.impossible:
         report.warning(
-            f"The position is none that can be on Earth: {_names(positions.impossible)}.",
+            f"The position is none that can be on Earth: {some(positions.impossible)}.",
             "These photos take part without their position.",
         )
-    elsewhere = [f"{_shown(name)} {why}" for name, why in positions.wrong.items() if why != NOWHERE]
+    elsewhere = [f"{printable(name)} {why}" for name, why in positions.wrong.items() if why != NOWHERE]
     if elsewhere:
         more = f"; and {len(elsewhere) - NAMES_SHOWN} more" if len(elsewhere) > NAMES_SHOWN else ""
         report.warning(
@@ -351,7 +351,7 @@ def _tell_positions(positions: PositionList, report: Reporter) -> None:
 def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:
     if refused:
         report.warning(
-            f"The calibrated focal length in {_names(refused)} is far from what lens and sensor give; it is not used.",
+            f"The calibrated focal length in {some(refused)} is far from what lens and sensor give; it is not used.",
             "Was the picture cropped or resized, or its metadata copied?",
         )
     unknown = sum(group.photos for group in groups if not group.has_prior)
@@ -373,17 +373,6 @@ def _in_threads(function: Callable[[T], R], items: Sequence[T], work: _Work, wha
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
     return results
-
-
-def _names(names: Iterable[str]) -> str:
-    shown = [_shown(name) for name in names]
-    more = f" and {len(shown) - NAMES_SHOWN} more" if len(shown) > NAMES_SHOWN else ""
-    return ", ".join(shown[:NAMES_SHOWN]) + more
-
-
-def _shown(name: str) -> str:
-    """A name without line breaks and other signs that would spoil a message."""
-    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in name)
 
 
 def _write_json(path: Path, value: JSON) -> None:

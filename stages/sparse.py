@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.dataset import some
+from splatpipe.pipeline.photos.names import some
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
 from splatpipe.pipeline.sfm.capture import Capture, Found

@@ -21,6 +21,8 @@ from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, write_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.survey.handover import in_world, ply_comments
+from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.pipeline.web.options import ExportConfig
@@ -154,7 +156,7 @@ def test_header_says_where_the_origin_is(exported: Path, tmp_path: Path) -> None
     comments = PlyData.read(str(exported / "splat.ply")).comments
     assert any("east north up, metres" in comment for comment in comments)
     assert any("52.2" in comment and "20.9" in comment and "110.5" in comment for comment in comments)
-    arbitrary = export.ply_comments(load_frame(write_frame(tmp_path / "frame.json", "arbitrary")), antialias=True)
+    arbitrary = ply_comments(load_frame(write_frame(tmp_path / "frame.json", "arbitrary")), antialias=True)
     assert arbitrary[0] == "SplatRenderMode: mip"
     assert "arbitrary scale" in arbitrary[1]
 
@@ -185,7 +187,7 @@ def test_broken_gaussians_stay_out_of_the_file(inputs: Inputs, tmp_path: Path) -
     model = read_splat(inputs["train.model"])
     model.quats[0] = 0.0
     model.log_scales[1, 0] = float("nan")
-    moved = export.in_world(model, load_frame(inputs["georef.frame"]))
+    moved = in_world(model, load_frame(inputs["georef.frame"]))
     assert len(moved) == len(model) - 2 and bool(moved.finite().all())
 
 
@@ -229,7 +231,7 @@ def test_scene_of_one_camera_and_no_points_is_still_written(inputs: Inputs) -> N
     points = load_points(inputs["undistort.dataset"])
     none = type(points)(points.xyz[:0], points.rgb[:0], points.track_lengths[:0], points.errors_px[:0])
     camera = load_views(inputs["undistort.dataset"])[0].camera
-    glb = export.sparse_glb(none, [camera], load_frame(inputs["georef.frame"]))
+    glb = sparse_glb(none, [camera], load_frame(inputs["georef.frame"]))
     assert glb[:4] == b"glTF"
 
 

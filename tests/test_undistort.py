@@ -17,8 +17,8 @@ from splatpipe.pipeline.photos import resampling
 from splatpipe.pipeline.photos.dataset import load_points, load_views
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list, save_photo_list
+from splatpipe.pipeline.photos.undistortion import pinhole_camera
 from splatpipe.stages import undistort
-from splatpipe.stages.undistort import pinhole_camera
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos

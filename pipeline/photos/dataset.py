@@ -14,13 +14,12 @@ from jaxtyping import Float64, Int64, UInt8
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.colmap_model import Cloud, Photo, read_cloud, read_photos
-from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.photos.names import NameFinder, some
 
 IMAGES = "images"
 MASKS = "masks"
 SKY_MASKS = "sky_masks"
 MODEL = "sparse/0"
-NAMES_SHOWN = 5  # of a list in a message
 
 Model = TypeVar("Model")
 
@@ -209,9 +208,3 @@ def load_split(path: Path) -> Split:
         return Split(tuple(map(str, fields["train"])), tuple(map(str, fields["held_out"])))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from split.") from error
-
-
-def some(names: Sequence[str]) -> str:
-    """A list of names for a message: the first few, and how many more."""
-    shown = ", ".join(names[:NAMES_SHOWN])
-    return shown + (f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else "")

@@ -65,3 +65,18 @@ def _last(name: str) -> str:
 def _without_suffix(name: str) -> str:
     stem, dot, suffix = _folded(name).rpartition(".")
     return stem if dot and suffix in PHOTO_SUFFIXES else _folded(name)
+
+
+NAMES_SHOWN = 10  # in one message; left_out.json has them all
+
+
+def some(names: Iterable[str], shown: int = NAMES_SHOWN) -> str:
+    """A list of names for a message: the first few, and how many more."""
+    listed = [printable(name) for name in names]
+    more = f" and {len(listed) - shown} more" if len(listed) > shown else ""
+    return ", ".join(listed[:shown]) + more
+
+
+def printable(name: str) -> str:
+    """A name without line breaks and other signs that would spoil a message."""
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in name)

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
+from splatpipe.pipeline.photos.names import some
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.fitting import (
     MAX_SIGMA_ROTATION_RAD,
@@ -45,7 +46,6 @@ POOR_NOISES = 2.0  # times what positions state: worth a warning
 LINE_RAD = math.radians(60.0)  # positions that tell the rotation about an axis no better lie along it
 NADIR_PITCH_DEG = -60.0
 HEIGHT_TOLERANCE = 0.1  # of the height above ground, against what the drone measured
-NAMES_SHOWN = 10
 
 
 def georeference(
@@ -196,10 +196,9 @@ def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Position
     _tell_directions(fit, report)
     tell_flights_apart(frame.residuals["flights"], report)
     if frame.left_out:
-        shown = ", ".join(frame.left_out[:NAMES_SHOWN])
-        more = f" and {len(frame.left_out) - NAMES_SHOWN} more" if len(frame.left_out) > NAMES_SHOWN else ""
         report.warning(
-            f"The stated position of {len(frame.left_out)} photos is off and left out of the fit: {shown}{more}.",
+            f"The stated position of {len(frame.left_out)} photos is off and left out of the fit: "
+            f"{some(frame.left_out)}.",
             "The photos themselves are used.",
         )
     heights = _heights(frame, model, positions)

@@ -10,11 +10,9 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.camera_angles import gimbal_from_nadir, tell_convention
-from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.photos.names import NameFinder, some
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
 from splatpipe.pipeline.survey.position_file import PhotoPlace, read_position_file
-
-NAMES_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -75,9 +73,8 @@ def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False)
         else:
             matched[name] = photo
     if not matched:
-        shown = ", ".join(unknown[:NAMES_SHOWN])
         raise SplatpipeError(
-            f"{path.name} names no photo that is there: {shown}{', …' if len(unknown) > NAMES_SHOWN else ''}.",
+            f"{path.name} names no photo that is there: {some(unknown)}.",
             "It may be of another capture: name the right one with --set ingest.positions=PATH, or =none to ignore it.",
         )
     crs = parse_crs(file.crs)

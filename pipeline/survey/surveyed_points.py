@@ -13,14 +13,13 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.triangulation import Rays, Triangulated, triangulate
-from splatpipe.pipeline.photos.names import NameFinder
+from splatpipe.pipeline.photos.names import NameFinder, some
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.control_file import ControlFile, SurveyedPoint, read_control_file
 from splatpipe.pipeline.survey.crs import Crs, parse_crs
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
 
-NAMES_SHOWN = 8
 LEAST_FOR_CHECKS = 6  # points, from which on some are kept as check points
 EVERY_NTH = 3  # of them
 OUTSIDE_SHARE = 0.3  # of the marks beyond their photos: they were made in photos of another size
@@ -126,7 +125,7 @@ def load_survey(
     ]
     if file.zero_heights:
         report.note(
-            f"A height of 0.0 is taken as unknown: {_some(file.zero_heights)} of {path.name} "
+            f"A height of 0.0 is taken as unknown: {some(file.zero_heights)} of {path.name} "
             f"{'controls' if len(file.zero_heights) == 1 else 'control'} horizontally only."
         )
     _tell_unusable(points, path.name, model, photos, report)
@@ -215,23 +214,23 @@ def _tell_marks(
         )
     if all_missing:
         raise SplatpipeError(
-            f"None of the photos that {name} names is in this capture: {_some(missing)}.",
+            f"None of the photos that {name} names is in this capture: {some(missing)}.",
             "Check that the file belongs to these photos; it names them as their files are called."
             " --set georef.control=none goes on without control.",
         )
     if missing:
         report.warning(
-            f"{name} names {len(missing)} photos that are not in this capture: {_some(missing)}.",
+            f"{name} names {len(missing)} photos that are not in this capture: {some(missing)}.",
             "Their marks are left out. Correct the names, or add the photos.",
         )
     if len(outside) > OUTSIDE_SHARE * marks:
         raise SplatpipeError(
-            f"{len(outside)} of {marks} marks of {name} lie outside of their photos: {_some(outside)}.",
+            f"{len(outside)} of {marks} marks of {name} lie outside of their photos: {some(outside)}.",
             "Were they made in photos of another size, or turned ones? Pixels count in the photos as they are here.",
         )
     if outside:
         report.warning(
-            f"{len(outside)} marks of {name} lie outside of their photos and are left out: {_some(outside)}.",
+            f"{len(outside)} marks of {name} lie outside of their photos and are left out: {some(outside)}.",
             "Correct their pixel coordinates.",
         )
 
@@ -262,7 +261,7 @@ def _tell_unusable(
                 s.photo if r is None else f"{s.photo} ({np.hypot(*r):.0f} px)" for s, r in zip(wrong, off, strict=True)
             ]
             report.warning(
-                f"Marks of {point.name} do not lie where its other marks have it, and are left out: {_some(named)}.",
+                f"Marks of {point.name} do not lie where its other marks have it, and are left out: {some(named)}.",
                 "Correct these marks: another point may have been marked, or the wrong photo named.",
             )
 
@@ -291,14 +290,9 @@ def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]
         unknown = sorted(checks - {point.name for point in points})
         if unknown:
             raise SplatpipeError(
-                f"georef.check_points names points that the control file does not have: {_some(unknown)}.",
-                f"It has {_some([point.name for point in points])}.",
+                f"georef.check_points names points that the control file does not have: {some(unknown)}.",
+                f"It has {some([point.name for point in points])}.",
             )
     return [
         replace(point, role="check") if point.role == "control" and point.name in checks else point for point in points
     ]
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    return ", ".join(names[:NAMES_SHOWN]) + more

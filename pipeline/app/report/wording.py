@@ -78,12 +78,6 @@ def interval(bounds: object) -> str:
     return f"{metres(bounds[0])} to {metres(bounds[1])}"
 
 
-def some(names: list[str], shown: int = 12) -> str:
-    """The first names of a list, and how many more there are."""
-    rest = len(names) - shown
-    return ", ".join(names[:shown]) + (f" and {rest} more" if rest > 0 else "")
-
-
 def plural(amount: int, one: str, more: str = "") -> str:
     """``1 photo``, ``2 photos``."""
     return f"{amount:,} {one if amount == 1 else more or one + 's'}"

@@ -22,10 +22,10 @@ from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama, read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.survey.handover import in_world
 from splatpipe.pipeline.train.smoothing import smoothed
 from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, viewer_splat
-from splatpipe.stages.export import in_world
 
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
 JPEG_QUALITY = 92

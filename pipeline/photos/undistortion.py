@@ -1,0 +1,198 @@
+"""Photos as pinhole cameras see them, and the sparse model that fits these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.stage import Inputs, Reporter
+from splatpipe.pipeline.geometry.camera import reduced_size
+from splatpipe.pipeline.photos.dataset import MASKS, SKY_MASKS, image_path, mask_path
+from splatpipe.pipeline.photos.names import match_names, some
+from splatpipe.pipeline.photos.photo_list import Photo, decode, decode_mask, decode_sky_mask
+from splatpipe.pipeline.photos.resampling import resample
+
+SHAPE_TOLERANCE = 0.01  # between the shapes of a photo and of its camera in the model
+JPEG_QUALITY = 97  # with full chroma: far above what training reaches, and a third of a PNG's size and decoding time
+WHITE = 254.5  # of 255: a pixel counts only if nothing of it is masked, and is sky only if all of it is
+LEAST_VIEWS = 2
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A photo with its camera in the model.
+
+    Attributes:
+        photo: The photo.
+        image: Its image in the model.
+        source: The model's camera, scaled to the photo's stored grid.
+        target: The pinhole camera at training resolution; photos with equal cameras share its id.
+    """
+
+    photo: Photo
+    image: pycolmap.Image
+    source: pycolmap.Camera
+    target: pycolmap.Camera
+
+
+def place(
+    model: pycolmap.Reconstruction, photos: Sequence[Photo], max_megapixels: float, report: Reporter
+) -> list[Placed]:
+    """Find each image's photo and both its cameras; in name order of the photos.
+
+    Raises:
+        SplatpipeError: if fewer than two images of the model can be used.
+    """
+    by_name = {photo.name: photo for photo in photos}
+    targets: dict[tuple[int, int, int], pycolmap.Camera] = {}
+    placed: dict[str, Placed] = {}
+    missing: list[str] = []
+    unusable: list[str] = []
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    matched = match_names((image.name for image in images), by_name)
+    for image in images:
+        name = matched.get(image.name)
+        if name is None or name in placed:
+            missing.append(image.name)
+            continue
+        photo = by_name[name]
+        source = _camera_for(image, photo)
+        if source is None:
+            unusable.append(image.name)
+            continue
+        key = (image.camera_id, photo.width, photo.height)
+        if key not in targets:
+            targets[key] = pinhole_camera(source, max_megapixels, len(targets) + 1)
+        placed[photo.name] = Placed(photo, image, source, targets[key])
+    if len(placed) < LEAST_VIEWS:
+        raise SplatpipeError(
+            f"Of the {len(images)} photos in the sparse model, {len(placed)} can be used.",
+            hint="images/ must hold them, with the names and in the shape that the model has.",
+        )
+    if missing:
+        report.warning(f"{len(missing)} photos of the sparse model are not there and are left out: {some(missing)}.")
+    if unusable:
+        report.warning(
+            f"{len(unusable)} photos do not fit their cameras in the sparse model and are left out: {some(unusable)}.",
+            hint="Their width over height differs, or camera or pose are not finite.",
+        )
+    return [placed[name] for name in sorted(placed)]
+
+
+def _camera_for(image: pycolmap.Image, photo: Photo) -> pycolmap.Camera | None:
+    """The model's camera in the photo's grid; None where they cannot belong together."""
+    camera = pycolmap.Camera(image.camera.todict())
+    if not np.isfinite(camera.params).all() or camera.mean_focal_length() <= 0 or camera.width * camera.height == 0:
+        return None
+    if not np.isfinite(image.cam_from_world().matrix()).all():
+        return None
+    by_x, by_y = photo.width / camera.width, photo.height / camera.height
+    if abs(by_x / by_y - 1.0) > SHAPE_TOLERANCE:
+        return None
+    if (photo.width, photo.height) != (camera.width, camera.height):
+        camera.rescale(photo.width, photo.height)
+    return camera
+
+
+def pinhole_camera(source: pycolmap.Camera, max_megapixels: float, number: int) -> pycolmap.Camera:
+    """The largest pinhole camera without blank borders (COLMAP's choice), reduced to the training resolution.
+
+    Args:
+        source: Any camera model.
+        max_megapixels: Of the result, in 10⁶ pixels.
+        number: The camera id to give it.
+    """
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = 0.0
+    camera = pycolmap.undistort_camera(options, source)
+    size = reduced_size(camera.width, camera.height, max_megapixels)
+    if size != (camera.width, camera.height):
+        camera.rescale(*size)
+    camera.camera_id = number
+    return camera
+
+
+def write_view(view: Placed, inputs: Inputs, dataset: Path) -> None:
+    part = inputs["ingest.photos"]
+    pixels = resample(decode(view.photo, part, inputs.photos_dir), view.source, view.target)
+    _write(image_path(dataset, view.photo.name), pixels[:, :, ::-1])
+    for folder, decoded in ((MASKS, decode_mask), (SKY_MASKS, decode_sky_mask)):
+        mask = decoded(view.photo, part)
+        if mask is not None:
+            white = resample(mask, view.source, view.target) > WHITE
+            _write(mask_path(dataset, view.photo.name, folder), white.astype(np.uint8) * 255)
+
+
+def _write(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
+    """Write a picture in the format of its name: PNG or TIFF without loss, anything else JPEG."""
+    suffix = path.suffix.lower()
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    kind = ".jpg"
+    if suffix in (".png", ".tif", ".tiff"):
+        kind, options = suffix, []
+    done, encoded = cv2.imencode(kind, np.ascontiguousarray(pixels), options)
+    if not done:
+        raise StageError(f"{path.name} could not be encoded.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encoded.tobytes())
+
+
+def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[Placed]) -> pycolmap.Reconstruction:
+    """The model seen by the pinhole cameras: what is observed in the undistorted photos, and nothing else.
+
+    Points that other programs export without observations stay.
+
+    Args:
+        model: As it came.
+        placed: The photos that take part.
+    """
+    result = pycolmap.Reconstruction()
+    observed: dict[int, list[tuple[int, int]]] = {}
+    for camera in {view.target.camera_id: view.target for view in placed}.values():
+        result.add_camera_with_trivial_rig(camera)
+    for view in placed:
+        points, places = _observations(model, view)
+        number = view.image.image_id
+        image = pycolmap.Image(view.photo.name, places, view.target.camera_id, number)
+        result.add_image_with_trivial_frame(image, view.image.cam_from_world())
+        for index, point in enumerate(points):
+            observed.setdefault(point, []).append((number, index))
+    for number in sorted(model.points3D):
+        old = model.points3D[number]
+        seen = observed.get(number, [])
+        unobserved = old.track.length() < LEAST_VIEWS
+        if (len(seen) < LEAST_VIEWS and not unobserved) or not np.isfinite(old.xyz).all():
+            continue
+        track = pycolmap.Track([pycolmap.TrackElement(*element) for element in seen])
+        result.add_point3D(old.xyz, track, old.color)
+    result.update_point_3d_errors()
+    for point in result.points3D.values():
+        if point.track.length() == 0:
+            point.error = -1.0  # COLMAP's "not known"
+    return result
+
+
+def _observations(model: pycolmap.Reconstruction, view: Placed) -> tuple[list[int], npt.NDArray[np.float64]]:
+    """Points that a photo sees, and where the pinhole camera sees them (n, 2), within its frame."""
+    indices = view.image.get_observation_point2D_idxs()
+    points = [view.image.points2D[index].point3D_id for index in indices]
+    if not points:
+        return [], np.zeros((0, 2))
+    distorted = np.array([view.image.points2D[index].xy for index in indices], np.float64)
+    target = view.target
+    in_camera = view.image.camera.cam_from_img(distorted)
+    focal = [target.focal_length_x, target.focal_length_y]
+    places = in_camera * focal + [target.principal_point_x, target.principal_point_y]
+    inside = np.isfinite(places).all(axis=1) & (places >= 0).all(axis=1)
+    inside &= (places <= [target.width, target.height]).all(axis=1)
+    known = np.array([point in model.points3D for point in points])
+    keep = np.flatnonzero(inside & known)
+    return [points[index] for index in keep], places[keep]
