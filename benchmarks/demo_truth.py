@@ -37,7 +37,7 @@ from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.resampling import resample
 from splatpipe.pipeline.photos.undistortion import place
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.stages.evaluate import flat_stems, mean_measures, measure
+from splatpipe.pipeline.render.view_measures import flat_stems, mean_measures, measure
 
 WITHIN_GSD = 2.0
 ATTACHED_M = 0.05  # in front of the house: the survey targets on its walls, also where they are seen at a slant

@@ -21,6 +21,7 @@ from splatpipe.pipeline.photos.dataset import load_views, split_views
 from splatpipe.pipeline.photos.images import load_colour, load_mask
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import render_pixels
+from splatpipe.pipeline.render.view_measures import measure
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.flatness import ends_at
@@ -29,7 +30,6 @@ from splatpipe.pipeline.train.plan import Plan, coarse_levels, make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.surroundings import begin_sky, surround
-from splatpipe.stages.evaluate import measure
 from splatpipe.stages.options import LineConfig
 
 COLUMNS = {

@@ -15,6 +15,7 @@ import torch
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.render import view_measures
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import write_splat
@@ -110,7 +111,7 @@ def test_error_picture_has_a_fixed_scale_and_greys_what_is_masked() -> None:
     render[1, 2] += 155
     mask = np.ones((2, 3), bool)
     mask[1, 0] = False
-    picture = evaluate.error_picture(render, photo, mask)
+    picture = view_measures.error_picture(render, photo, mask)
     brightness = picture.astype(int).sum(axis=2)
     assert brightness[0, 0] < brightness[0, 1] < brightness[0, 2]
     np.testing.assert_array_equal(picture[0, 2], picture[1, 2])  # both beyond the scale's end
@@ -134,16 +135,16 @@ def test_named_views_are_taken(inputs: Inputs, tmp_path: Path) -> None:
 
 def test_wholly_masked_view_has_no_figures_and_the_mean_leaves_it_out() -> None:
     photo = np.zeros((16, 16, 3), np.uint8)
-    figures = evaluate.measure(photo, photo, np.zeros((16, 16), bool))
+    figures = view_measures.measure(photo, photo, np.zeros((16, 16), bool))
     assert set(figures.values()) == {None}
     other = dict.fromkeys(figures, 2.0)
-    assert evaluate.mean_measures([figures, other])["psnr"] == 2.0
+    assert view_measures.mean_measures([figures, other])["psnr"] == 2.0
 
 
 def test_file_names_are_safe_and_unique_whatever_the_photos_are_called() -> None:
     names = ["a/b.jpg", "a_b.jpg", "A_B.png", "../../etc/passwd", "..", "x" * 300 + ".jpg", "Фото 1.JPG"]
     names += ["c:d?.jpg", ".jpg"]
-    stems = evaluate.flat_stems(names)
+    stems = view_measures.flat_stems(names)
     assert len({stem.casefold() for stem in stems}) == len(names)
     for stem in stems:
         assert stem and not set(stem) & set('/\\:*?"<>|') and not stem.startswith(".") and len(stem) < 110

@@ -36,8 +36,8 @@ from splatpipe.pipeline.film.video import CODECS
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.view_measures import flat_stems
 from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.stages.evaluate import flat_stems
 from splatpipe.stages.line import EXPORT, FLYTHROUGH, LINE, TRAIN
 
 ORBIT_STILLS = 12
