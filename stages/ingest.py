@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
@@ -23,15 +19,12 @@ from splatpipe.pipeline.photos.camera_groups import (
     refused_calibrations,
     tell_cameras,
 )
-from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
-from splatpipe.pipeline.photos.convert import convert_photo, save_png, scale_of
+from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.doubts import FAR_M, median_distance_m
 from splatpipe.pipeline.photos.duplicates import split_duplicates
-from splatpipe.pipeline.photos.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
 from splatpipe.pipeline.photos.names import NAMES_SHOWN, printable, some
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
-    CONVERTED_DIR,
     MASK_DIR,
     SKY_DIR,
     Photo,
@@ -40,7 +33,17 @@ from splatpipe.pipeline.photos.photo_list import (
     photo_root,
     save_photo_list,
 )
-from splatpipe.pipeline.photos.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan, scan_folder
+from splatpipe.pipeline.photos.preparation import (
+    MASKS,
+    SKIES,
+    Preparation,
+    check_photos,
+    convert_odd,
+    converted_path,
+    mask_path,
+    prepare_masks,
+)
+from splatpipe.pipeline.photos.scan import LeftOut, Scan, scan_folder
 from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.pipeline.survey.photo_positions import (
@@ -54,34 +57,6 @@ from splatpipe.pipeline.survey.photo_positions import (
 from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 
 MIN_PHOTOS = 2
-MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly meant
-T = TypeVar("T")
-R = TypeVar("R")
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """What masks are for: the name of the user's folders, and of the folder in the part."""
-
-    folder: str
-    part: str
-
-
-_MASKS, _SKIES = _Kind(MASK_FOLDER, MASK_DIR), _Kind(SKY_FOLDER, SKY_DIR)
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What every step needs."""
-
-    config: IngestConfig
-    threads: int
-    part: Path
-    report: Reporter
-
-    @property
-    def max_pixels(self) -> int:
-        return int(self.config.max_megapixels * 1e6)
 
 
 def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -93,22 +68,22 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     root = photo_root(inputs.photos_dir)
     part = out / "photos"
     part.mkdir(parents=True, exist_ok=True)
-    work = _Work(config, inputs.machine.threads, part, report)
+    work = Preparation(config, inputs.machine.threads, part, report)
     # Libraries warn of odd metadata tags in a text of their own; filters are process wide, so they are set only here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scan = scan_folder(root)
-        checked, broken = _check(scan, work)
+        checked, broken = check_photos(scan, work)
         photos, duplicates = split_duplicates(checked)
         left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
         _require_photos(inputs.photos_dir, scan, photos, left_out)
         _tell_left_out(left_out, report)
         groups, camera_of = group_cameras(photos)
         groups, lenses = _lenses(inputs, groups, camera_of, photos, report)
-        opacity = _convert(photos, camera_of, work)
+        opacity = convert_odd(photos, camera_of, work)
         others = [entry.name for entry in left_out]
-        masked = _mask(_MASKS, root, photos, others, opacity, work)
-        skies = _mask(_SKIES, root, photos, others, {}, work)
+        masked = prepare_masks(MASKS, root, photos, others, opacity, work)
+        skies = prepare_masks(SKIES, root, photos, others, {}, work)
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places)
     _tell_positions(positions, report)
@@ -132,91 +107,6 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
     }
-
-
-def _check(scan: Scan, work: _Work) -> tuple[list[CheckedPhoto], list[LeftOut]]:
-    limits = Limits(work.config.min_size, work.max_pixels)
-    results = _in_threads(
-        lambda candidate: check_photo(candidate, limits), scan.candidates, work, "checking photos", "photos"
-    )
-    checked = [result for result in results if isinstance(result, CheckedPhoto)]
-    return checked, [result for result in results if isinstance(result, LeftOut)]
-
-
-def _convert(
-    photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int], work: _Work
-) -> dict[str, UInt8[np.ndarray, "h w"]]:
-    """Write the PNGs of photos that are not plain; returns the masks of transparent ones by name."""
-    odd = [photo for photo in photos if not photo.plain]
-    if not odd:
-        return {}
-    ranges: dict[int, list[tuple[float, float]]] = {}
-    for photo in odd:
-        if photo.deep_range is not None:
-            ranges.setdefault(camera_of[photo.name], []).append(photo.deep_range)
-    scales = {camera: scale_of(values) for camera, values in ranges.items()}
-
-    def convert(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"] | None:
-        scale = scales[camera_of[photo.name]] if photo.deep_range is not None else None
-        return convert_photo(photo, scale, work.part / converted_path(photo.name))
-
-    masks = _in_threads(convert, odd, work, "converting to 8-bit RGB", "photos")
-    return {photo.name: mask for photo, mask in zip(odd, masks, strict=True) if mask is not None}
-
-
-def _mask(
-    kind: _Kind,
-    root: Path,
-    photos: Sequence[CheckedPhoto],
-    left_out: Sequence[str],
-    opacity: Mapping[str, UInt8[np.ndarray, "h w"]],
-    work: _Work,
-) -> set[str]:
-    """Write the masks of a kind, from its folder and from transparency; returns the names of masked photos."""
-    files = find_masks(root, kind.folder) if work.config.masks else []
-    matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
-    if unused:
-        names = some([mask.label for mask in unused])
-        work.report.warning(f"No photo is found for the mask {names}.", "A mask has its photo's name: NAME.png.")
-    masked = [photo for photo in photos if photo.name in matched or photo.name in opacity]
-
-    def write(photo: CheckedPhoto) -> str | None:
-        problem, values = _read(matched.get(photo.name), photo, work.max_pixels)
-        clear = opacity.get(photo.name)
-        if clear is not None:
-            values = clear if values is None else np.minimum(values, clear)
-        if values is None:
-            return problem
-        save_png(values, work.part / mask_path(photo.name, kind.part))
-        if kind is _MASKS and np.mean(values == 0) > MOSTLY_IGNORED:
-            return f"The mask of {printable(photo.name)} leaves hardly anything of it: black is what is ignored."
-        return problem
-
-    problems = _in_threads(write, masked, work, "preparing masks", "masks")
-    for problem in dict.fromkeys(problem for problem in problems if problem is not None):
-        work.report.warning(problem)
-    return {photo.name for photo in masked if (work.part / mask_path(photo.name, kind.part)).is_file()}
-
-
-def _read(
-    mask: MaskFile | None, photo: CheckedPhoto, max_pixels: int
-) -> tuple[str | None, UInt8[np.ndarray, "h w"] | None]:
-    if mask is None:
-        return None, None
-    try:
-        return None, read_mask(mask, photo, max_pixels)
-    except MaskError as error:
-        return f"The mask {printable(mask.label)} {error}; it is not used.", None
-
-
-def converted_path(name: str) -> str:
-    """Where a photo's conversion lies in the part."""
-    return f"{CONVERTED_DIR}/{name}.png"
-
-
-def mask_path(name: str, folder: str) -> str:
-    """Where a photo's mask lies in the part: as COLMAP looks for it below a mask folder."""
-    return f"{folder}/{name}.png"
 
 
 def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str], skies: set[str]) -> Photo:
@@ -360,19 +250,6 @@ def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: R
             f"Nothing is known of the focal length of {unknown} photos; calibration has to find it.",
             "Photos as the camera wrote them, with their EXIF, give a better result.",
         )
-
-
-def _in_threads(function: Callable[[T], R], items: Sequence[T], work: _Work, what: str, unit: str) -> list[R]:
-    """``function`` of each item, in their order; Pillow and hashlib work outside Python's lock."""
-    results: list[R] = []
-    pool = ThreadPoolExecutor(max_workers=max(1, work.threads))
-    try:
-        for result in pool.map(function, items):
-            results.append(result)
-            work.report.progress(len(results), len(items), what, unit)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-    return results
 
 
 def _write_json(path: Path, value: JSON) -> None:

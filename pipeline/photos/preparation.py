@@ -1,0 +1,161 @@
+"""Photos made ready for every reader: checked, converted where they are odd, their masks in the stored grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import UInt8
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.convert import convert_photo, save_png, scale_of
+from splatpipe.pipeline.photos.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
+from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.photos.options import IngestConfig
+from splatpipe.pipeline.photos.photo_list import (
+    CONVERTED_DIR,
+    MASK_DIR,
+    SKY_DIR,
+)
+from splatpipe.pipeline.photos.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan
+
+MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly meant
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class MaskKind:
+    """What masks are for: the name of the user's folders, and of the folder in the part."""
+
+    folder: str
+    part: str
+
+
+MASKS = MaskKind(MASK_FOLDER, MASK_DIR)
+SKIES = MaskKind(SKY_FOLDER, SKY_DIR)
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What every step of it needs.
+
+    Attributes:
+        config: Ingest's options.
+        threads: That work at a time.
+        part: The folder of the part `photos`.
+        report: Told of progress.
+    """
+
+    config: IngestConfig
+    threads: int
+    part: Path
+    report: Reporter
+
+    @property
+    def max_pixels(self) -> int:
+        return int(self.config.max_megapixels * 1e6)
+
+
+def check_photos(scan: Scan, work: Preparation) -> tuple[list[CheckedPhoto], list[LeftOut]]:
+    """Check what the scan found; the photos that can be used, and what cannot and why."""
+    limits = Limits(work.config.min_size, work.max_pixels)
+    results = _in_threads(
+        lambda candidate: check_photo(candidate, limits), scan.candidates, work, "checking photos", "photos"
+    )
+    checked = [result for result in results if isinstance(result, CheckedPhoto)]
+    return checked, [result for result in results if isinstance(result, LeftOut)]
+
+
+def convert_odd(
+    photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int], work: Preparation
+) -> dict[str, UInt8[np.ndarray, "h w"]]:
+    """Write the PNGs of photos that are not plain; returns the masks of transparent ones by name."""
+    odd = [photo for photo in photos if not photo.plain]
+    if not odd:
+        return {}
+    ranges: dict[int, list[tuple[float, float]]] = {}
+    for photo in odd:
+        if photo.deep_range is not None:
+            ranges.setdefault(camera_of[photo.name], []).append(photo.deep_range)
+    scales = {camera: scale_of(values) for camera, values in ranges.items()}
+
+    def convert(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"] | None:
+        scale = scales[camera_of[photo.name]] if photo.deep_range is not None else None
+        return convert_photo(photo, scale, work.part / converted_path(photo.name))
+
+    masks = _in_threads(convert, odd, work, "converting to 8-bit RGB", "photos")
+    return {photo.name: mask for photo, mask in zip(odd, masks, strict=True) if mask is not None}
+
+
+def prepare_masks(
+    kind: MaskKind,
+    root: Path,
+    photos: Sequence[CheckedPhoto],
+    left_out: Sequence[str],
+    opacity: Mapping[str, UInt8[np.ndarray, "h w"]],
+    work: Preparation,
+) -> set[str]:
+    """Write the masks of a kind, from its folder and from transparency; returns the names of masked photos."""
+    files = find_masks(root, kind.folder) if work.config.masks else []
+    matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
+    if unused:
+        names = some([mask.label for mask in unused])
+        work.report.warning(f"No photo is found for the mask {names}.", "A mask has its photo's name: NAME.png.")
+    masked = [photo for photo in photos if photo.name in matched or photo.name in opacity]
+
+    def write(photo: CheckedPhoto) -> str | None:
+        problem, values = _read(matched.get(photo.name), photo, work.max_pixels)
+        clear = opacity.get(photo.name)
+        if clear is not None:
+            values = clear if values is None else np.minimum(values, clear)
+        if values is None:
+            return problem
+        save_png(values, work.part / mask_path(photo.name, kind.part))
+        if kind is MASKS and np.mean(values == 0) > MOSTLY_IGNORED:
+            return f"The mask of {printable(photo.name)} leaves hardly anything of it: black is what is ignored."
+        return problem
+
+    problems = _in_threads(write, masked, work, "preparing masks", "masks")
+    for problem in dict.fromkeys(problem for problem in problems if problem is not None):
+        work.report.warning(problem)
+    return {photo.name for photo in masked if (work.part / mask_path(photo.name, kind.part)).is_file()}
+
+
+def _read(
+    mask: MaskFile | None, photo: CheckedPhoto, max_pixels: int
+) -> tuple[str | None, UInt8[np.ndarray, "h w"] | None]:
+    if mask is None:
+        return None, None
+    try:
+        return None, read_mask(mask, photo, max_pixels)
+    except MaskError as error:
+        return f"The mask {printable(mask.label)} {error}; it is not used.", None
+
+
+def converted_path(name: str) -> str:
+    """Where a photo's conversion lies in the part."""
+    return f"{CONVERTED_DIR}/{name}.png"
+
+
+def mask_path(name: str, folder: str) -> str:
+    """Where a photo's mask lies in the part: as COLMAP looks for it below a mask folder."""
+    return f"{folder}/{name}.png"
+
+
+def _in_threads(function: Callable[[T], R], items: Sequence[T], work: Preparation, what: str, unit: str) -> list[R]:
+    """``function`` of each item, in their order; Pillow and hashlib work outside Python's lock."""
+    results: list[R] = []
+    pool = ThreadPoolExecutor(max_workers=max(1, work.threads))
+    try:
+        for result in pool.map(function, items):
+            results.append(result)
+            work.report.progress(len(results), len(items), what, unit)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return results
