@@ -12,7 +12,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.dome import SPACING_RAD, dome_directions, dome_radius, sky_dome
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama
-from splatpipe.pipeline.splat.sky import directions, elevations_deg
+from splatpipe.pipeline.splat.sky_mask import directions, elevations_deg
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies

@@ -17,7 +17,7 @@ from splatpipe.pipeline.splat.panorama import (
     read_panorama,
     write_panorama,
 )
-from splatpipe.pipeline.splat.sky import directions, elevations_deg
+from splatpipe.pipeline.splat.sky_mask import directions, elevations_deg
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies

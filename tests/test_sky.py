@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.splat.sky import agreed, find_skies, find_sky, points_in, up_of, votes_of
+from splatpipe.pipeline.splat.sky_mask import agreed, find_skies, find_sky, points_in, up_of, votes_of
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies

@@ -22,7 +22,7 @@ from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
-from splatpipe.pipeline.splat.sky import SkyMask, directions
+from splatpipe.pipeline.splat.sky_mask import SkyMask, directions
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.measure import Effort, measure
 from splatpipe.pipeline.train.options import TrainConfig

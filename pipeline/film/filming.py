@@ -24,7 +24,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import Model, as_trained, render_depth, render_normals, render_pixels
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.sky import WORK_MEGAPIXELS, SkyPhoto, up_of
+from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
 
 What = Literal["colour", "depth", "normals"]
 ASPECT = 16.0 / 9.0

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import COLUMNS, FULL_FROM_DEG, Panorama
 from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.splat.sky import horizontal_axes
+from splatpipe.pipeline.splat.sky_mask import horizontal_axes
 
 SPACING_RAD = 2.0 * math.pi / COLUMNS / 4.0  # a quarter of a cell: neighbours differ by less than an 8-bit step or so
 SIGMA_PER_SPACING = 0.8  # the least at which no light comes between them; larger ones blur

@@ -14,7 +14,7 @@ from torch import Tensor
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.archives import read_archive
-from splatpipe.pipeline.splat.sky import directions, horizontal_axes
+from splatpipe.pipeline.splat.sky_mask import directions, horizontal_axes
 
 ROWS = 32  # from straight down to straight up, cells of 5.6°: gradients and large clouds, no building
 COLUMNS = 2 * ROWS

@@ -25,7 +25,7 @@ from splatpipe.pipeline.photos.dataset import View, load_points
 from splatpipe.pipeline.photos.images import reduced_sky, reduced_view
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over
-from splatpipe.pipeline.splat.sky import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
+from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
 from splatpipe.pipeline.train.side import SideModel
 
 LEAST_TRACK = 3  # photos of a point that the search for the sky believes in

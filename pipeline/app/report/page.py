@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from splatpipe.pipeline.app.report.capture import capture_chapter, registration_chapter
+from splatpipe.pipeline.app.report.capturing import capture_chapter, registration_chapter
 from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.learning import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.making import files_chapter, making_chapter, said_chapter

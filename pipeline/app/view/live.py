@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.dataset import View
 
 if TYPE_CHECKING:  # torch takes seconds to load, and marking does without
-    from splatpipe.pipeline.app.view.checkpoint import Shown, Source
+    from splatpipe.pipeline.app.view.checkpoint_render import Shown, Source
 
 LOOK_EVERY_S = 2.0
 MOST_PICTURES = 64  # that are kept: pairs of JPEGs of some 100 kB
@@ -50,7 +50,7 @@ class Live:
 
     def state(self) -> dict[str, JSON]:
         """How far the run is, for the page."""
-        from splatpipe.pipeline.app.view import checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
 
         with self._lock:
             self._log.read()
@@ -103,7 +103,7 @@ class Live:
         return None if made is None else made[0 if what == "page" else 1]
 
     def _make_viewer(self) -> tuple[bytes, bytes] | None:
-        from splatpipe.pipeline.app.view import checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
 
         with self._lock:
             opened, _ = self._look()
@@ -116,7 +116,7 @@ class Live:
         return self._viewer[1:]
 
     def _load(self, source: Source, opened: Contents) -> Shown:
-        from splatpipe.pipeline.app.view import checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
 
         if self._model is None or self._model[0] != source.stamp:
             self._model = None  # two of them may not fit
@@ -124,7 +124,7 @@ class Live:
         return self._model[1]
 
     def _make(self, number: int) -> tuple[bytes, bytes] | None:
-        from splatpipe.pipeline.app.view import checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
 
         with self._lock:
             opened, views = self._look()
@@ -144,7 +144,7 @@ class Live:
 
     def _look(self) -> tuple[Contents, tuple[View, ...]]:
         """What there is, at most so old; called with the lock held."""
-        from splatpipe.pipeline.app.view import checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
 
         if time.monotonic() - self._looked_s >= LOOK_EVERY_S:
             self._opened = contents_of(self._run, self._log)
