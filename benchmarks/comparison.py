@@ -16,6 +16,7 @@ MEASURES = {
     "PSNR cc": ("psnr_cc", ".2f"),
     "SSIM": ("ssim", ".4f"),
     "best − end": ("below_best", ".2f"),
+    "veil": ("floaters.veil.mean", ".5f"),
     "free space": ("floaters.free_space_opacity", ".6f"),
     "depth off": ("floaters.depth_disagreement.median", ".5f"),
     "loss": ("loss", ".4f"),

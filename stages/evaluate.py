@@ -49,7 +49,7 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     means = mean_measures(per_view)
     cameras = [reduced_camera(view.camera, megapixels) for view in views]
     with same_bits(inputs.machine.threads):
-        floaters = measure_floaters(gaussians, cameras, inputs["undistort.dataset"], options)
+        floaters = measure_floaters(gaussians, cameras, set(held_out), inputs["undistort.dataset"], options)
         accuracy = measure_accuracy(inputs.parts, cameras, held_out, partial(render_depth, gaussians, options=options))
     result = {"test_views": len(per_view), "mean": means, "floaters": floaters, "accuracy": accuracy}
     result["per_view"] = per_view
@@ -57,4 +57,4 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
     summary: dict[str, Any] = {"test_views": len(per_view)}
     summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
-    return summary | {"free_space_opacity": floaters["free_space_opacity"]}
+    return summary | {"veil": floaters["veil"]["mean"]}

@@ -116,7 +116,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=6,
+    version=7,
     config=EvaluateConfig,
     reads=(
         "train.model",

@@ -8,15 +8,20 @@ import numpy as np
 import pytest
 import torch
 
+from splatpipe.pipeline.app.report.verdict import VEIL
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.floaters import measure_floaters
+from splatpipe.pipeline.render.veil import light_stopped
+from splatpipe.pipeline.splat.free_space import free_space, near_or_free
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
 WALL = 6.0
+HELD_OUT = {"photo_3.png"}
 OPTIONS = RenderOptions(sh_degree=0, background=(1.0, 1.0, 1.0), depth=False)
 
 
@@ -62,7 +67,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_true_model_has_no_floaters_and_its_views_agree(dataset: Path) -> None:
-    figures = measure_floaters(wall(), cameras(), dataset, OPTIONS)
+    figures = measure_floaters(wall(), cameras(), HELD_OUT, dataset, OPTIONS)
     assert (figures["free_space_opacity"], figures["free_space_gaussians"], figures["free_space_rendered"]) == (0, 0, 0)
     apart = figures["depth_disagreement"]
     assert apart["median"] < 1e-4 and apart["share_above_5_percent"] == 0.0
@@ -73,7 +78,7 @@ def test_true_model_has_no_floaters_and_its_views_agree(dataset: Path) -> None:
 def test_planted_floater_is_found_with_the_light_that_it_stops(dataset: Path) -> None:
     floater = blob(np.array([[0.0, 0.0, 2.0]]), 0.08, 0.98)
     model = Gaussians.concat([wall(), floater])
-    figures = measure_floaters(model, cameras(), dataset, OPTIONS)
+    figures = measure_floaters(model, cameras(), HELD_OUT, dataset, OPTIONS)
     assert figures["free_space_gaussians"] == 1
     assert figures["free_space_opacity"] == pytest.approx(0.98 / (0.98 + 0.9 * len(places())), abs=1e-6)
     assert figures["depth_disagreement"]["share_above_5_percent"] == 0.0  # all see it in the same place
@@ -86,8 +91,8 @@ def test_haze_that_is_a_surface_for_one_view_alone_is_a_disagreement(dataset: Pa
     """Two veils, one behind the other for the first camera: only there they stop more than half of the light."""
     x = float(cameras()[0].centre()[0])
     veils = [blob(np.array([[x, 0.0, z]]), 8.0 * z / 130.0, 0.45) for z in (1.5, 3.0)]
-    figures = measure_floaters(Gaussians.concat([wall(), *veils]), cameras(), dataset, OPTIONS)
-    alone = measure_floaters(Gaussians.concat([wall(), veils[0]]), cameras(), dataset, OPTIONS)
+    figures = measure_floaters(Gaussians.concat([wall(), *veils]), cameras(), HELD_OUT, dataset, OPTIONS)
+    alone = measure_floaters(Gaussians.concat([wall(), veils[0]]), cameras(), HELD_OUT, dataset, OPTIONS)
     assert (figures["free_space_gaussians"], alone["free_space_gaussians"]) == (2, 1)
     apart = figures["depth_disagreement"]
     # (1 - 0.45 g)² is below a half within 0.93 σ: π (0.93 · 8)² pixels, a sixteenth of them samples, in three pairs.
@@ -111,8 +116,9 @@ def test_depth_of_an_antialiased_model_is_that_of_the_surface_however_fine_its_g
 
 def test_without_sparse_points_the_figures_are_not_known(tmp_path: Path) -> None:
     tiny_scene.write_model(tmp_path / "sparse/0", cameras(), np.empty((0, 3)), np.empty((0, 3), np.uint8))
-    figures = measure_floaters(wall(), cameras(), tmp_path, OPTIONS)
+    figures = measure_floaters(wall(), cameras(), HELD_OUT, tmp_path, OPTIONS)
     assert figures == {
+        "veil": {"mean": None, "worst": None, "worst_photo": None, "photos": 0, "points": 0},
         "free_space_opacity": None,
         "free_space_gaussians": None,
         "free_space_rendered": None,
@@ -124,4 +130,34 @@ def test_figures_do_not_depend_on_the_size_beyond_half_a_megapixel(dataset: Path
     floater = blob(np.array([[0.0, 0.0, 2.0]]), 0.08, 0.98)
     model = Gaussians.concat([wall(), floater])
     large, limit = ([view.scaled(w, h) for view in cameras()] for w, h in ((1152, 864), (816, 612)))
-    assert measure_floaters(model, large, dataset, OPTIONS) == measure_floaters(model, limit, dataset, OPTIONS)
+    figures = (measure_floaters(model, size, HELD_OUT, dataset, OPTIONS) for size in (large, limit))
+    assert next(figures) == next(figures)
+
+
+def test_floater_that_passes_trainings_own_rule_is_still_called_out(dataset: Path) -> None:
+    """Right before a held-out camera, where no other one looks: training's photos have no say there."""
+    centre = cameras()[3].centre()
+    floater = blob(centre[None] + (0.0, 0.0, 0.5), 0.1, 0.9)
+    model = Gaussians.concat([wall(), floater])
+    points, tracks = load_points_and_tracks(dataset)
+    trained = cameras()[:3]
+    space = free_space(trained, points.xyz, [tracks[camera.name] for camera in trained])
+    assert space.known and not near_or_free(model, space, views=1).any()
+    clean, veiled = (measure_floaters(m, cameras(), HELD_OUT, dataset, OPTIONS)["veil"] for m in (wall(), model))
+    assert clean["mean"] == 0.0 and clean["points"] > 500
+    assert veiled["mean"] > VEIL and (veiled["worst_photo"], veiled["photos"]) == ("photo_3.png", 1)
+    seen = measure_floaters(model, cameras(), {"photo_0.png"}, dataset, OPTIONS)["veil"]
+    assert seen["mean"] == 0.0  # it hangs before nothing that this one sees
+
+
+def test_light_that_a_veil_stops_is_what_its_gaussian_says(dataset: Path) -> None:
+    """A haze of which every pixel lets more than half through, so that no depth tells of it."""
+    camera, sigma_px = cameras()[1], 0.6 * 130.0 / 2.0
+    veil = blob(camera.centre()[None] + (0.0, 0.0, 2.0), 0.6, 0.3)
+    xyz = np.array([[x, y, WALL] for x in (-0.8, 0.1, 1.3) for y in (-0.6, 0.4)])
+    stopped = light_stopped(Gaussians.concat([wall(), veil]), camera, xyz)
+    pixels = np.floor(camera.project(xyz)) + 0.5
+    squares = ((pixels - [72.0, 54.0]) ** 2).sum(axis=1) / (sigma_px**2 + 0.3)
+    np.testing.assert_allclose(stopped, 0.3 * np.exp(-0.5 * squares), rtol=1e-4)
+    beside = blob(camera.centre()[None] + (0.0, 0.0, 0.95 * WALL), 0.6, 0.3)
+    assert not light_stopped(Gaussians.concat([wall(), beside]), camera, xyz).any()  # is the surface itself

@@ -69,6 +69,10 @@ class Camera:
             cy=self.cy * by_y,
         )
 
+    def depths(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """Depths of world points along the view axis, world units; negative behind the camera."""
+        return np.asarray(points @ self.cam_from_world[2, :3] + self.cam_from_world[2, 3])
+
     def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Project world points to pixels.
 

@@ -1,8 +1,9 @@
-"""What evaluation says of floaters: the part of the splat in free space, and whether neighbouring views agree."""
+"""What evaluation says of floaters: the veil before held-out photos, the part of the splat in free space, and whether
+neighbouring views agree."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.consistency import depth_differences, disagreement, neighbouring_pairs
+from splatpipe.pipeline.render.veil import measure_veil
 from splatpipe.pipeline.splat.free_space import free_space, near_or_free, share_of_opacity
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import rgb_to_dc
@@ -25,16 +27,21 @@ LARGEST_MEGAPIXELS = 0.5  # of a depth map: what floats is larger than its pixel
 
 
 def measure_floaters(
-    gaussians: Gaussians, cameras: Sequence[Camera], dataset: Path, options: rasterizer.RenderOptions
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    held_out: Container[str],
+    dataset: Path,
+    options: rasterizer.RenderOptions,
 ) -> dict[str, Any]:
     """The figures of `floaters` in metrics.json; None where the sparse model does not tell.
 
-    All registered photos take part, the held-out ones, too: they are not compared with the model, but their points and
-    places say where the air is, and what hangs before them is what a visitor meets.
+    All registered photos say where the air is. That is also what training goes by, with its own photos, so that only
+    the veil before held-out photos, which is measured in another way, is a verdict on it.
 
     Args:
         gaussians: The model.
         cameras: Of all registered photos, at the size that the model is evaluated at.
+        held_out: Names of the photos that were not trained on.
         dataset: Their dataset, with the sparse points.
         options: How the model is rendered.
     """
@@ -52,6 +59,7 @@ def measure_floaters(
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
     apart = disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
     return {
+        "veil": measure_veil(gaussians, cameras, (points.xyz, seen), held_out),
         "free_space_opacity": _rounded(share_of_opacity(gaussians, chosen)) if space.known else None,
         "free_space_gaussians": int(chosen.sum()) if space.known else None,
         "free_space_rendered": _rounded(light[0] / light[1]) if space.known and light[1] > 0.0 else None,

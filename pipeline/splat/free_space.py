@@ -174,7 +174,7 @@ def _cells(
     camera: Camera, points: Float64[np.ndarray, "n 3"]
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"], Int64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
     """Which points fall into a photo: their rows, their pixels, their cells (row, column), and their depths."""
-    depths = points @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+    depths = camera.depths(points)
     rows = np.flatnonzero((depths > 0.0) & np.isfinite(depths))
     pixels = camera.project(points[rows])
     inside = ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1)
@@ -192,7 +192,7 @@ def _judge(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " 
             rows, pixels, cells, depths = _cells(photo.camera, means)
             front = np.flatnonzero(depths < (1.0 - MARGIN) * photo.depth[cells[:, 0], cells[:, 1]])
             front = front[_within(pixels[front], cells[front], photo)]  # few: only of them is the spread looked at
-            spread = _spread(gaussians, chunk[rows[front]], photo.camera.cam_from_world[2, :3])
+            spread = spread_along(gaussians, chunk[rows[front]], photo.camera.cam_from_world[2, :3])
             limits = (1.0 - MARGIN) * photo.depth[cells[front, 0], cells[front, 1]]
             through[chunk[rows[front[depths[front] + spread < limits]]]] += 1
             close = rows[depths < photo.near]
@@ -221,7 +221,7 @@ def _chunks(rows: Int64[np.ndarray, " _"]) -> Iterator[Int64[np.ndarray, " _"]]:
     return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
 
 
-def _spread(
+def spread_along(
     gaussians: Gaussians, rows: Int64[np.ndarray, " k"], axis: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " k"]:
     """Standard deviation along an axis of the world, world units: |S Rᵀ axis|."""
