@@ -50,17 +50,17 @@ class Live:
 
     def state(self) -> dict[str, JSON]:
         """How far the run is, for the page."""
-        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render
 
         with self._lock:
             self._log.read()
             opened, views = self._look()
             log = self._log
-            source = checkpoint.newest(opened)
-            held_out = set(checkpoint.held_out_of(opened))
+            source = checkpoint_render.newest(opened)
+            held_out = set(checkpoint_render.held_out_of(opened))
             model: JSON = None
             if source is not None and views:
-                model = {"kind": source.kind, "stamp": source.stamp, "iteration": checkpoint.iteration_of(source)}
+                model = {"kind": source.kind, "stamp": source.stamp, "iteration": checkpoint_render.iteration_of(source)}
                 model["in_3d"] = source.rendering is not None
             return {
                 "name": self._run.name,
@@ -103,32 +103,32 @@ class Live:
         return None if made is None else made[0 if what == "page" else 1]
 
     def _make_viewer(self) -> tuple[bytes, bytes] | None:
-        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render
 
         with self._lock:
             opened, _ = self._look()
-        source = checkpoint.newest(opened)
+        source = checkpoint_render.newest(opened)
         if source is None:
             return None
         if self._viewer is None or self._viewer[0] != source.stamp:
-            page, splat = checkpoint.viewer(self._load(source, opened), source, opened, self._run.name)
+            page, splat = checkpoint_render.viewer(self._load(source, opened), source, opened, self._run.name)
             self._viewer = source.stamp, page.encode(), splat
         return self._viewer[1:]
 
     def _load(self, source: Source, opened: Contents) -> Shown:
-        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render
 
         if self._model is None or self._model[0] != source.stamp:
             self._model = None  # two of them may not fit
-            self._model = source.stamp, checkpoint.load(source, opened)
+            self._model = source.stamp, checkpoint_render.load(source, opened)
         return self._model[1]
 
     def _make(self, number: int) -> tuple[bytes, bytes] | None:
-        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render
 
         with self._lock:
             opened, views = self._look()
-        source = checkpoint.newest(opened)
+        source = checkpoint_render.newest(opened)
         if source is None or not 0 <= number < len(views):
             return None
         if (source.stamp, number) in self._pictures:
@@ -136,7 +136,7 @@ class Live:
         shown = self._load(source, opened)
         if shown.megapixels is None:
             shown = replace(shown, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
-        made = checkpoint.pictures(shown, views[number], RENDER_THREADS)
+        made = checkpoint_render.pictures(shown, views[number], RENDER_THREADS)
         self._pictures[source.stamp, number] = made
         while len(self._pictures) > MOST_PICTURES:
             self._pictures.popitem(last=False)
@@ -144,7 +144,7 @@ class Live:
 
     def _look(self) -> tuple[Contents, tuple[View, ...]]:
         """What there is, at most so old; called with the lock held."""
-        from splatpipe.pipeline.app.view import checkpoint_render as checkpoint
+        from splatpipe.pipeline.app.view import checkpoint_render
 
         if time.monotonic() - self._looked_s >= LOOK_EVERY_S:
             self._opened = contents_of(self._run, self._log)
@@ -153,7 +153,7 @@ class Live:
             path = None if part is None else part.path
             if path != self._views[0]:
                 try:
-                    self._views = path, checkpoint.views_of(self._opened)
+                    self._views = path, checkpoint_render.views_of(self._opened)
                 except SplatpipeError:
                     self._views = None, ()
         return self._opened, self._views[1]
