@@ -89,18 +89,24 @@ class Comparison:
         threads = len(os.sched_getaffinity(0))
         self._say("running the line of that commit")
         options = ["--config", str(config), "--device", "cpu", "--threads", str(threads)]
-        _check(before.python("-m", before.command, "run", str(photos), str(earlier), *options))
+        for name in reversed(wanted):  # the last one needs most others, and what is there is reused
+            if not self._manifests(name):
+                _check(before.python("-m", before.command, "run", str(photos), str(earlier), *options, "--until", name))
         self._say(f"running the present {', '.join(wanted)} on what it left")
         job = {"earlier": str(earlier), "out": str(later), "photos": str(photos), "threads": threads, "stages": wanted}
         _check(now.python(str(HERE / "rerun.py"), json.dumps(job)))
         result: dict[str, Any] = json.loads((later / "rerun.json").read_text(encoding="utf-8"))
         return result
 
-    def _files(self, stage: str) -> dict[str, dict[str, str]]:
-        """By part the files that the earlier run left, with their digests."""
-        (path,) = (self._folder / "earlier" / "stages").glob(f"{stage}-*/manifest.json")
-        parts = json.loads(path.read_text(encoding="utf-8"))["parts"]
-        return {name: {file["path"]: file["sha256"] for file in part["files"]} for name, part in parts.items()}
+    def _manifests(self, stage: str) -> list[Path]:
+        """What describes the artifact that the earlier run left, if it did."""
+        return list((self._folder / "earlier" / "stages").glob(f"{stage}-*/manifest.json"))
+
+    def _files(self, stage: str) -> dict[str, str]:
+        """The files that the earlier run left, with their digests."""
+        (path,) = self._manifests(stage)
+        parts = json.loads(path.read_text(encoding="utf-8"))["parts"].values()
+        return {file["path"]: file["sha256"] for part in parts for file in part["files"]}
 
 
 def _without_running(then: StageSources | None, now: StageSources) -> Verdict | None:
@@ -114,17 +120,18 @@ def _without_running(then: StageSources | None, now: StageSources) -> Verdict | 
     return None
 
 
-def _verdict(found: Mapping[str, Any], before: Mapping[str, Mapping[str, str]]) -> Verdict:
+def _verdict(found: Mapping[str, Any], before: Mapping[str, str]) -> Verdict:
     if "failed" in found:
         return Verdict(False, f"fails on what was left before ({found['failed']})")
-    if not found["reused"]:
-        return Verdict(True, "has other options, inputs or parts, so that nothing from before is reused")
-    files = {name: file for part in found["files"].values() for name, file in part.items()}
-    others = {name: file for part in before.values() for name, file in part.items()}
-    changed = sorted(name for name in {**files, **others} if files.get(name) != others.get(name))
-    if not changed:
-        return Verdict(True, f"the same bits in all {len(files)} files")
-    return Verdict(False, f"other bits in {', '.join(changed[:4])}{' …' if len(changed) > 4 else ''}")
+    now, reused = found["files"], found["reused"]
+    names = {*now, *before} if reused else {*now} & {*before}
+    changed = sorted(name for name in names if now.get(name) != before.get(name))
+    bits = f"other bits in {', '.join(changed)}" if changed else f"the same bits in all {len(names)} files"
+    if reused:
+        return Verdict(not changed, bits)
+    return Verdict(
+        True, f"has other options, inputs or parts, so nothing from before is reused ({bits} that both leave)"
+    )
 
 
 def _check(done: subprocess.CompletedProcess[str]) -> None:

@@ -2,7 +2,8 @@
 
 Each stage reads the parts that the earlier run left, whatever other stages leave now, so that what differs is its own
 doing. It takes a JSON object: ``earlier`` (that run's OUT), ``photos``, ``out``, ``threads``, ``stages`` (names), and
-writes ``out/rerun.json``: by stage its parts' digests, why it failed, or that nothing earlier is reused anyway.
+writes ``out/rerun.json``: by stage its files' digests and whether an earlier artifact could be taken for its
+own, or why it failed.
 """
 
 from __future__ import annotations
@@ -68,9 +69,7 @@ def _run(stage: Stage, runner: Runner, parts: dict[str, Part], artifacts: Mappin
     for name, part in done.parts.items():
         parts.setdefault(name, part)
     reused = earlier is not None and _asks(earlier.manifest) == _asks(done.manifest)
-    files = {
-        name: {file["path"]: file["sha256"] for file in part["files"]} for name, part in done.manifest["parts"].items()
-    }
+    files = {file["path"]: file["sha256"] for part in done.manifest["parts"].values() for file in part["files"]}
     return {"reused": reused, "files": files}
 
 

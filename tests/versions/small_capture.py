@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from pathlib import Path
 
 from PIL import Image
@@ -10,8 +11,10 @@ from PIL import Image
 # An orbit of a house, and some photos that look straight down: more than are matched with each, so that the choice of
 # pairs shows.
 NUMBERS = (*range(1, 17), 20, 24, 28, 32, 36, 40)
-OTHER_CAMERA = (13, 14, 15, 16, 20, 24)  # said to be of another camera, so that cameras are told apart
-MODEL, OTHER_MODEL = b"M3E\0", b"M3T\0"  # in EXIF
+OTHER_CAMERA = (13, 14, 15, 16, 20, 24)  # said to be of a camera that nobody knows, so that cameras are told apart
+MODEL, OTHER_MODEL = b"M3E\0", b"M3X\0"  # in EXIF
+ZOOMED = (24, 36, 40)  # said to be of a focal length 3 % longer, which is another setting of a lens
+FOCAL, LONGER_FOCAL = struct.pack(">II", 1229, 100), struct.pack(">II", 1266, 100)  # millimetres, in EXIF
 MASKED = 5
 CONTROL = "gcp_list.txt"
 
@@ -51,9 +54,9 @@ def write_capture(demo: Path, folder: Path) -> Path:
     for number in NUMBERS:
         name = f"DJI_{number:04d}.JPG"
         content = (demo / "photos" / name).read_bytes()
-        if number in OTHER_CAMERA:
-            assert MODEL in content
-            content = content.replace(MODEL, OTHER_MODEL)
+        for said, instead, numbers in ((MODEL, OTHER_MODEL, OTHER_CAMERA), (FOCAL, LONGER_FOCAL, ZOOMED)):
+            assert said in content, name
+            content = content.replace(said, instead) if number in numbers else content
         (photos / name).write_bytes(content)
     with Image.open(photos / f"DJI_{MASKED:04d}.JPG") as photo:
         mask = Image.new("L", photo.size, 255)

@@ -1,0 +1,131 @@
+"""What CI has to notice: other answers under the same version, imports against the order, options without docs."""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from os import environ
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "versions"))
+import record
+from comparison import Comparison
+from sources import PACKAGE
+
+ROOT = Path(__file__).resolve().parents[1]
+MADE = ("*.so", "__pycache__", "dist", "node_modules", record.RECORD)
+
+
+def copy_sources(target: Path, *besides: str) -> Path:
+    """Copy the sources but for what is built, and ``besides``; record them."""
+    for folder in ("pipeline", "stages", "configs", "demo"):
+        shutil.copytree(ROOT / folder, target / folder, ignore=shutil.ignore_patterns(*MADE, *besides))
+    record.write(target, record.present(target))
+    return target
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of the sources that is imported as ``splatpipe`` where PYTHONPATH names the folder above; recorded."""
+    root = copy_sources(tmp_path / PACKAGE, "capture")
+    assert record.complaint(root) == ""
+    return root
+
+
+def replace(file: Path, pattern: str, text: str) -> None:
+    """Replace the one place that a pattern finds."""
+    changed, count = re.subn(pattern, text, file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert count == 1, f"{pattern} is in {file.name} {count} times"
+    file.write_text(changed, encoding="utf-8")
+
+
+def append(file: Path, text: str) -> None:
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+
+
+def complained_of(root: Path) -> set[str]:
+    """The stages that a complaint names."""
+    named = re.search(r"changed of: (.*?)\. ", record.complaint(root))
+    return set(named.group(1).split(", ")) if named else set()
+
+
+def run(arguments: list[str], folder: Path, extra: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=folder, env={**environ, **extra}, capture_output=True, text=True, check=False)
+
+
+def test_a_changed_answer_without_a_raised_version_is_noticed(copy: Path) -> None:
+    replace(copy / "pipeline/splat/free_space.py", r"^CELLS = \d+", "CELLS = 99")
+    noticed = complained_of(copy)
+    assert "train" in noticed and not noticed & {"ingest", "features", "matches", "sparse", "georef"}
+    assert "make versions" in record.complaint(copy)
+
+
+def test_kernels_belong_to_the_stages_that_reach_them(copy: Path) -> None:
+    kernel = copy / "pipeline/raster/native/adam_cpu.cpp"
+    append(kernel, "\n// A comment,\n/* and\nanother */\n\n")
+    assert record.complaint(copy) == ""
+    append(kernel, "int planted;\n")
+    noticed = complained_of(copy)
+    assert "train" in noticed and not noticed & {"ingest", "features", "matches", "sparse", "georef"}
+
+
+def test_comments_docstrings_and_formatting_do_not_count(copy: Path) -> None:
+    for file in copy.glob("stages/*.py"):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        file.write_text(f'"""Another docstring."""\n# A comment.\n{ast.unparse(tree)}\n', encoding="utf-8")
+    assert record.complaint(copy) == ""
+
+
+def test_a_version_is_recorded_with_the_sources_that_it_stands_for(copy: Path) -> None:
+    replace(copy / record.LINE_FILE, r'("matches",\n\s+version=)\d+', r"\g<1>99")
+    assert complained_of(copy) == {"matches"}
+    record.write(copy, record.present(copy))
+    assert record.complaint(copy) == "" and record.recorded(copy)["matches"].version == 99
+
+
+def test_each_stage_is_compared_on_what_was_left_before(tmp_path: Path) -> None:
+    """One that leaves other bits has to be raised; one that reads these, and does the same as before, has not."""
+    checkout = copy_sources(tmp_path / "checkout")
+    shutil.copy(ROOT / "pyproject.toml", checkout)
+    git = ["git", "-c", "user.name=t", "-c", "user.email=t@t", "-C", str(checkout)]
+    for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "right"]):
+        subprocess.run([*git, *arguments], check=True)
+    replace(checkout / "pipeline/photos/camera_groups.py", r"^ZOOM_TOLERANCE = \S+", "ZOOM_TOLERANCE = 0.5")
+    append(checkout / "stages/features.py", "\nPLANTED = 1\n")
+    subprocess.run([*git, "commit", "-qam", "wrong"], check=True)
+    comparison = Comparison(checkout, tmp_path / "work", lambda text: None)
+    base = comparison.last_right(["ingest", "features"])
+    assert base == subprocess.check_output([*git, "rev-parse", "HEAD~1"], text=True).strip()
+    verdicts = comparison.verdicts(base)
+    assert {name: verdict.accepted for name, verdict in verdicts.items()} == {"ingest": False, "features": True}
+    assert verdicts["ingest"].why == "other bits in cameras.json, lenses.json, photos/photos.json"
+
+
+def test_an_upward_import_and_a_stage_that_imports_a_stage_are_noticed(copy: Path) -> None:
+    append(copy / "pipeline/geometry/camera.py", "\nfrom splatpipe.pipeline.splat import ply\n")
+    append(copy / "stages/undistort.py", "\nfrom splatpipe.stages import sparse\n")
+    (copy / "__init__.py").touch()  # so that no other splatpipe joins it
+    linter = str(Path(sys.executable).parent / "lint-imports")
+    told = run(
+        [linter, "--no-cache", "--config", str(ROOT / "pyproject.toml")], copy.parent, {"PYTHONPATH": str(copy.parent)}
+    )
+    assert told.returncode == 1
+    assert "2 broken" in told.stdout
+    assert "splatpipe.pipeline.geometry.camera -> splatpipe.pipeline.splat.ply" in told.stdout
+    assert "splatpipe.stages.undistort -> splatpipe.stages.sparse" in told.stdout
+
+
+def test_an_option_without_docs_is_noticed(copy: Path) -> None:
+    replace(copy / "pipeline/sfm/options.py", r'^    """Models of fewer photos are dropped."""\n', "")
+    test = "test_every_option_has_a_help_text"
+    told = run(
+        ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_config.py", "-k", test],
+        ROOT,
+        {"PYTHONPATH": str(copy.parent), "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+    assert told.returncode == 1 and "sparse.min_model_size" in told.stdout
