@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -148,7 +148,6 @@ def time_case(case: Case) -> Row:
     config = TrainConfig(
         iterations=PUBLISHED_ITERATIONS,
         sh_degree=case.sh_degree,
-        sh_every=1,
         seed=case.seed,
         max_gaussians=10**9,
         densify=case.statistics,
@@ -157,9 +156,10 @@ def time_case(case: Case) -> Row:
     views = load_views(Path(case.dataset))
     start = read_splat(Path(case.splat))
     plan = make_plan(config, views, Split(tuple(view.camera.name for view in views)), len(start))
+    plan = replace(plan, schedule=replace(plan.schedule, sh_every=1))
     warmup = max(case.warmup, len(views))
     steps = warmup + case.repeats
-    if steps >= int(plan.options.densify_from):
+    if steps >= plan.schedule.density.first:
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
     with same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:

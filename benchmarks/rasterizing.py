@@ -14,7 +14,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import _native, rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.plan import Plan, sh_degree_at
+from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.state import TrainState
 
 WARMUP = 3  # renders that do not count
@@ -65,7 +65,7 @@ def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iterati
     frame.forward(
         tuple(tensor.detach().contiguous() for tensor in gaussians.tensors().values()),
         (np.ascontiguousarray(camera.cam_from_world, np.float64), (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
-        (sh_degree_at(options, iteration), options.antialias, plan.near, 0.0, loop.background(options, iteration)),
+        (plan.schedule.sh_degree_at(iteration), options.antialias, plan.near, 0.0, loop.background(options, iteration)),
         (torch.empty(h, w, 3), torch.empty(h, w), None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
     )
     return int(frame.contributing_pairs())

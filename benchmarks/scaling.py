@@ -17,6 +17,7 @@ import math
 import shutil
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -45,8 +46,10 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
 from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train import plan as planned
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 from splatpipe.stages import train
 
 COLUMNS = {
@@ -108,23 +111,25 @@ def write_start(dataset: Path, count: int, wanted: float, threads: int) -> Path:
     return path
 
 
+def grown_in_the_middle(config: TrainConfig, photos: int) -> Schedule:
+    """A schedule with one step of density control, in which everything that was seen grows: the cap decides."""
+    schedule, middle = resolve_schedule(config, photos), config.iterations // 2
+    density = replace(schedule.density, first=middle, last=middle, every=middle, gradient=1e-12)
+    return replace(schedule, sh_every=1, density=density)
+
+
 def stage_case(case: Case) -> Row:
     """The whole training stage of a few iterations, with density control up to the cap and checkpoints."""
     before = restart_peak()
     start = Path(case.splat)
     cap = round(read_splat_header(start).count / MEMORY_START)
-    middle = MEMORY_ITERATIONS // 2
     config = TrainConfig(
         iterations=MEMORY_ITERATIONS,
         max_gaussians=cap,
         sh_degree=case.sh_degree,
-        sh_every=1,
         coarse_levels=0,
-        densify_from=middle,
-        densify_until=middle,
-        densify_every=middle,
-        densify_gradient=1e-12,  # everything that was seen wants to be densified; the cap decides
     )
+    planned.resolve_schedule = grown_in_the_middle
     loop.CHECKPOINT_SECONDS, loop.CHECKPOINT_SHARE = 0.0, math.inf  # one after every iteration but the last
     parts = {"undistort.dataset": Path(case.dataset), "initialize.splat": start}
     names = [view.camera.name for view in load_views(Path(case.dataset))]

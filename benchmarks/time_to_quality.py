@@ -26,7 +26,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, coarse_levels, make_plan
+from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.surroundings import begin_sky, surround
@@ -88,7 +88,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     split = split_views([view.camera.name for view in views], config.split.every, arguments.held_out)
     plan = make_plan(config.train, views, split, len(start))
     trained_on = loop.views_of(plan, views)
-    levels = coarse_levels(plan.options)
+    levels = plan.schedule.coarse_levels_to(plan.options.iterations)
     with same_bits(arguments.threads):
         clocks.start()
         sky = begin_sky(config.train, trained_on, dataset, arguments.threads, SilentReporter())

@@ -12,6 +12,7 @@ from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, Undisto
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.train.options import GONE as GONE_OF_TRAIN
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
 
@@ -22,6 +23,7 @@ class LineConfig(StageConfig):
     gone: ClassVar[Mapping[str, str]] = {
         "evaluate.every": "It is called split.every.",
         "evaluate.views": "It is called split.views.",
+        **{f"train.{name}": hint for name, hint in GONE_OF_TRAIN.items()},
     }
 
     ingest: IngestConfig = IngestConfig()

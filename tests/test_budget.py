@@ -18,6 +18,7 @@ from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop, planning
+from splatpipe.pipeline.train import plan as planning_of_schedule
 from splatpipe.pipeline.train.budget import (
     FEWEST,
     FEWEST_GAUSSIANS,
@@ -37,7 +38,8 @@ from splatpipe.pipeline.train.densify import room_at
 from splatpipe.pipeline.train.measure import Measured
 from splatpipe.pipeline.train.memory import FIXED_BYTES, bytes_per_gaussian, resident_bytes, return_free_heap
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan import Plan, coarse_levels, duration, make_plan, means_rate, resolve_schedule
+from splatpipe.pipeline.train.plan import Plan, duration, make_plan
+from splatpipe.pipeline.train.schedule import resolve_schedule
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import evaluate, initialize, train
@@ -130,10 +132,10 @@ def test_no_cost_is_below_zero_whatever_was_measured() -> None:
 
 
 def test_forecast_is_the_sum_over_the_iterations() -> None:
-    options = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
-    levels = coarse_levels(options)
-    each = [SPEED.seconds(room_at(options, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
-    assert forecast(SPEED, options, 8_000, 0.4) == pytest.approx(math.fsum(each), rel=0.01)
+    schedule = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
+    levels = schedule.coarse_levels_to(2400)
+    each = [SPEED.seconds(room_at(schedule.density, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
+    assert forecast(SPEED, schedule, 8_000, 0.4) == pytest.approx(math.fsum(each), rel=0.01)
 
 
 def plan_for(seconds: float, photos: int = 30, initial: int = 8_000, size: float = 0.5, cap: int = 1_000_000) -> Choice:
@@ -234,11 +236,8 @@ def trained(scene: Path, out: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture
 def plan(scene: Path, tmp_path: Path) -> Plan:
     """One of a budget, with fewer iterations than it has time for."""
-    options = {"iterations": 60, "densify_from": 10, "densify_every": 10, "densify_until": 40, "time_budget_s": 600.0}
     (tmp_path / "first").mkdir()
-    train.run(
-        TrainConfig(**options | {"time_budget_s": 0.0}), make_inputs(scene), tmp_path / "first", tiny_scene.Recorder()
-    )
+    train.run(TrainConfig(iterations=60), make_inputs(scene), tmp_path / "first", tiny_scene.Recorder())
     made = read_plan(tmp_path / "first")
     budgeted = made.options.model_copy(update={"time_budget_s": 600.0})
     return Plan(**{**vars(made), "options": budgeted, "megapixels": 0.002, "train_seconds": 500.0})
@@ -293,7 +292,7 @@ def test_iterations_beyond_the_schedule_fill_the_time_and_change_none_before(
     assert longer["density"] == schedule["density"]
     assert longer["curve"][0] == schedule["curve"][0]
     assert [point["iteration"] for point in longer["curve"]] == [50, 80]
-    assert means_rate(plan, 80) == means_rate(plan, 60)
+    assert plan.schedule.means_rate(80) == plan.schedule.means_rate(60)
     assert digest(tmp_path / "longer") != digest(tmp_path / "schedule")
 
 
@@ -330,6 +329,7 @@ import tiny_scene
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
+from splatpipe.pipeline.train import plan
 from splatpipe.pipeline.train.measure import Measured
 from splatpipe.pipeline.train.memory import FIXED_BYTES, resident_bytes
 
@@ -338,8 +338,8 @@ limit = resident_bytes() + FIXED_BYTES + int(sys.argv[4])
 parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
 parts |= tiny_scene.split_part(scene / "dataset", 4)
 inputs = Inputs(parts, scene, machine=Machine("cpu", 1))
-config = tiny_scene.plain(iterations=40, densify_from=2, densify_every=1, densify_until=40, densify_gradient=1e-12,
-                     prune_opacity=0.0, prune_extent=0.0, max_memory_bytes=limit)
+config = tiny_scene.plain(iterations=40, max_memory_bytes=limit)
+plan.resolve_schedule = tiny_scene.resolver(first=2, last=40, every=1, gradient=1e-12, prune_opacity=0.0)
 recorder = tiny_scene.Recorder()
 summary = train.run(config, inputs, out, recorder)
 print(json.dumps({"limit": limit, "peak": peak_memory_bytes(), **summary, "warnings": recorder.warnings}))
@@ -365,16 +365,23 @@ def test_a_memory_limit_binds_and_the_resident_memory_stays_below_it(scene: Path
     assert told["peak"] <= told["limit"]  # type: ignore[operator]
 
 
-def test_growth_ends_where_memory_runs_out_all_the_same(
+def test_growth_ends_where_memory_runs_out_all_the_same_and_pruning_goes_on(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop, "over_memory", lambda options: True)
-    config = tiny_scene.plain(iterations=60, densify_from=10, densify_every=10, densify_until=60, densify_gradient=1e-9)
+    limits = {"first": 10, "last": 60, "every": 10, "gradient": 1e-9, "prune_opacity": 0.08, "reset_every": 25}
+    monkeypatch.setattr(planning_of_schedule, "resolve_schedule", tiny_scene.resolver(**limits))
     recorder = tiny_scene.Recorder()
-    train.run(config, make_inputs(scene), tmp_path, recorder)
+    train.run(tiny_scene.plain(iterations=60), make_inputs(scene), tmp_path, recorder)
     assert len(recorder.warnings) == 1 and "no Gaussian is added after iteration 10" in recorder.warnings[0]
     history = json.loads((tmp_path / "history.json").read_text())
-    assert history["growth_ended"] == 10 and [event["iteration"] for event in history["density"]] == [10]
+    assert history["growth_ended"] == 10 and history["resets"] == [25, 50]
+    first, *rest = history["density"]
+    assert first["iteration"] == 10 and first["cloned"] + first["split"] > 0
+    assert [event["iteration"] for event in rest] == [20, 30, 40, 50, 60]
+    assert not any(event["cloned"] + event["split"] for event in rest) and sum(event["pruned"] for event in rest) > 0
+    left = first["gaussians"] - sum(event["pruned"] for event in rest)
+    assert rest[-1]["gaussians"] == left == len(read_splat(tmp_path / "model.ply"))
 
 
 def test_a_budget_long_enough_for_a_film_keeps_time_for_it() -> None:

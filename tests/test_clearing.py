@@ -14,14 +14,16 @@ from splatpipe.pipeline.splat.free_space import FreeSpace, near_or_free
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.clearing import STEPS_BETWEEN, free_space_of, is_clearing_step, unwanted
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan, resolve_schedule
+from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.schedule import resolve_schedule
 from splatpipe.pipeline.train.state import TrainState
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-OPTIONS = resolve_schedule(TrainConfig(prune_free_space=2))
-LOOKS = STEPS_BETWEEN * int(OPTIONS.densify_every)
+OPTIONS = TrainConfig(prune_free_space=2)
+SCHEDULE = resolve_schedule(OPTIONS)
+LOOKS = STEPS_BETWEEN * SCHEDULE.density.every
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +59,10 @@ def space(dataset: Path) -> FreeSpace:
 
 def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: FreeSpace) -> None:
     gaussians = haze_and_wall()
-    assert unwanted(gaussians, space, OPTIONS, LOOKS).tolist() == [True] * 4 + [False] * 4
-    assert torch.equal(unwanted(gaussians, space, OPTIONS, LOOKS), near_or_free(gaussians, space, 2))
-    assert not unwanted(gaussians, space, OPTIONS, LOOKS + int(OPTIONS.densify_every)).any()
-    assert not unwanted(gaussians, None, OPTIONS, LOOKS).any()
+    assert unwanted(gaussians, space, SCHEDULE, LOOKS).tolist() == [True] * 4 + [False] * 4
+    assert torch.equal(unwanted(gaussians, space, SCHEDULE, LOOKS), near_or_free(gaussians, space, 2))
+    assert not unwanted(gaussians, space, SCHEDULE, LOOKS + SCHEDULE.density.every).any()
+    assert not unwanted(gaussians, None, SCHEDULE, LOOKS).any()
 
 
 @pytest.mark.parametrize("density", ["published", "absolute", "mcmc"])
@@ -69,21 +71,21 @@ def test_every_strategy_takes_it_away(dataset: Path, space: FreeSpace, density: 
     plan = make_plan(config, load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     state = TrainState.begin(haze_and_wall(), plan)
     state.free_space = space
-    state.control_density(plan.options, plan.extent, 8, LOOKS)
+    state.control_density(plan, LOOKS)
     assert len(state.gaussians) >= 4
     assert not near_or_free(state.gaussians.detach(), space, 2).any()
 
 
 def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: Path, space: FreeSpace) -> None:
     plan = make_plan(TrainConfig(prune_free_space=2), load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
-    step = STEPS_BETWEEN * int(plan.options.densify_every)
-    after = (int(plan.options.densify_until) // step + 1) * step
-    assert is_clearing_step(space, plan.options, after) and not is_clearing_step(space, plan.options, after + 1)
-    assert not is_clearing_step(space, plan.options, plan.options.iterations)
+    step = STEPS_BETWEEN * plan.schedule.density.every
+    after = (plan.schedule.density.last // step + 1) * step
+    assert is_clearing_step(space, plan.schedule, after) and not is_clearing_step(space, plan.schedule, after + 1)
+    assert not is_clearing_step(space, plan.schedule, plan.options.iterations)
     state = TrainState.begin(haze_and_wall(), plan)
     state.free_space = space
     before = state.gaussians.detach().select(torch.arange(4, 8))
-    state.control_density(plan.options, plan.extent, 8, after)
+    state.control_density(plan, after)
     for name, tensor in before.tensors().items():
         assert torch.equal(state.gaussians.detach().tensors()[name], tensor)
     assert state.history.density == [
@@ -93,4 +95,4 @@ def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: 
 
 
 def test_nobody_asks_nothing_is_looked_at(dataset: Path) -> None:
-    assert free_space_of(load_views(dataset), dataset, resolve_schedule(TrainConfig(prune_free_space=0))) is None
+    assert free_space_of(load_views(dataset), dataset, TrainConfig(prune_free_space=0)) is None

@@ -83,6 +83,21 @@ def test_a_wrong_option_is_named(table: dict[str, object], message: str) -> None
     assert message in caught.value.message
 
 
+def test_a_configuration_of_another_version_is_told_each_reason_once() -> None:
+    old = {"train": {"lr_means": 1e-4, "iterations": 7, "sh_limit": False, "lr_sh": 2e-3, "spread_weight": 0.1}}
+    with pytest.raises(UsageError) as caught:
+        resolve(LineConfig, [old])
+    told = caught.value.message
+    assert "There are no options train.lr_means, train.lr_sh any more. This is decided by constants now" in told
+    assert "There is no option train.sh_limit any more. No gain" in told
+    assert "train.spread_weight any more. It is called train.distortion_weight." in told
+    assert told.count("any more") == 3
+
+
+def test_no_option_is_said_to_be_gone_that_is_there() -> None:
+    assert not set(LineConfig.gone) & set(option_names(LineConfig))
+
+
 @pytest.mark.parametrize("text", ["train", "train=5", "=5", ".=5", "train.=5", "", "iterations=5"])
 def test_a_broken_assignment_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="--set"):

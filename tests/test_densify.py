@@ -1,6 +1,7 @@
 """Density control: who is cloned, split, pruned and held back, and that its random numbers repeat."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,17 +13,15 @@ from splatpipe.pipeline.train.densify import (
     DensityStatistics,
     grow,
     half_opacity,
-    is_density_step,
-    is_opacity_reset,
     prune_mask,
     reset_opacity,
     room_at,
 )
 from splatpipe.pipeline.train.draws import normal, permutation, uniform
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import resolve_schedule
+from splatpipe.pipeline.train.schedule import resolve_schedule
 
-OPTIONS = resolve_schedule(TrainConfig(reset_every=100))
+SCHEDULE = replace(resolve_schedule(TrainConfig()).density, reset_every=100)
 EXTENT = 10.0  # so that sizes above 0.1 are split, and above 1 pruned
 
 
@@ -35,7 +34,7 @@ def model(sizes: list[float]) -> Gaussians:
 
 def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
     gaussians = model([0.05, 0.5, 0.05, 0.5])
-    growth, counts = grow(gaussians, torch.tensor([1.0, 1.0, 0.0, 0.0]), 10, OPTIONS, EXTENT, 7)
+    growth, counts = grow(gaussians, torch.tensor([1.0, 1.0, 0.0, 0.0]), 10, SCHEDULE, EXTENT, 7)
     assert counts == {"cloned": 1, "split": 1, "held_back": 0}
     assert growth.source.tolist() == [0, 2, 3, 0, 1, 1]
     assert growth.fresh.tolist() == [False, False, False, True, True, True]
@@ -51,7 +50,7 @@ def test_children_of_a_split_are_drawn_from_their_parent() -> None:
     gaussians.log_scales[:] = torch.tensor([4.0, 1.0, 0.25]).log()
     half = math.radians(30.0) / 2.0
     gaussians.quats[:] = 3.0 * torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)])
-    growth, _ = grow(gaussians, torch.ones(4000), 4000, OPTIONS, EXTENT, 1)
+    growth, _ = grow(gaussians, torch.ones(4000), 4000, SCHEDULE, EXTENT, 1)
     c, s = math.cos(2 * half), math.sin(2 * half)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     expected = turn @ np.diag([16.0, 1.0, 0.0625]) @ turn.T
@@ -62,17 +61,17 @@ def test_children_of_a_split_are_drawn_from_their_parent() -> None:
 
 def test_the_largest_scores_come_first_and_the_rest_is_counted() -> None:
     score = torch.tensor([0.1, 0.5, 0.3, 0.5, 0.0])
-    growth, counts = grow(model([0.05] * 5), score, 2, OPTIONS, EXTENT, 1)
+    growth, counts = grow(model([0.05] * 5), score, 2, SCHEDULE, EXTENT, 1)
     assert growth.source.tolist() == [0, 1, 2, 3, 4, 1, 3]
     assert counts == {"cloned": 2, "split": 0, "held_back": 2}
-    _, counts = grow(model([0.05] * 9), torch.ones(9), -3, OPTIONS, EXTENT, 1)
+    _, counts = grow(model([0.05] * 9), torch.ones(9), -3, SCHEDULE, EXTENT, 1)
     assert counts == {"cloned": 0, "split": 0, "held_back": 9}
 
 
 def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
     gaussians = model([0.05, 0.5, 0.5])
     gaussians.opacity_logits[:] = torch.tensor([2.0, -4.0, 1.0])
-    growth, _ = grow(gaussians, torch.tensor([1.0, 1.0, 0.0]), 9, OPTIONS, EXTENT, 1)
+    growth, _ = grow(gaussians, torch.tensor([1.0, 1.0, 0.0]), 9, SCHEDULE, EXTENT, 1)
     assert growth.source.tolist() == [0, 2, 0, 1, 1]
     before, after = 1.0 - torch.sigmoid(gaussians.opacity_logits), 1.0 - torch.sigmoid(growth.opacity_logits)
     torch.testing.assert_close(after[0] * after[2], before[0])
@@ -83,12 +82,12 @@ def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
 def test_what_would_be_pruned_when_halved_is_not_densified() -> None:
     gaussians = model([0.05, 0.5, 0.05, 0.5])
     gaussians.opacity_logits[:] = torch.logit(torch.tensor([0.0099, 0.0099, 0.0101, 0.0101]))
-    growth, counts = grow(gaussians, torch.ones(4), 9, OPTIONS, EXTENT, 1)
+    growth, counts = grow(gaussians, torch.ones(4), 9, SCHEDULE, EXTENT, 1)
     assert counts == {"cloned": 1, "split": 1, "held_back": 0} and growth.source.tolist() == [0, 1, 2, 2, 3, 3]
     grown = gaussians.select(growth.source)
     grown.opacity_logits = growth.opacity_logits
-    assert not prune_mask(grown, OPTIONS, EXTENT, 50, torch.zeros(6)).any()
-    unlimited = OPTIONS.model_copy(update={"prune_opacity": 0.0})
+    assert not prune_mask(grown, SCHEDULE, EXTENT, 50, torch.zeros(6)).any()
+    unlimited = replace(SCHEDULE, prune_opacity=0.0)
     assert grow(gaussians, torch.ones(4), 9, unlimited, EXTENT, 1)[1] == {"cloned": 2, "split": 2, "held_back": 0}
 
 
@@ -105,14 +104,16 @@ def test_halved_opacity_is_exact_for_any_logit(logit: float) -> None:
 
 
 def test_gaussians_rise_to_the_cap_fast_at_first() -> None:
-    options = resolve_schedule(TrainConfig(iterations=4000, max_gaussians=1000))  # steps at 500, 600, ..., 2000
-    steps = [room_at(options, 100, iteration) for iteration in range(500, 2001, 100)]
+    schedule = resolve_schedule(
+        TrainConfig(iterations=4000, max_gaussians=1000)
+    ).density  # steps at 500, 600, ..., 2000
+    steps = [room_at(schedule, 100, step) for step in range(500, 2001, 100)]
     assert steps[-1] == 1000 and steps[7] == 775  # half of the steps done: three quarters of the growth
     growth = [after - before for before, after in pairwise([100, *steps])]
     assert all(earlier >= later - 1 for earlier, later in pairwise(growth)) and growth[0] > 15 * growth[-1]
-    assert room_at(options, 100, 400) == 100 and room_at(options, 5000, 1000) == 1000
-    assert room_at(options.model_copy(update={"densify": False}), 100, 1000) == 100
-    never = options.model_copy(update={"densify_until": 400})  # ends before it begins
+    assert room_at(schedule, 100, 400) == 100 and room_at(schedule, 5000, 1000) == 1000
+    assert room_at(replace(schedule, on=False), 100, 1000) == 100
+    never = replace(schedule, last=400)  # ends before it begins
     assert [room_at(never, 100, iteration) for iteration in (1, 400, 500, 4000)] == [100] * 4
 
 
@@ -121,16 +122,16 @@ def test_transparent_huge_and_broken_gaussians_are_pruned() -> None:
     gaussians.opacity_logits[1] = math.log(0.004 / 0.996)
     gaussians.means[3, 1] = math.nan
     radii = torch.tensor([0.0, 0.0, 0.0, 0.0, 50.0])
-    assert prune_mask(gaussians, OPTIONS, EXTENT, 200, radii).tolist() == [False, True, True, True, False]
-    assert prune_mask(gaussians, OPTIONS, EXTENT, 50, radii).tolist() == [False, True, False, True, False]
-    on_screen = OPTIONS.model_copy(update={"prune_screen_px": 20.0})
+    assert prune_mask(gaussians, SCHEDULE, EXTENT, 200, radii).tolist() == [False, True, True, True, False]
+    assert prune_mask(gaussians, SCHEDULE, EXTENT, 50, radii).tolist() == [False, True, False, True, False]
+    on_screen = replace(SCHEDULE, prune_screen_px=20.0)
     assert prune_mask(gaussians, on_screen, EXTENT, 200, radii).tolist() == [False, True, True, True, True]
 
 
 def test_the_last_gaussian_is_never_pruned() -> None:
     gaussians = model([0.5, 0.5])
     gaussians.opacity_logits[:] = torch.tensor([-20.0, -19.0])
-    assert prune_mask(gaussians, OPTIONS, EXTENT, 50, torch.zeros(2)).tolist() == [True, False]
+    assert prune_mask(gaussians, SCHEDULE, EXTENT, 50, torch.zeros(2)).tolist() == [True, False]
 
 
 def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
@@ -145,12 +146,13 @@ def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> Non
 
 
 def test_published_schedule_of_density_control() -> None:
-    steps = [i for i in range(1, 30_001) if is_density_step(resolve_schedule(TrainConfig()), i)]
+    schedule = resolve_schedule(TrainConfig()).density
+    steps = [i for i in range(1, 30_001) if schedule.is_step(i)]
     assert (steps[0], steps[1], steps[-1]) == (500, 600, 15_000)
-    resets = [i for i in range(1, 30_001) if is_opacity_reset(resolve_schedule(TrainConfig()), i)]
+    resets = [i for i in range(1, 30_001) if schedule.is_reset(i)]
     assert resets == [3000, 6000, 9000, 12_000]
-    short = resolve_schedule(TrainConfig(iterations=9999))
-    assert not any(is_opacity_reset(short, i) for i in range(1, 10_000))
+    short = resolve_schedule(TrainConfig(iterations=9999)).density
+    assert not any(short.is_reset(i) for i in range(1, 10_000))
 
 
 def test_opacity_reset_lowers_only_what_is_above() -> None:

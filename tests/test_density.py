@@ -16,11 +16,12 @@ from splatpipe.pipeline.train.density import BLIND, Density, DensityStep, Look, 
 from splatpipe.pipeline.train.density.mcmc import composite_integral, disturb, draw_parents, shared
 from splatpipe.pipeline.train.density.strategy import ScoredDensity
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import resolve_schedule
+from splatpipe.pipeline.train.schedule import resolve_schedule
 
 WIDTH, HEIGHT = 40, 30
 CAMERA = Camera("photo.png", WIDTH, HEIGHT, 35.0, 36.0, 20.5, 14.5, np.eye(4))
-MCMC = resolve_schedule(TrainConfig(density="mcmc"))
+MCMC = TrainConfig(density="mcmc")
+MCMC_SCHEDULE = resolve_schedule(MCMC).density
 
 
 def scene(count: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -51,7 +52,7 @@ def observed(density: Density, gaussians: Gaussians, weights: Tensor) -> Tensor:
     render = rendered(gaussians.requires_grad_(), density.look, probe)
     (render.colour * weights).sum().backward()
     with torch.no_grad():
-        density.observe(Seen(render, None if probe is None else probe.grad), TrainConfig())
+        density.observe(Seen(render, None if probe is None else probe.grad), resolve_schedule(TrainConfig()).density)
     assert isinstance(density, ScoredDensity)
     return density.statistics.score()
 
@@ -105,7 +106,8 @@ def test_mcmc_adds_the_gradient_of_its_decays_to_what_was_seen() -> None:
 
 @pytest.mark.parametrize("name", ["published", "absolute", "mcmc"])
 def test_every_strategy_keeps_to_the_limit_and_its_statistics_survive(name: str) -> None:
-    options = resolve_schedule(TrainConfig.model_validate({"density": name, "densify_gradient": 1e-9}))
+    options = TrainConfig.model_validate({"density": name})
+    schedule = replace(resolve_schedule(options).density, gradient=1e-9)
     gaussians = scene(50)
     density = make_density(options, 50)
     if isinstance(density, ScoredDensity):
@@ -113,7 +115,7 @@ def test_every_strategy_keeps_to_the_limit_and_its_statistics_survive(name: str)
     again = make_density(options, 50)
     again.load({key: tensor.clone() for key, tensor in density.to_arrays().items()})
     for limit in (50, 61):
-        step = DensityStep(options, 5.0, limit, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
+        step = DensityStep(schedule, 5.0, limit, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
         growth, counts = density.control(gaussians, step)
         assert len(growth.source) == limit
         repeated, same = again.control(gaussians, step)
@@ -135,7 +137,7 @@ def test_relocation_moves_dead_and_broken_gaussians_and_no_others() -> None:
     gaussians.opacity_logits[3:7] = -6.0  # 0.0025
     gaussians.means[20, 1] = math.nan
     growth, counts = make_density(MCMC, 40).control(
-        gaussians, DensityStep(MCMC, 5.0, 45, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
+        gaussians, DensityStep(MCMC_SCHEDULE, 5.0, 45, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
     )
     assert (counts["relocated"], counts["added"], counts["pruned"]) == (5, 5, 0)
     dead = [3, 4, 5, 6, 20]
@@ -154,7 +156,7 @@ def test_relocation_leaves_a_model_of_dead_gaussians_alone() -> None:
     gaussians = scene(4)
     gaussians.opacity_logits[:] = -9.0
     growth, counts = make_density(MCMC, 4).control(
-        gaussians, DensityStep(MCMC, 5.0, 9, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
+        gaussians, DensityStep(MCMC_SCHEDULE, 5.0, 9, 600, gaussians, NONE_UNWANTED[: len(gaussians)])
     )
     assert growth.source.tolist() == [0, 1, 2, 3] and counts["relocated"] == counts["added"] == 0
 

@@ -12,6 +12,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.dropout import dropped, share_at
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.schedule import resolve_schedule
 
 FRONT = Camera("front", 32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))
 
@@ -30,12 +31,12 @@ def wall(depth: float, count: int = 30) -> Gaussians:
 
 
 def test_share_of_dropped_gaussians_rises_to_the_option_and_they_are_not_projected() -> None:
-    options = TrainConfig(iterations=100, dropout=0.4)
+    schedule = resolve_schedule(TrainConfig(iterations=100, dropout=0.4))
     gaussians = Gaussians.concat([wall(4.0)] * 100).requires_grad_()
     for iteration in (25, 100, 300):
-        share = share_at(options, iteration)
+        share = share_at(schedule, iteration)
         assert share == pytest.approx(0.4 * min(1.0, iteration / 100))
-        model = dropped(gaussians, options, iteration)
+        model = dropped(gaussians, schedule, iteration)
         left_out = model.opacity_logits.detach() < -20.0
         assert float(left_out.float().mean()) == pytest.approx(share, abs=4.0 * math.sqrt(0.25 / len(gaussians)))
         rendered = rasterizer.render(model, FRONT, rasterizer.RenderOptions(sh_degree=0))
@@ -43,20 +44,20 @@ def test_share_of_dropped_gaussians_rises_to_the_option_and_they_are_not_project
         gaussians.opacity_logits.grad = None
         rendered.colour.sum().backward()
         assert not bool(gaussians.opacity_logits.grad[left_out].any())
-    assert not torch.equal(dropped(gaussians, options, 98).opacity_logits, model.opacity_logits)
-    again = dropped(gaussians, options, 300).opacity_logits
+    assert not torch.equal(dropped(gaussians, schedule, 98).opacity_logits, model.opacity_logits)
+    again = dropped(gaussians, schedule, 300).opacity_logits
     assert torch.equal(again, model.opacity_logits)
-    assert dropped(gaussians, TrainConfig(dropout=0.0), 50) is gaussians
+    assert dropped(gaussians, resolve_schedule(TrainConfig(dropout=0.0)), 50) is gaussians
 
 
 def test_dropping_keeps_what_a_pixel_shows_on_average() -> None:
-    options = TrainConfig(iterations=1, dropout=0.25)
+    schedule = resolve_schedule(TrainConfig(iterations=1, dropout=0.25))
     gaussians = wall(4.0)
     gaussians.opacity_logits -= 1.5  # below 0.75, so that no scaled opacity reaches 1
     settings = rasterizer.RenderOptions(sh_degree=0)
     with torch.no_grad():
         whole = rasterizer.render(gaussians, FRONT, settings).alpha
-        draws = [rasterizer.render(dropped(gaussians, options, draw), FRONT, settings).alpha for draw in range(1, 401)]
+        draws = [rasterizer.render(dropped(gaussians, schedule, draw), FRONT, settings).alpha for draw in range(1, 401)]
     stacked = torch.stack(draws)
     error = (stacked.mean(dim=0) - whole).abs()
     # Five standard errors, and the flanks of up to three Gaussians that only scaled opacities lift above 1/255.
@@ -65,10 +66,10 @@ def test_dropping_keeps_what_a_pixel_shows_on_average() -> None:
 
 
 def test_gradient_through_dropping_is_that_of_the_scaled_opacity() -> None:
-    options = TrainConfig(iterations=1, dropout=0.25)
+    schedule = resolve_schedule(TrainConfig(iterations=1, dropout=0.25))
     logits = torch.linspace(-6.0, 0.9, 40).requires_grad_()
     gaussians = replace(wall(4.0, 40), opacity_logits=logits)
-    torch.sigmoid(dropped(gaussians, options, 7).opacity_logits).sum().backward()
-    kept = dropped(gaussians, options, 7).opacity_logits.detach() > -20.0
+    torch.sigmoid(dropped(gaussians, schedule, 7).opacity_logits).sum().backward()
+    kept = dropped(gaussians, schedule, 7).opacity_logits.detach() > -20.0
     opacity = torch.sigmoid(logits.detach())
     torch.testing.assert_close(logits.grad, kept * opacity * (1.0 - opacity) / 0.75, rtol=1e-4, atol=1e-7)

@@ -12,7 +12,8 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.train import flatness, loop
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, means_rate, resolve_schedule
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.schedule import resolve_schedule
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
@@ -20,15 +21,15 @@ from splatpipe.stages import initialize, train
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-FEW = tiny_scene.plain(iterations=200, densify=False, sh_every=5, exposure="affine", dropout=0.1)
+FEW = tiny_scene.plain(iterations=200, densify=False, exposure="affine", dropout=0.1)
 FLAT = FEW.model_copy(update={"stop_when_flat": 0.9})  # so much that any curve is flat
 PARTS = ("model.ply", "history.json", "exposures.json", "plan.json")
 
 
 def make_plan(iterations: int, threshold: float, last: int = 0, **options: object) -> Plan:
     fields = TrainConfig().model_dump() | {"iterations": iterations, "stop_when_flat": threshold} | options
-    resolved = resolve_schedule(TrainConfig.model_validate(fields))
-    return Plan(resolved, 1.0, 0.01, ("a", "b"), (), 0.1, 10, last or iterations)
+    config = TrainConfig.model_validate(fields)
+    return Plan(config, resolve_schedule(config), 1.0, 0.01, ("a", "b"), (), 0.1, 10, last or iterations)
 
 
 def power_law(exponent: float, noise: float = 0.0, until: int = 5000) -> list[tuple[int, float]]:
@@ -60,11 +61,13 @@ def test_a_curve_that_still_falls_a_few_epochs_or_the_schedules_end_are_not_flat
 
 
 def test_nothing_is_judged_before_density_control_all_degrees_and_full_size() -> None:
-    options = make_plan(1000, 0.1).options
-    assert flatness.settled_from(options) == 3 * int(options.sh_every) == 600
-    assert flatness.settled_from(make_plan(1000, 0.1, densify_until=700).options) == 700
-    assert flatness.settled_from(make_plan(1000, 0.1, densify_until=700, densify=False, sh_degree=1).options) == 200
-    assert flatness.settled_from(make_plan(1000, 0.1, coarse_levels=1, coarse_until=900).options) == 900
+    schedule = make_plan(1000, 0.1).schedule
+    assert flatness.settled_from(schedule) == 3 * schedule.sh_every == 600
+    longer = replace(schedule, density=replace(schedule.density, last=700))
+    assert flatness.settled_from(longer) == 700
+    unchanging = replace(schedule, sh_degree=1, density=replace(longer.density, on=False))
+    assert flatness.settled_from(unchanging) == 200
+    assert flatness.settled_from(replace(schedule, coarse_levels=1, coarse_until=900)) == 900
 
 
 def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None:
@@ -74,7 +77,7 @@ def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None
     places = [flatness.place_in_schedule(plan, 5000, iteration) for iteration in range(4990, 5501)]
     assert places[:11] == list(range(4990, 5001)) and places[-1] == 7000
     assert set(np.diff(places[10:])) == {4}
-    assert means_rate(plan, places[-1]) == means_rate(plan, 7000)
+    assert plan.schedule.means_rate(places[-1]) == plan.schedule.means_rate(7000)
     assert flatness.place_in_schedule(plan, 0, 6000) == 6000
 
 

@@ -83,7 +83,7 @@ def test_gradient_agrees_with_finite_differences() -> None:
 
 
 def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> None:
-    options = tiny_scene.plain(iterations=100, spread_weight=0.1)
+    options = tiny_scene.plain(iterations=100, distortion_weight=0.1)
     assert not is_spread_counted(options, 20) and is_spread_counted(options, 21)
     assert not is_spread_counted(tiny_scene.plain(iterations=100), 90)
 
@@ -97,7 +97,7 @@ def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:
     for weight in (0.0, 0.05):
         out = tmp_path / f"{weight}"
         out.mkdir()
-        config = tiny_scene.plain(iterations=300, densify_gradient=1e-3, spread_weight=weight)
+        config = tiny_scene.plain(iterations=300, distortion_weight=weight)
         train.run(config, Inputs(parts, tmp_path, machine=Machine("cpu", 1)), out, tiny_scene.Recorder())
         model, shares = read_splat(out / "model.ply"), []
         for view in load_views(tmp_path / "dataset")[::4]:

@@ -16,8 +16,7 @@ from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, resolve_schedule
+from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.robust import (
     GRID,
     LEAST_RESIDUAL,
@@ -175,8 +174,7 @@ def test_threshold_is_the_quantile_of_all_known_cells() -> None:
 
 
 def test_share_rises_from_the_begin_of_density_control() -> None:
-    options = resolve_schedule(TrainConfig(iterations=1000, robust=0.1, densify_from=200))
-    shares = [share_at(options, iteration) for iteration in (1, 200, 300, 400, 1000)]
+    shares = [share_at(0.1, 200, iteration) for iteration in (1, 200, 300, 400, 1000)]
     assert shares == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1])
 
 
@@ -227,7 +225,7 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "train_step", keeping)
-        config = tiny_scene.plain(iterations=iterations, robust=robust, densify_gradient=1e-3)
+        config = tiny_scene.plain(iterations=iterations, robust=robust)
         summary = dict(train.run(config, inputs, out, tiny_scene.Recorder()))
     model = read_splat(out / "model.ply")
     views = [cameras()[number] for number in HELD_OUT]

@@ -30,9 +30,7 @@ from splatpipe.stages import initialize, train
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-QUICK = TrainConfig(
-    iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15, filter_3d=True
-)
+QUICK = TrainConfig(iterations=60, filter_3d=True)
 SUBPIXELS = 8  # a side, of the ideal photos
 THINNER = 1.2  # natural logarithm: the tiny scene's Gaussians become a fraction of a pixel to a pixel wide
 

@@ -37,14 +37,12 @@ TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "filter_3d": True,
     "antialias": True,
     "dropout": 0.2,
-    "spread_weight": 0.05,
+    "distortion_weight": 0.05,
     "prune_free_space": 2,
     "robust": 0.1,
     "stop_when_flat": 0.5,
 }
-QUICK = tiny_scene.plain(
-    iterations=60, densify_from=10, densify_every=10, densify_until=40, reset_every=25, sh_every=15
-)
+QUICK = tiny_scene.plain(iterations=60)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +87,7 @@ def held_out_psnr(scene: Path, model: Path) -> float:
 
 
 def test_training_approaches_the_truth_in_a_photo_it_never_saw(scene: Path, tmp_path: Path) -> None:
-    config = tiny_scene.plain(iterations=400, densify_gradient=1e-3)
+    config = tiny_scene.plain(iterations=400)
     recorder = tiny_scene.Recorder()
     summary = train.run(config, make_inputs(scene), tmp_path, recorder)
     before, after = held_out_psnr(scene, scene / "init.ply"), held_out_psnr(scene, tmp_path / "model.ply")
@@ -101,7 +99,7 @@ def test_training_approaches_the_truth_in_a_photo_it_never_saw(scene: Path, tmp_
 
 
 def test_any_number_of_threads_gives_the_same_splat(scene: Path, tmp_path: Path) -> None:
-    config = QUICK.model_copy(update={"iterations": 200, "densify_until": 150, "coarse_levels": 1, "coarse_until": 50})
+    config = QUICK.model_copy(update={"iterations": 200, "coarse_levels": 1})
     splats = {threads: trained(scene, tmp_path / str(threads), config, threads) for threads in (1, 2, 5)}
     assert len({hashlib.sha256((out / "model.ply").read_bytes()).hexdigest() for out in splats.values()}) == 1
     assert len({digest(out) for out in splats.values()}) == 1
@@ -222,7 +220,7 @@ def test_masked_pixels_are_not_learnt(scene: Path, tmp_path: Path) -> None:
 
 
 def test_cap_holds_and_is_reported(scene: Path, tmp_path: Path) -> None:
-    config = QUICK.model_copy(update={"max_gaussians": 160, "densify_gradient": 1e-6})
+    config = QUICK.model_copy(update={"max_gaussians": 160})
     assert len(read_splat(trained(scene, tmp_path, config) / "model.ply")) <= 160
     events = json.loads((tmp_path / "history.json").read_text())["density"]
     assert max(event["gaussians"] for event in events) <= 160
@@ -238,14 +236,12 @@ def test_fewer_gaussians_than_points_may_be_asked_for(scene: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     "options",
     [
-        {"coarse_levels": 2, "coarse_until": 30},
+        {"coarse_levels": 2},
         {"background": "random"},
         {"background": "white"},
         {"antialias": True},
         {"filter_3d": True},
-        {"sparse_adam": False},
         {"loss": "kornia", "iterations": 20},
-        {"prune_screen_px": 5.0},
     ],
 )
 def test_options_train_to_a_finite_model_and_repeat(

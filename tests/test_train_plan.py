@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +21,12 @@ from splatpipe.pipeline.train.checkpoint import (
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import (
     Plan,
-    coarse_levels,
     load_or_write_plan,
     make_plan,
-    means_rate,
-    resolve_schedule,
     scene_extent,
-    sh_degree_at,
 )
+from splatpipe.pipeline.train.rates import Rates, rates_of
+from splatpipe.pipeline.train.schedule import resolve_schedule
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -45,50 +44,52 @@ def views(count: int = 4) -> list[View]:
 
 
 def test_long_runs_have_the_published_schedule() -> None:
-    options = resolve_schedule(TrainConfig())
-    lengths = (options.sh_every, options.densify_from, options.densify_until, options.densify_every)
-    assert lengths == (1000, 500, 15_000, 100)
-    assert options.reset_every == 3000
+    schedule = resolve_schedule(TrainConfig())
+    density = schedule.density
+    assert (schedule.sh_every, density.first, density.last, density.every) == (1000, 500, 15_000, 100)
+    assert density.reset_every == 3000
 
 
 @pytest.mark.parametrize("iterations", [1, 7, 100, 999, 3000, 7000, 9999])
 def test_short_runs_have_every_phase_and_no_reset(iterations: int) -> None:
-    options = resolve_schedule(TrainConfig(iterations=iterations))
-    assert options.reset_every == 0
-    assert 1 <= int(options.densify_from) <= max(1, int(options.densify_until)) <= iterations
-    assert iterations < 10 or sh_degree_at(options, iterations) == 3
+    schedule = resolve_schedule(TrainConfig(iterations=iterations))
+    assert schedule.density.reset_every == 0
+    assert 1 <= schedule.density.first <= max(1, schedule.density.last) <= iterations
+    assert iterations < 10 or schedule.sh_degree_at(iterations) == 3
 
 
 @pytest.mark.parametrize(
     ("density", "gradient", "until", "reset"),
-    [
-        ("published", 2e-4, 15_000, 3000),
-        ("absolute", 1.2e-3, 15_000, 3000),
-        ("mcmc", 1.0, 25_000, 0),
-    ],
+    [("published", 2e-4, 15_000, 3000), ("absolute", 1.2e-3, 15_000, 3000), ("mcmc", 1.0, 25_000, 0)],
 )
 def test_each_strategy_of_density_control_has_its_defaults(
     density: str, gradient: float, until: int, reset: int
 ) -> None:
-    options = resolve_schedule(TrainConfig.model_validate({"density": density}))
-    assert (options.densify_gradient, options.densify_until, options.reset_every) == (gradient, until, reset)
-    given = {"density": density, "densify_gradient": 0.5, "densify_until": 9, "reset_every": 8}
-    assert resolve_schedule(TrainConfig.model_validate(given)).model_dump().items() >= given.items()
+    found = resolve_schedule(TrainConfig.model_validate({"density": density})).density
+    assert (found.gradient, found.last, found.reset_every) == (gradient, until, reset)
 
 
-def test_given_lengths_are_taken_as_they_are() -> None:
-    options = resolve_schedule(TrainConfig(iterations=100, densify_every=7, reset_every=40))
-    assert (options.densify_every, options.reset_every) == (7, 40)
+def test_published_density_takes_the_rates_resets_and_pruning_of_that_method_however_short_the_run() -> None:
+    for iterations in (1500, 30_000):
+        schedule = resolve_schedule(TrainConfig(iterations=iterations, density="published"))
+        assert schedule.rates == Rates(opacity=0.05, boost=1.0, sparse=False)
+        assert (schedule.density.reset_every, schedule.density.prune_screen_px) == (3000, 20.0)
+        ours = resolve_schedule(TrainConfig(iterations=iterations))
+        assert ours.rates.sparse and ours.rates.opacity == 0.15 and ours.density.prune_screen_px == 0.0
+
+
+def test_a_time_budget_halves_the_threshold() -> None:
+    given, free = (resolve_schedule(TrainConfig(time_budget_s=seconds)).density for seconds in (60.0, 0.0))
+    assert given == replace(free, gradient=0.5 * free.gradient)
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
         {"iterations": 0},
-        {"densify_every": 0},
         {"sh_degree": 4},
-        {"lr_means": -1.0},
-        {"reset_every": "never"},
+        {"density": "never"},
+        {"dropout": 1.0},
         {"colour": 1},
     ],
 )
@@ -101,25 +102,24 @@ def test_extent_is_a_tenth_more_than_the_farthest_camera() -> None:
     assert scene_extent([view.camera for view in views(3)]) == pytest.approx(1.1 * 2.0)
 
 
-def test_rate_of_positions_falls_exponentially_with_the_extent() -> None:
-    plan = make_plan(TrainConfig(iterations=100, lr_boost=1.0), views(), tiny_scene.split_of(views()), 9)
-    assert means_rate(plan, 0) == pytest.approx(1.6e-4 * plan.extent)
-    assert means_rate(plan, 50) == pytest.approx(1.6e-5 * plan.extent)
-    assert means_rate(plan, 100) == pytest.approx(1.6e-6 * plan.extent)
+def test_rate_of_positions_falls_exponentially() -> None:
+    schedule = replace(resolve_schedule(TrainConfig(iterations=100)), rates=Rates())
+    found = [schedule.means_rate(place) for place in (0, 50, 100, 200)]
+    assert found == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6, 1.6e-6])
 
 
 def test_short_runs_take_longer_steps() -> None:
-    boosts = [resolve_schedule(TrainConfig(iterations=run)).lr_boost for run in (100, 7500, 30_000, 100_000)]
+    boosts = [rates_of(run).boost for run in (100, 7500, 30_000, 100_000)]
     assert boosts == [4.0, 2.0, 1.0, 1.0]
-    plan = make_plan(TrainConfig(iterations=7500), views(), tiny_scene.split_of(views()), 9)
-    assert means_rate(plan, 0) == pytest.approx(2.0 * 1.6e-4 * plan.extent)
-    assert means_rate(plan, 7500) == pytest.approx(4.0 * 1.6e-6 * plan.extent)
+    schedule = resolve_schedule(TrainConfig(iterations=7500))
+    assert schedule.means_rate(0) == pytest.approx(2.0 * 1.6e-4)
+    assert schedule.means_rate(7500) == pytest.approx(4.0 * 1.6e-6)
 
 
 def test_coarse_photos_come_first_in_equal_shares() -> None:
-    options = resolve_schedule(TrainConfig(iterations=10, coarse_levels=2, coarse_until=6))
-    assert coarse_levels(options) == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
-    assert coarse_levels(resolve_schedule(TrainConfig(iterations=3))) == [0, 0, 0]
+    schedule = resolve_schedule(TrainConfig(iterations=12, coarse_levels=2))
+    assert schedule.coarse_levels_to(10) == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
+    assert resolve_schedule(TrainConfig(iterations=3)).coarse_levels_to(3) == [0, 0, 0]
 
 
 def test_held_out_photos_are_not_trained_on() -> None:
@@ -156,7 +156,7 @@ def test_broken_plan_is_written_anew(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     fresh = make_plan(TrainConfig(), views(), tiny_scene.split_of(views(), 2), 9)
     assert load_or_write_plan(path, lambda: fresh) == fresh
-    assert json.loads(path.read_text())["format"] == 2
+    assert json.loads(path.read_text())["format"] == 3
 
 
 def test_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:

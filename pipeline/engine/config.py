@@ -127,18 +127,27 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
     try:
         return model.model_validate(merge(layers))
     except ValidationError as error:
-        problems = [
-            _describe(model, problem["loc"], problem["type"], problem["msg"], problem["input"])
-            for problem in error.errors()
-        ]
+        gone: Mapping[str, str] = getattr(model, "gone", {})
+        by_hint: dict[str, list[str]] = {}
+        problems = []
+        for problem in error.errors():
+            dotted = ".".join(str(key) for key in problem["loc"])
+            if problem["type"] == "extra_forbidden" and dotted in gone:
+                by_hint.setdefault(gone[dotted], []).append(dotted)
+            else:
+                problems.append(_describe(model, dotted, problem["type"], problem["msg"], problem["input"]))
+        problems += [_gone(names, hint) for hint, names in by_hint.items()]
         raise UsageError(" ".join(problems), hint="`splatpipe options` lists every option with its default.") from error
 
 
-def _describe(model: type[BaseModel], location: tuple[int | str, ...], kind: str, message: str, value: JSON) -> str:
-    dotted = ".".join(str(key) for key in location)
+def _gone(names: Sequence[str], hint: str) -> str:
+    """Of options that another version had: an old configuration may name many that went for one reason."""
+    told = f"is no option {names[0]}" if len(names) == 1 else f"are no options {', '.join(names)}"
+    return f"There {told} any more. {hint}"
+
+
+def _describe(model: type[BaseModel], dotted: str, kind: str, message: str, value: JSON) -> str:
     if kind == "extra_forbidden":
-        if dotted in (gone := getattr(model, "gone", {})):
-            return f"There is no option {dotted} any more. {gone[dotted]}"
         close = difflib.get_close_matches(dotted, list(option_names(model)), n=1, cutoff=0.5)
         return f"There is no option {dotted}." + (f" Did you mean {close[0]}?" if close else "")
     return f"{dotted} = {value!r}: {message[0].lower()}{message[1:]}."

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from splatpipe.pipeline.train.densify import room_at
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import coarse_level_at, resolve_schedule
+from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 
 # Of these, up to COARSEST_MEGAPIXELS, none was compared by held-out quality: they are judgement, the reasons theirs.
 SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
@@ -31,7 +31,6 @@ VISITS = 10  # iterations a photo at least: one seen less often leaves floaters 
 FIRST_GROWTH = 1.5  # times the initial Gaussians that every plan has room for, before it takes larger photos
 FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer; the plan thins the initial ones down to it at most
 COARSEST_MEGAPIXELS = 0.05  # photos are halved at the start of a training no further than to this
-GRADIENT_SHARE = 0.5  # of ``densify_gradient``: Gaussians follow ``room_at``, and so the forecast, but not into noise
 
 EXPORT_GAUSSIAN_S = 8e-6  # a Gaussian of the model moved, written twice and hashed
 AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
@@ -103,22 +102,22 @@ def _terms(gaussians: int, pixels: int) -> npt.NDArray[np.float64]:
     return np.array([1.0, gaussians, pixels, gaussians * pixels])
 
 
-def forecast(speed: Speed, options: TrainConfig, initial: int, megapixels: float) -> float:
+def forecast(speed: Speed, schedule: Schedule, initial: int, megapixels: float) -> float:
     """Seconds that a training takes.
 
     Args:
         speed: Of this machine on this scene.
-        options: Resolved.
+        schedule: Of the training.
         initial: Gaussians at the start.
         megapixels: Of a photo at full size.
     """
-    steps = min(SAMPLES, options.iterations)
+    steps = min(SAMPLES, schedule.iterations)
     total = 0.0
     for step in range(steps):
-        iteration = int((step + 0.5) * options.iterations / steps) + 1
-        pixels = 1e6 * megapixels / 4 ** coarse_level_at(options, iteration)
-        total += speed.seconds(room_at(options, initial, iteration), pixels)
-    return total * options.iterations / steps
+        iteration = int((step + 0.5) * schedule.iterations / steps) + 1
+        pixels = 1e6 * megapixels / 4 ** schedule.coarse_level_at(iteration)
+        total += speed.seconds(room_at(schedule.density, initial, iteration), pixels)
+    return total * schedule.iterations / steps
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ class Task:
     """What is to be planned.
 
     Attributes:
-        config: The options, not resolved; its ``max_gaussians`` is the most that may be planned.
+        config: The options; its ``max_gaussians`` is the most that may be planned.
         initial: Gaussians at the start.
         photos: To train on.
         megapixels: Their mean size in the dataset.
@@ -150,7 +149,9 @@ class Task:
     def takes(self, options: TrainConfig, megapixels: float) -> float:
         """Forecast of a training, its photos' decoding (once a size) included, seconds."""
         decoding = self.prepare_s * (1 + options.coarse_levels)
-        return decoding + AGEING * forecast(self.speed, options, self.initial, megapixels)
+        return decoding + AGEING * forecast(
+            self.speed, resolve_schedule(options, self.photos), self.initial, megapixels
+        )
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ class Choice:
     """What meets the time.
 
     Attributes:
-        options: Resolved: iterations, cap, halvings at the start and a low threshold of density control.
+        options: With its iterations, cap and halvings at the start.
         megapixels: Most of a photo; None for the dataset's size.
         seconds: When the training ends, done or not.
         forecast_s: When the schedule should be done.
@@ -228,16 +229,15 @@ def worthwhile_iterations(seconds: float) -> int:
 
 
 def planned_options(task: Task, megapixels: float, cap: int, iterations: int) -> TrainConfig:
-    """The options of a planned training, resolved."""
+    """The options of a planned training."""
     config = task.config
     halvings = int(max(0.0, math.log(megapixels / COARSEST_MEGAPIXELS, 4)))
     planned = {
         "iterations": iterations,
         "max_gaussians": cap,
         "coarse_levels": max(config.coarse_levels, min(2, halvings)),
-        "densify_gradient": GRADIENT_SHARE * float(resolve_schedule(config, task.photos).densify_gradient),
     }
-    return resolve_schedule(config.model_copy(update=planned), task.photos)
+    return config.model_copy(update=planned)
 
 
 def _fits(task: Task, megapixels: float, cap: int, iterations: int) -> bool:

@@ -17,6 +17,7 @@ from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks
 from splatpipe.pipeline.splat.free_space import FreeSpace, free_space, near_or_free
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.schedule import Schedule
 
 STEPS_BETWEEN = 5  # steps of density control from one look to the next: a look takes as long as several iterations
 LAST_LOOK = 0.9  # of the run: the rest closes the holes
@@ -40,7 +41,7 @@ def free_space_of(views: Sequence[View], dataset: Path, options: TrainConfig) ->
     return free_space(cameras, points.xyz, [tracks[camera.name] for camera in cameras])
 
 
-def is_clearing_step(space: FreeSpace | None, options: TrainConfig, iteration: int) -> bool:
+def is_clearing_step(space: FreeSpace | None, schedule: Schedule, iteration: int) -> bool:
     """Whether Gaussians in free space are looked for after an iteration (from 1).
 
     Density control has its own beginning and end. Looking goes on after it: what is left fits the photos by hanging
@@ -48,23 +49,23 @@ def is_clearing_step(space: FreeSpace | None, options: TrainConfig, iteration: i
 
     Args:
         space: What is free; None where nobody asks.
-        options: Resolved.
+        schedule: The training's.
         iteration: The one that ends.
     """
-    every = STEPS_BETWEEN * int(options.densify_every)
-    due = iteration % every == 0 and int(options.densify_from) <= iteration <= LAST_LOOK * options.iterations
-    return space is not None and options.densify and due
+    density = schedule.density
+    due = iteration % (STEPS_BETWEEN * density.every) == 0 and iteration <= LAST_LOOK * schedule.iterations
+    return space is not None and density.on and due and density.first <= iteration
 
 
-def unwanted(gaussians: Gaussians, space: FreeSpace | None, options: TrainConfig, iteration: int) -> Bool[Tensor, " n"]:
+def unwanted(gaussians: Gaussians, space: FreeSpace | None, schedule: Schedule, iteration: int) -> Bool[Tensor, " n"]:
     """Which Gaussians hang in free space, at a step of density control that looks; none at the others.
 
     Args:
         gaussians: As they are rendered.
         space: What is free.
-        options: Resolved.
+        schedule: The training's.
         iteration: Now.
     """
-    if space is None or not is_clearing_step(space, options, iteration):
+    if space is None or not is_clearing_step(space, schedule, iteration):
         return torch.zeros(len(gaussians), dtype=torch.bool)
-    return near_or_free(gaussians, space, options.prune_free_space)
+    return near_or_free(gaussians, space, schedule.density.prune_free_space)

@@ -19,9 +19,57 @@ from torch import Tensor
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.draws import SPLIT_POSITION, normal
-from splatpipe.pipeline.train.options import TrainConfig
 
 MIN_AFTER_PRUNE = 1  # a model is never emptied: there would be nothing left to learn from
+
+# All published.
+SPLIT_EXTENT = 0.01  # share of the scene's extent: larger Gaussians are split, smaller ones cloned
+SPLIT_SHRINK = 1.6  # the two halves of a split are so many times smaller
+PRUNE_OPACITY = 0.005  # Gaussians below it are removed: no pixel shows them
+PRUNE_EXTENT = 0.1  # share of the extent: larger ones are removed after the first opacity reset
+PRUNE_SCREEN_PX = 20.0  # larger ones on screen, too; of the published method alone, for it eats aerial ground
+RESET_OPACITY = 0.01  # an opacity reset leaves no Gaussian above it
+
+
+@dataclass(frozen=True)
+class DensitySchedule:
+    """When and how density control acts.
+
+    Attributes:
+        on: Whether it does.
+        seed: Names the random numbers.
+        cap: The most Gaussians.
+        first: First iteration that it may act after.
+        last: Last one.
+        every: Iterations between its steps.
+        gradient: Score above which Gaussians are densified.
+        reset_every: Iterations between opacity resets; 0 for none.
+        prune_screen_px: Radius on screen above which Gaussians are removed; 0 for never.
+        prune_free_space: Gaussians before the surface for so many photos are removed; 0 for never.
+        prune_opacity: Opacity below which Gaussians are removed.
+        prune_extent: Share of the scene's extent above which they are; 0 for never.
+    """
+
+    on: bool
+    seed: int
+    cap: int
+    first: int
+    last: int
+    every: int
+    gradient: float
+    reset_every: int = 0
+    prune_screen_px: float = 0.0
+    prune_free_space: int = 0
+    prune_opacity: float = PRUNE_OPACITY
+    prune_extent: float = PRUNE_EXTENT
+
+    def is_step(self, iteration: int) -> bool:
+        """Whether density control acts after this iteration."""
+        return self.on and self.first <= iteration <= self.last and iteration % self.every == 0
+
+    def is_reset(self, iteration: int) -> bool:
+        """Whether opacities are reset after this iteration: never in the last step of density control or later."""
+        return self.on and self.reset_every > 0 and iteration % self.reset_every == 0 and iteration < self.last
 
 
 @dataclass(frozen=True)
@@ -126,27 +174,32 @@ class DensityStatistics:
         return {"score_sum": self.score_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
 
 
-def room_at(options: TrainConfig, initial: int, iteration: int) -> int:
+def room_at(schedule: DensitySchedule, initial: int, iteration: int) -> int:
     """The most Gaussians that density control leaves: up to the cap, fast at first and slower towards its last step.
 
     What comes early has time to be trained; what comes late has the better score. With x the share of the steps done,
     the share of the growth is x (2 - x).
 
     Args:
-        options: Resolved.
+        schedule: Of density control.
         initial: Gaussians at the start.
         iteration: Now.
     """
-    first, last, every = int(options.densify_from), int(options.densify_until), int(options.densify_every)
-    initial = min(initial, options.max_gaussians)
-    if not options.densify or iteration < first or last < first:
+    first, last, every = schedule.first, schedule.last, schedule.every
+    initial = min(initial, schedule.cap)
+    if not schedule.on or iteration < first or last < first:
         return initial
     done = min(1.0, (iteration - first + every) / (last - first + every))
-    return initial + int(done * (2.0 - done) * (options.max_gaussians - initial))
+    return initial + int(done * (2.0 - done) * (schedule.cap - initial))
 
 
 def grow(
-    gaussians: Gaussians, score: Float[Tensor, " n"], room: int, options: TrainConfig, extent: float, iteration: int
+    gaussians: Gaussians,
+    score: Float[Tensor, " n"],
+    room: int,
+    schedule: DensitySchedule,
+    extent: float,
+    iteration: int,
 ) -> tuple[Growth, dict[str, int]]:
     """Clone the small and split the large Gaussians whose score asks for it.
 
@@ -156,7 +209,7 @@ def grow(
         gaussians: The model.
         score: ``DensityStatistics.score`` of each.
         room: How many Gaussians may be added.
-        options: Resolved.
+        schedule: Of density control.
         extent: Of the scene, world units.
         iteration: Names the random numbers.
 
@@ -164,11 +217,11 @@ def grow(
         The new rows (kept ones in their order, then clones, then two children for each split), and the counts
         ``cloned``, ``split`` and ``held_back``.
     """
-    lasting = gaussians.opacity_logits >= lowest_logit_to_halve(options.prune_opacity)
-    wanted = torch.nonzero((score > float(options.densify_gradient)) & lasting).flatten()
+    lasting = gaussians.opacity_logits >= lowest_logit_to_halve(schedule.prune_opacity)
+    wanted = torch.nonzero((score > schedule.gradient) & lasting).flatten()
     chosen = _largest(wanted, score, max(0, room))
     size = gaussians.log_scales.amax(dim=1)
-    large = size[chosen] > math.log(options.split_extent * extent)
+    large = size[chosen] > math.log(SPLIT_EXTENT * extent)
     cloned, split = chosen[~large], chosen[large]
 
     kept = torch.ones(len(gaussians), dtype=torch.bool)
@@ -178,8 +231,8 @@ def grow(
     fresh = torch.arange(len(source)) >= len(old)
     means, log_scales = gaussians.means[source], gaussians.log_scales[source]
     children = len(old) + len(cloned)
-    means[children:] += _split_offsets(gaussians, split, options.seed, iteration)
-    log_scales[children:] -= math.log(options.split_shrink)
+    means[children:] += _split_offsets(gaussians, split, schedule.seed, iteration)
+    log_scales[children:] -= math.log(SPLIT_SHRINK)
     logits = gaussians.opacity_logits.clone()
     logits[chosen] = half_opacity(logits[chosen])
     counts = {"cloned": len(cloned), "split": len(split), "held_back": len(wanted) - len(chosen)}
@@ -231,7 +284,7 @@ def rotate(quats: Float[Tensor, "k 4"], vectors: Float[Tensor, "k 3"]) -> Float[
 
 def prune_mask(
     gaussians: Gaussians,
-    options: TrainConfig,
+    schedule: DensitySchedule,
     extent: float,
     iteration: int,
     radius_px: Float[Tensor, " n"],
@@ -240,34 +293,22 @@ def prune_mask(
 
     Args:
         gaussians: The model.
-        options: Resolved.
+        schedule: Of density control.
         extent: Of the scene, world units.
         iteration: Now.
         radius_px: Largest radius on screen since the last step, pixels; 0 for new ones.
     """
-    gone = torch.sigmoid(gaussians.opacity_logits) < options.prune_opacity
+    gone = torch.sigmoid(gaussians.opacity_logits) < schedule.prune_opacity
     size = gaussians.log_scales.amax(dim=1)
-    after_reset = 0 < int(options.reset_every) < iteration
-    if options.prune_extent > 0.0 and after_reset:
-        gone |= size > math.log(options.prune_extent * extent)
-    if options.prune_screen_px > 0.0 and after_reset:
-        gone |= radius_px > options.prune_screen_px
+    after_reset = 0 < schedule.reset_every < iteration
+    if schedule.prune_extent > 0.0 and after_reset:
+        gone |= size > math.log(schedule.prune_extent * extent)
+    if schedule.prune_screen_px > 0.0 and after_reset:
+        gone |= radius_px > schedule.prune_screen_px
     gone |= ~torch.isfinite(gaussians.means).all(dim=1) | ~torch.isfinite(size)
     if len(gaussians) - int(gone.sum()) < MIN_AFTER_PRUNE:
         gone[torch.argmax(torch.nan_to_num(gaussians.opacity_logits, nan=-math.inf))] = False
     return gone
-
-
-def is_density_step(options: TrainConfig, iteration: int) -> bool:
-    """Whether density control acts after this iteration."""
-    within = int(options.densify_from) <= iteration <= int(options.densify_until)
-    return options.densify and within and iteration % int(options.densify_every) == 0
-
-
-def is_opacity_reset(options: TrainConfig, iteration: int) -> bool:
-    """Whether opacities are reset after this iteration: never in the last step of density control or later."""
-    every = int(options.reset_every)
-    return options.densify and every > 0 and iteration % every == 0 and iteration < int(options.densify_until)
 
 
 def reset_opacity(opacity_logits: Float[Tensor, " n"], limit: float) -> None:

@@ -15,18 +15,18 @@ from torch import Tensor
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.draws import DROPOUT, uniform
-from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.schedule import Schedule
 
 DROPPED_LOGIT = -30.0  # an opacity of 1e-13: the projection culls it, so it costs nothing and learns nothing
 LARGEST_OPACITY = 0.999  # of the scaled ones, which a logit has to hold; the blending caps alpha at 0.99
 
 
-def share_at(options: TrainConfig, iteration: int) -> float:
+def share_at(schedule: Schedule, iteration: int) -> float:
     """The share left out at an iteration (from 1): rises evenly to `dropout` at the schedule's end."""
-    return float(options.dropout) * min(1.0, iteration / options.iterations)
+    return schedule.dropout * min(1.0, iteration / schedule.iterations)
 
 
-def dropped(gaussians: Gaussians, options: TrainConfig, iteration: int) -> Gaussians:
+def dropped(gaussians: Gaussians, schedule: Schedule, iteration: int) -> Gaussians:
     """The Gaussians as an iteration renders them; the same object where `dropout` is 0.
 
     A random share has no opacity, the others have theirs over 1 - share: what a pixel lets through is the same on
@@ -34,13 +34,13 @@ def dropped(gaussians: Gaussians, options: TrainConfig, iteration: int) -> Gauss
 
     Args:
         gaussians: The model.
-        options: The training's.
+        schedule: The training's.
         iteration: From 1; with the seed and a Gaussian's row it names the random number.
     """
-    share = share_at(options, iteration)
+    share = share_at(schedule, iteration)
     if share == 0.0:
         return gaussians
-    drawn = torch.from_numpy(uniform(options.seed, iteration, DROPOUT, np.arange(len(gaussians))))
+    drawn = torch.from_numpy(uniform(schedule.seed, iteration, DROPOUT, np.arange(len(gaussians))))
     logits = _Dropped.apply(gaussians.opacity_logits, drawn >= share, share)  # type: ignore[no-untyped-call]
     return replace(gaussians, opacity_logits=logits)
 

@@ -17,10 +17,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.side import SideModel
 
+FIRST_RATE = 1e-3  # of learning: a photo has some hundred visits, in which its exposure moves by a tenth at most
 LAST_RATE = 0.1  # of the first; exponential in between
+DECAY = 1e-3  # times the maps' deviation from the identity joins the loss's gradient: what no pixel tells stays there
 _NAME = "deviations"
 
 
@@ -29,47 +30,38 @@ class Exposure(SideModel):
 
     Args:
         names: Of the photos trained on.
-        maps: How many each has.
+        first_rate: Learning rate at the start.
+        decay: How strongly the maps are drawn to the identity.
     """
 
-    model = "affine"
-
-    def __init__(self, names: Sequence[str], maps: int = 1) -> None:
-        super().__init__({_NAME: torch.zeros(len(names) * maps, 12)})
-        self._maps = maps
-        self._centred_every = 1
+    def __init__(self, names: Sequence[str], first_rate: float = FIRST_RATE, decay: float = DECAY) -> None:
+        super().__init__({_NAME: torch.zeros(len(names), 12)})
+        self._first_rate, self._decay = first_rate, decay
         self._row = {name: row for row, name in enumerate(sorted(names))}
 
     def map_of(self, name: str) -> Float[Tensor, "3 4"]:
         """What a photo's map is now: its colours are A c + b of the splat's, [A b]."""
-        return torch.eye(3, 4) + self._deviation(name).view(3, 4)
+        return torch.eye(3, 4) + self._deviations()[self._row[name]].view(3, 4)
 
     def shown(self, picture: Float[Tensor, "h w 3"], name: str) -> Float[Tensor, "h w 3"]:
         """A render as the photo's exposure would show it; differentiable."""
         return affine_colour(picture, self.map_of(name))
 
     @torch.no_grad()
-    def step(self, name: str, iteration: int, options: TrainConfig) -> None:
-        """Step a photo's maps against their gradient, and let their mean over the photos be the identity again.
+    def step(self, name: str, share: float) -> None:
+        """Step a photo's map against its gradient, and let the photos' mean map be the identity again.
 
         Args:
             name: The photo's.
-            iteration: From 1.
-            options: Resolved.
+            share: Of the schedule that is done.
         """
-        deviations, own = self._deviations(), self._own(name)
+        deviations, row = self._deviations(), self._row[name]
         if deviations.grad is not None:
-            deviations.grad[own] += self._pull(deviations.detach()[own], options)
-        share = min(1.0, iteration / options.iterations)
+            deviations.grad[row] += self._decay * deviations.detach()[row]
         rows = torch.zeros(len(deviations), dtype=torch.bool)
-        rows[own] = True
-        self.descend({_NAME: options.lr_exposure * math.exp(math.log(LAST_RATE) * share)}, rows)
-        if iteration % self._centred_every == 0:
-            self._centre()
-
-    def _pull(self, deviation: Float[Tensor, "maps 12"], options: TrainConfig) -> Float[Tensor, "maps 12"]:
-        """The gradient of what the loss has against a photo's maps themselves."""
-        return options.exposure_decay * deviation
+        rows[row] = True
+        self.descend({_NAME: self._first_rate * math.exp(math.log(LAST_RATE) * share)}, rows)
+        self._centre()
 
     def _centre(self) -> None:
         """Take out the maps' mean deviation."""
@@ -80,13 +72,6 @@ class Exposure(SideModel):
         """What is trained: the maps less the identity."""
         return self.tensors[_NAME]
 
-    def _own(self, name: str) -> slice:
-        """A photo's rows."""
-        return slice(self._row[name] * self._maps, (self._row[name] + 1) * self._maps)
-
-    def _deviation(self, name: str) -> Float[Tensor, "maps 12"]:
-        return self._deviations()[self._own(name)]
-
     def maps(self) -> dict[str, list[list[float]]]:
         """Every photo's map, rows of A with b at their end, by name in order."""
         with torch.no_grad():
@@ -95,5 +80,5 @@ class Exposure(SideModel):
 
 def exposures_json(exposure: Exposure | None) -> str:
     """The text of `exposures.json`."""
-    fields = {"model": "off", "views": {}} if exposure is None else {"model": exposure.model, "views": exposure.maps()}
+    fields = {"model": "off", "views": {}} if exposure is None else {"model": "affine", "views": exposure.maps()}
     return json.dumps(fields, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

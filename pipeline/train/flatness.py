@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.schedule import Schedule
 
 WINDOW_SHARE = 0.25  # of the iterations done: what the line is drawn through
 FEWEST_EPOCHS = 8  # in it, so that their scatter is known
@@ -23,15 +23,15 @@ STANDARD_ERRORS = 2.0  # the line is taken so much steeper: noise does not end a
 TAIL_SHARE = 0.1  # of the iterations done: what the rest of the schedule is compressed into
 
 
-def settled_from(options: TrainConfig) -> int:
+def settled_from(schedule: Schedule) -> int:
     """Iteration after which only the rates change: all Gaussians, all degrees and the photos' full size are there.
 
     Args:
-        options: Resolved.
+        schedule: The training's.
     """
-    density = int(options.densify_until) if options.densify else 0
-    coarse = int(options.coarse_until) if options.coarse_levels else 0
-    return max(density, coarse, options.sh_degree * int(options.sh_every))
+    density = schedule.density.last if schedule.density.on else 0
+    coarse = schedule.coarse_until if schedule.coarse_levels else 0
+    return max(density, coarse, schedule.sh_degree * schedule.sh_every)
 
 
 def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:

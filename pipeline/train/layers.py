@@ -30,7 +30,7 @@ def is_spread_counted(options: TrainConfig, place: int) -> bool:
         options: The training's.
         place: Of the iteration in the schedule, from 1.
     """
-    return options.spread_weight > 0.0 and place > FIRST_SHARE * options.iterations
+    return options.distortion_weight > 0.0 and place > FIRST_SHARE * options.iterations
 
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:

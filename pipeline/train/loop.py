@@ -22,7 +22,6 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
-from splatpipe.pipeline.train.densify import is_density_step
 from splatpipe.pipeline.train.density import BLIND, Seen
 from splatpipe.pipeline.train.draws import BACKGROUND, ELSEWHERE, uniform
 from splatpipe.pipeline.train.dropout import dropped
@@ -30,15 +29,12 @@ from splatpipe.pipeline.train.exposure import exposures_json
 from splatpipe.pipeline.train.flatness import ends_at, is_flat, place_in_schedule, settled_from
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
 from splatpipe.pipeline.train.layers import depth_origin, is_spread_counted, spread_loss
-from splatpipe.pipeline.train.memory import over_memory, without_growth
+from splatpipe.pipeline.train.memory import over_memory
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import (
     Plan,
-    coarse_levels,
     load_or_write_plan,
     make_plan,
-    means_rate,
-    sh_degree_at,
 )
 from splatpipe.pipeline.train.planning import Scene, under_budgets
 from splatpipe.pipeline.train.sky import SkyModel
@@ -50,6 +46,7 @@ CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
 REPORT_EVERY = 10  # iterations
+SSIM_WEIGHT = 0.2  # share of 1 - SSIM in the loss, the rest is L1: published
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -79,7 +76,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         if budgeted(plan):
             report.note(plan.described())
         state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
-        levels = coarse_levels(plan.options, ends_at(plan, state.history.flat_at))
+        levels = plan.schedule.coarse_levels_to(ends_at(plan, state.history.flat_at))
         surround(state, plan, trained_on, dataset)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(trained_on, levels, plan.options.seed, first, out, size) as photos:
@@ -228,11 +225,10 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     options, iteration = plan.options, state.iteration + 1
     if photo.mask is None or bool(photo.mask.any()):
         descend(state, plan, photo, iteration)
-    state.end_epoch(iteration, len(plan.train_views), options)
+    state.end_epoch(iteration, plan)
+    state.control_density(plan, iteration)
     growing = not state.history.growth_ended
-    control = options if growing else without_growth(options)
-    state.control_density(control, plan.extent, plan.initial_gaussians, iteration)
-    if growing and is_density_step(options, iteration) and over_memory(options):
+    if growing and plan.schedule.density.is_step(iteration) and over_memory(options):
         state.history.growth_ended = iteration
     state.iteration = iteration
     if options.stop_when_flat > 0.0 and iteration % len(plan.train_views) == 0:
@@ -244,7 +240,7 @@ def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
 def judge_epoch(state: TrainState, plan: Plan) -> None:
     """Close an epoch, and note where the loss is flat."""
     history, photos = state.history, len(plan.train_views)
-    history.end_epoch(state.iteration - photos // 2, state.iteration - photos >= settled_from(plan.options))
+    history.end_epoch(state.iteration - photos // 2, state.iteration - photos >= settled_from(plan.schedule))
     if not history.flat_at and is_flat(history.epochs, plan, state.iteration):
         history.flat_at = state.iteration
 
@@ -253,7 +249,7 @@ def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str
     """What a point of the history's curve says besides the loss."""
     return {
         "gaussians": len(state.gaussians),
-        "sh_degree": sh_degree_at(plan.options, state.iteration),
+        "sh_degree": plan.schedule.sh_degree_at(state.iteration),
         "width": photo.camera.width,
     }
 
@@ -261,30 +257,33 @@ def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str
 def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
     """Render the photo's view and step the parameters against the loss's gradient."""
     options = plan.options
-    observed = options.densify and iteration <= int(options.densify_until) and not state.history.growth_ended
+    density = plan.schedule.density
+    observed = density.on and iteration <= density.last
     look = state.density.look if observed else BLIND
     place = place_in_schedule(plan, state.history.flat_at, iteration)
     settings = render_options(plan, iteration, look.magnitudes)
     if spread := is_spread_counted(options, place):
         settings = replace(settings, depth=True, depth_origin=depth_origin(state.gaussians.means, photo.camera))
     probe = state.probe() if look.probe else None
-    model = dropped(state.rendered_model(options), options, place)
+    model = dropped(state.rendered_model(options), plan.schedule, place)
     rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     photometric, penalties = losses(state, plan, photo, rendered, settings.background)
     loss = photometric + penalties
     if spread:
-        loss = loss + options.spread_weight * spread_loss(rendered, settings.depth_origin, photo.camera)
+        loss = loss + options.distortion_weight * spread_loss(rendered, settings.depth_origin, photo.camera)
     loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
     state.density.add_gradients(state.gaussians, rendered.visible, plan.extent)
     with torch.no_grad():
         if observed:
-            state.density.observe(Seen(rendered, None if probe is None else probe.grad), options)
-        state.step(rendered.visible, means_rate(plan, place), plan.extent, options)
+            state.density.observe(Seen(rendered, None if probe is None else probe.grad), density)
+        means_rate = plan.extent * plan.schedule.means_rate(place)
+        state.step(rendered.visible, means_rate, plan.extent, plan.schedule)
+        share = min(1.0, place / options.iterations)
         if state.exposure is not None:
-            state.exposure.step(photo.camera.name, place, options)
+            state.exposure.step(photo.camera.name, share)
         if state.sky is not None:
-            state.sky.step(min(1.0, place / options.iterations))
+            state.sky.step(share)
 
 
 def losses(
@@ -304,20 +303,20 @@ def losses(
         elsewhere = random_colour(options, state.iteration + 1, ELSEWHERE)
         seen = state.sky.seen(photo.camera)
         shown = state.sky.composite(rendered, photo.camera, seen, behind, elsewhere)
-        penalty = state.sky.penalty(rendered.alpha, seen, options.sky_opacity_weight)
+        penalty = state.sky.penalty(rendered.alpha, seen)
     if state.exposure is not None:
         shown = state.exposure.shown(shown, photo.camera.name)
     if state.robust is not None:
         photo = state.robust.look(photo, rendered, shown)
     measure = photo_loss if options.loss == "native" else photo_loss_reference
-    return measure(shown, photo.colour, options.ssim_weight, photo.mask), penalty
+    return measure(shown, photo.colour, SSIM_WEIGHT, photo.mask), penalty
 
 
 def render_options(plan: Plan, iteration: int, magnitudes: bool) -> rasterizer.RenderOptions:
     """How an iteration renders; with ``magnitudes`` of the screen gradient where density control looks on."""
     options = plan.options
     return rasterizer.RenderOptions(
-        sh_degree=sh_degree_at(options, iteration),
+        sh_degree=plan.schedule.sh_degree_at(iteration),
         background=background(options, iteration),
         antialias=options.antialias,
         near=plan.near,

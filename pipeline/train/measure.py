@@ -18,8 +18,8 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
-from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.schedule import Schedule
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.smoothing import sampling_of
 from splatpipe.pipeline.train.state import TrainState
@@ -80,7 +80,7 @@ def measure(
     """
     began = time.monotonic()
     chosen = [views[index * len(views) // min(len(views), MOST_VIEWS)] for index in range(min(len(views), MOST_VIEWS))]
-    trial = replace(plan, options=pilot_options(plan))
+    trial = replace(plan, schedule=pilot_schedule(plan.schedule))
     small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
     models = [stretched(start, count, plan.options.seed) for count in counts]
@@ -101,10 +101,10 @@ def measure(
     return Measured(fit_speed(timings), decode_s, evaluate_s)
 
 
-def pilot_options(plan: Plan) -> TrainConfig:
-    """Those of the plan without steps of density control, all SH degrees taking part."""
-    lengths = {"densify_every": NEVER, "densify_from": 1, "densify_until": NEVER, "reset_every": 0, "sh_every": 1}
-    return plan.options.model_copy(update=lengths)
+def pilot_schedule(schedule: Schedule) -> Schedule:
+    """The schedule without steps of density control, all SH degrees taking part."""
+    density = replace(schedule.density, first=1, last=NEVER, every=NEVER, reset_every=0)
+    return replace(schedule, sh_every=1, density=density)
 
 
 def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:

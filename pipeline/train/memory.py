@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-from dataclasses import replace
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError
@@ -71,7 +70,7 @@ def within_memory(plan: Plan, largest_pixels: int, report: Reporter) -> Plan:
             hint="Give more with --max-memory for a finer model.",
         )
     cap = min(plan.options.max_gaussians, int(most))
-    return replace(plan, options=plan.options.model_copy(update={"max_gaussians": cap}))
+    return plan.of(plan.options.model_copy(update={"max_gaussians": cap}))
 
 
 def over_memory(options: TrainConfig) -> bool:
@@ -85,11 +84,6 @@ def over_memory(options: TrainConfig) -> bool:
         return False
     return_free_heap()
     return resident_bytes() > GROWTH_STOPS_AT * limit
-
-
-def without_growth(options: TrainConfig) -> TrainConfig:
-    """The options without density control: no Gaussian comes, none goes, no opacity is reset."""
-    return options.model_copy(update={"densify": False})
 
 
 def return_free_heap() -> None:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,37 +17,11 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import Split, View
 from splatpipe.pipeline.render.rendering import Rendering
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 
-PLAN_FORMAT = 2
+PLAN_FORMAT = 3
 EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
 NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones see nothing that near
-PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
-LARGEST_BOOST = 4.0  # of learning rates: measured best at 1,500 iterations, and beyond it Gaussians overshoot
-FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
-FEW_DROPOUT = 0.2
-SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings
-
-
-@dataclass(frozen=True)
-class _Defaults:
-    """What `auto` means for a strategy of density control.
-
-    Attributes:
-        gradient: Score above which Gaussians are densified.
-        until: Last step, as a share of the run.
-        resets: Whether opacities are reset.
-    """
-
-    gradient: float
-    until: float = 0.5
-    resets: bool = True
-
-
-DENSITY_DEFAULTS = {
-    "published": _Defaults(2e-4),
-    "absolute": _Defaults(1.2e-3),
-    "mcmc": _Defaults(1.0, until=25 / 30, resets=False),  # it has no score
-}
 
 
 @dataclass(frozen=True)
@@ -55,7 +29,8 @@ class Plan:
     """What a training does, resolved.
 
     Attributes:
-        options: The configuration with every `auto` replaced by a number.
+        options: The configuration, with what a budget planned.
+        schedule: That follows from them.
         extent: Radius of the cameras, world units.
         near: Near plane, world units.
         train_views: Names of the photos trained on, sorted.
@@ -70,6 +45,7 @@ class Plan:
     """
 
     options: TrainConfig
+    schedule: Schedule
     extent: float
     near: float
     train_views: tuple[str, ...]
@@ -95,6 +71,10 @@ class Plan:
     def digest(self) -> str:
         """sha256 of ``to_json``: names the plan in its checkpoints."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
+
+    def of(self, options: TrainConfig) -> Plan:
+        """The same training with other options, and the schedule that follows from them."""
+        return replace(self, options=options, schedule=resolve_schedule(options, len(self.train_views)))
 
     def described(self) -> str:
         """The plan in a line for people."""
@@ -123,6 +103,7 @@ class Plan:
             raise ValueError("not a plan of this version")
         try:
             fields["options"] = TrainConfig.model_validate(fields["options"])
+            fields["schedule"] = Schedule.from_json(fields["schedule"])
             fields["train_views"] = tuple(fields["train_views"])
             fields["test_views"] = tuple(fields["test_views"])
             return Plan(**fields)
@@ -138,35 +119,6 @@ def duration(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest:02d} s" if rest else f"{minutes} min"
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes % 60 else f"{minutes // 60} h"
-
-
-def share_of_few(photos: int) -> float:
-    """How much of what few photos need a training takes: all of it up to FEW_PHOTOS, nothing from MANY_PHOTOS on."""
-    return min(1.0, max(0.0, (MANY_PHOTOS - photos) / (MANY_PHOTOS - FEW_PHOTOS)))
-
-
-def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> TrainConfig:
-    """Replace every `auto` by the published value, changed for short runs and few photos as the option's text says.
-
-    Args:
-        config: The options.
-        photos: That are trained on.
-    """
-    run, strategy = config.iterations, DENSITY_DEFAULTS[config.density]
-    until = config.densify_until if config.densify_until != "auto" else int(run * strategy.until)
-    auto = {
-        "sh_every": max(1, min(1000, run // 5)),
-        "densify_from": max(1, min(500, run // 5)),
-        "densify_until": max(1, until),
-        "densify_every": max(1, min(100, run // 10)),
-        "reset_every": 3000 if run >= SHORT_RUN and strategy.resets else 0,
-        "densify_gradient": strategy.gradient,
-        "coarse_until": until,
-        "dropout": round(FEW_DROPOUT * share_of_few(photos), 4),
-        "lr_boost": round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / run))), 4),
-    }
-    resolved = {name: value for name, value in auto.items() if getattr(config, name) == "auto"}
-    return config.model_copy(update=resolved)
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
@@ -203,7 +155,8 @@ def make_plan(config: TrainConfig, views: Sequence[View], split: Split, gaussian
             hint="Take the photos from different places, and hold out fewer of them.",
         )
     return Plan(
-        options=resolve_schedule(config, len(split.train)),
+        options=config,
+        schedule=resolve_schedule(config, len(split.train)),
         extent=extent,
         near=NEAR_PER_EXTENT * extent,
         train_views=split.train,
@@ -229,37 +182,3 @@ def load_or_write_plan(path: Path, make: Callable[[], Plan]) -> Plan:
         fresh = make()
         write_durably(path, fresh.to_json())
         return fresh
-
-
-def coarse_level_at(options: TrainConfig, iteration: int) -> int:
-    """How often an iteration's photo (from 1) is halved: equal shares of ``coarse_until``, coarsest first.
-
-    Args:
-        options: Resolved.
-        iteration: From 1.
-    """
-    until = int(options.coarse_until)
-    return options.coarse_levels - (iteration - 1) * options.coarse_levels // until if iteration <= until else 0
-
-
-def coarse_levels(options: TrainConfig, last: int | None = None) -> list[int]:
-    """``coarse_level_at`` for every iteration.
-
-    Args:
-        options: Resolved.
-        last: The last iteration; that of the schedule without it.
-    """
-    return [coarse_level_at(options, iteration) for iteration in range(1, (last or options.iterations) + 1)]
-
-
-def means_rate(plan: Plan, iteration: int) -> float:
-    """Learning rate of the positions at an iteration (from 1), world units: exponential from start to end."""
-    share = min(1.0, iteration / plan.options.iterations)
-    boost = float(plan.options.lr_boost)
-    first, last = boost * plan.options.lr_means, boost * boost * plan.options.lr_means_final
-    return plan.extent * math.exp(math.log(first) * (1.0 - share) + math.log(last) * share)
-
-
-def sh_degree_at(options: TrainConfig, iteration: int) -> int:
-    """The degree trained at an iteration (from 1): one more every ``sh_every``."""
-    return min(options.sh_degree, iteration // int(options.sh_every))

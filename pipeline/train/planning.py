@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.budget import (
 from splatpipe.pipeline.train.measure import Effort, Measured, Step, measure
 from splatpipe.pipeline.train.memory import within_memory
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan import Plan, mean_megapixels, resolve_schedule
+from splatpipe.pipeline.train.plan import Plan, mean_megapixels
 from splatpipe.pipeline.train.sky import SkyModel
 
 MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
@@ -92,8 +92,7 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
         )
     cameras = [view.camera for view in scene.trained_on]
     return replace(
-        plan,
-        options=choice.options,
+        plan.of(choice.options),
         last_iteration=choice.last_iteration,
         megapixels=choice.megapixels,
         train_megapixels=mean_megapixels(cameras, choice.megapixels),
@@ -111,7 +110,7 @@ def pilot(plan: Plan, config: TrainConfig) -> Plan:
     """
     wanted = max(FIRST_GROWTH * plan.initial_gaussians, PILOT_GROWTH_A_SECOND * config.time_budget_s, FEWEST_GAUSSIANS)
     short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
-    return replace(plan, options=resolve_schedule(config.model_copy(update=short), len(plan.train_views)))
+    return plan.of(config.model_copy(update=short))
 
 
 def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:

@@ -26,7 +26,6 @@ from torch.nn import functional
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them
@@ -43,15 +42,15 @@ SURFACE_ALPHA = 0.5  # of a cell with a depth
 UNKNOWN = -1.0  # residual of a cell that no visit has shown
 
 
-def share_at(options: TrainConfig, iteration: int) -> float:
-    """The share left out at an iteration: from `densify_from` on it rises, to `robust` at twice that.
+def share_at(robust: float, begin: int, iteration: int) -> float:
+    """The share left out at an iteration: it rises from the first step of density control on.
 
     Args:
-        options: Resolved.
+        robust: The most, reached at twice that.
+        begin: First iteration of density control: before it, no photo is told well enough to be contradicted.
         iteration: From 1.
     """
-    begin = int(options.densify_from)
-    return options.robust * min(1.0, max(0.0, iteration / begin - 1.0))
+    return robust * min(1.0, max(0.0, iteration / begin - 1.0))
 
 
 class Robust:

@@ -32,6 +32,7 @@ LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
 MOST_ERROR_PX = 2.0
 SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
 RIM_PX = 3  # around the sky, of ``WORK_MEGAPIXELS``: what the search may have left of it, and thin things before it
+OPACITY_WEIGHT = 0.1  # of the mean opacity before the sky in the loss; judgement
 SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills what no photo shows
 FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # of the colours, a step, from the start to the end of the schedule
 EPSILON = 1e-8  # Adam's: cells that hardly any pixel pulls at stay where they are
@@ -133,10 +134,10 @@ class SkyModel(SideModel):
         behind = torch.where(seen.around[:, :, None], behind, flat.behind(camera, background))
         return laid_over(rendered.colour, rendered.alpha, background, behind)
 
-    def penalty(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None, opacity_weight: float) -> Float[Tensor, ""]:
+    def penalty(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None) -> Float[Tensor, ""]:
         """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness."""
         loss = SMOOTHNESS * roughness(self.panorama.colours)
-        return loss if seen is None else loss + opacity_weight * torch.where(seen.mask, alpha, 0.0).mean()
+        return loss if seen is None else loss + OPACITY_WEIGHT * torch.where(seen.mask, alpha, 0.0).mean()
 
     def seen(self, camera: Camera) -> SeenSky | None:
         """The sky of a training photo at the size of ``camera``; None where it shows none."""

@@ -19,10 +19,9 @@ from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint
 from splatpipe.pipeline.train.clearing import is_clearing_step, unwanted
 from splatpipe.pipeline.train.densify import (
+    RESET_OPACITY,
     DensityEvent,
     Growth,
-    is_density_step,
-    is_opacity_reset,
     reset_opacity,
     room_at,
     unchanged,
@@ -33,6 +32,7 @@ from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.robust import Robust, share_at
+from splatpipe.pipeline.train.schedule import Schedule
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.smoothing import REFRESH_EVERY, Sampling, raw_opacity_limits, smoothed
 
@@ -132,83 +132,84 @@ class TrainState:
             self.filter_sigmas = sampling.filter_sigmas(self.gaussians.means)
         return self.filter_sigmas
 
-    def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, options: TrainConfig) -> None:
+    def step(self, gradient_rows: Bool[Tensor, " n"], means_rate: float, extent: float, schedule: Schedule) -> None:
         """Step the parameters against their gradients, which are dropped.
 
         Args:
             gradient_rows: The Gaussians that the photo saw.
             means_rate: Learning rate of positions, world units.
             extent: Of the scene, world units.
-            options: Resolved.
+            schedule: The training's.
         """
-        boost = float(options.lr_boost)
-        colour = boost * options.lr_sh
+        given = schedule.rates
+        colour = given.boost * given.sh
         rates: dict[str, float | Tensor] = {
             "means": means_rate,
-            "log_scales": boost * options.lr_scales,
-            "quats": boost * options.lr_quats,
-            "opacity_logits": options.lr_opacity,
-            "sh": sh_rates(self.gaussians.sh.shape[1], colour, colour / options.lr_sh_rest_divisor),
+            "log_scales": given.boost * given.scales,
+            "quats": given.boost * given.quats,
+            "opacity_logits": given.opacity,
+            "sh": sh_rates(self.gaussians.sh.shape[1], colour, colour / given.sh_rest_divisor),
         }
         tensors = self.gaussians.tensors()
-        rows = gradient_rows if options.sparse_adam else None
+        rows = gradient_rows if given.sparse else None
         self.history.skipped_gradients += self.adam.step(tensors, rates, rows)
         for tensor in tensors.values():
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))
-        self.density.stepped(self.gaussians.detach(), options, means_rate, self.iteration + 1)
+        self.density.stepped(self.gaussians.detach(), schedule.density, means_rate, self.iteration + 1)
 
-    def end_epoch(self, iteration: int, photos: int, options: TrainConfig) -> None:
+    def end_epoch(self, iteration: int, plan: Plan) -> None:
         """After the last iteration of an epoch, with `robust`: take its threshold."""
-        if self.robust is not None and iteration % photos == 0:
-            self.robust.end_epoch(share_at(options, iteration))
+        if self.robust is not None and iteration % len(plan.train_views) == 0:
+            self.robust.end_epoch(share_at(plan.options.robust, plan.schedule.density.first, iteration))
 
     def probe(self) -> Float[Tensor, "n 2"]:
         """Zeros whose gradient a render makes the one by the means on the image plane."""
         return torch.zeros(len(self.gaussians), 2, requires_grad=True)
 
-    def control_density(self, options: TrainConfig, extent: float, initial: int, iteration: int) -> None:
-        """Grow, prune and reset where this iteration is one for it.
+    def control_density(self, plan: Plan, iteration: int) -> None:
+        """Grow, prune and reset where this iteration is one for it; only prune and reset once growth has ended.
 
         Args:
-            options: Resolved.
-            extent: Of the scene, world units.
-            initial: Gaussians that the training began with.
+            plan: The training's.
             iteration: The one that ends.
         """
+        density = plan.schedule.density
         with torch.no_grad():
-            if is_density_step(options, iteration):
-                self._densify(options, extent, room_at(options, initial, iteration), iteration)
-            elif not self.history.flat_at and is_clearing_step(self.free_space, options, iteration):
-                self._clear(options, iteration)
-            if is_opacity_reset(options, iteration):
-                self._reset_opacity(options.reset_opacity)
+            if density.is_step(iteration):
+                growing = not self.history.growth_ended
+                limit = room_at(density, plan.initial_gaussians, iteration) if growing else 0
+                self._densify(plan, limit, iteration)
+            elif not self.history.flat_at and is_clearing_step(self.free_space, plan.schedule, iteration):
+                self._clear(plan.schedule, iteration)
+            if density.is_reset(iteration):
+                self._reset_opacity()
                 self.adam.zero_state(names=("opacity_logits",))
                 self.history.resets.append(iteration)
 
-    def _reset_opacity(self, limit: float) -> None:
-        """Leave no opacity as it is rendered above ``limit``."""
+    def _reset_opacity(self) -> None:
+        """Leave no opacity as it is rendered above ``RESET_OPACITY``."""
         logits = self.gaussians.opacity_logits.detach()
         if self.sampling is None:
-            reset_opacity(logits, limit)
+            reset_opacity(logits, RESET_OPACITY)
         else:
-            logits.clamp_(max=raw_opacity_limits(self.gaussians, self._filter(self.sampling), limit))
+            logits.clamp_(max=raw_opacity_limits(self.gaussians, self._filter(self.sampling), RESET_OPACITY))
 
-    def _densify(self, options: TrainConfig, extent: float, limit: int, iteration: int) -> None:
-        """Give the model the rows that the strategy chooses, at most ``limit``."""
+    def _densify(self, plan: Plan, limit: int, iteration: int) -> None:
+        """Give the model the rows that the strategy chooses, at most ``limit`` where it adds any."""
         self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
         gaussians = self.gaussians.detach()
         rendered = self._filtered(gaussians)
-        gone = unwanted(rendered, self.free_space, options, iteration)
-        step = DensityStep(options, extent, limit, iteration, rendered, gone)
+        gone = unwanted(rendered, self.free_space, plan.schedule, iteration)
+        step = DensityStep(plan.schedule.density, plan.extent, limit, iteration, rendered, gone)
         growth, counts = self.density.control(gaussians, step)
         self._become(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
 
-    def _clear(self, options: TrainConfig, iteration: int) -> None:
+    def _clear(self, schedule: Schedule, iteration: int) -> None:
         """Remove what hangs in free space, after the last step of density control, too."""
         gaussians = self.gaussians.detach()
-        gone = unwanted(self._filtered(gaussians), self.free_space, options, iteration)
+        gone = unwanted(self._filtered(gaussians), self.free_space, schedule, iteration)
         if bool(gone.any()) and not bool(gone.all()):
             self._become(unchanged(gaussians, ~gone))
             pruned = int(gone.sum())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import dc_to_rgb, rgb_to_dc
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 
 WIDTH, HEIGHT, FOCAL = 72, 54, 70.0
 CAMERAS = 9
@@ -31,13 +32,22 @@ PLAIN: dict[str, object] = {
     "sky": "off",
     "prune_free_space": 0,
     "dropout": 0.0,
-    "lr_opacity": 0.05,
 }
 
 
 def plain(**options: object) -> TrainConfig:
     """A training's configuration without them, but for the options given."""
     return TrainConfig.model_validate(PLAIN | options)
+
+
+def resolver(**density: object) -> Callable[[TrainConfig, int], Schedule]:
+    """``resolve_schedule`` with other lengths and limits of density control, to be put into its place."""
+
+    def resolved(config: TrainConfig, photos: int) -> Schedule:
+        schedule = resolve_schedule(config, photos)
+        return replace(schedule, density=replace(schedule.density, **density))  # type: ignore[arg-type]
+
+    return resolved
 
 
 @dataclass

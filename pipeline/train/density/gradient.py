@@ -5,13 +5,13 @@ SIGGRAPH 2023, section 5: the norm of the gradient, summed with its sign over th
 ACM MM 2024: the pixels' magnitudes are summed, which do not cancel in a Gaussian that is too large for what it covers.
 
 Both keep to our cap, our schedule of growth and our opacity of two that take the place of one (see `densify.py`);
-published is what is ranked and its threshold.
+published are what is ranked and its threshold, the learning rates, the opacity resets and the pruning by size.
 """
 
 from __future__ import annotations
 
+from splatpipe.pipeline.train.densify import DensitySchedule
 from splatpipe.pipeline.train.density.strategy import Look, ScoredDensity, Seen
-from splatpipe.pipeline.train.options import TrainConfig
 
 
 class PublishedDensity(ScoredDensity):
@@ -19,12 +19,12 @@ class PublishedDensity(ScoredDensity):
 
     look = Look(probe=True)
 
-    def observe(self, seen: Seen, options: TrainConfig) -> None:
+    def observe(self, seen: Seen, schedule: DensitySchedule) -> None:
         """Add the norms, in NDC."""
         if seen.gradient_px is not None:
             height, width = seen.rendered.alpha.shape
             self.statistics.observe(seen.gradient_px, seen.rendered.visible, width, height)
-            self.observe_radii(seen, options)
+            self.observe_radii(seen, schedule)
 
 
 class AbsoluteDensity(PublishedDensity):

@@ -1,8 +1,8 @@
 """Density control as sampling: dead Gaussians are relocated onto live ones, and positions are disturbed by noise.
 
 Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024. Every step moves the Gaussians
-below `prune_opacity` onto live ones, drawn in proportion to opacity, and adds copies of such draws; the N that share a
-place get the opacity and the size that keep their sum as it was. Every iteration adds noise to the positions
+below the pruning limit onto live ones, drawn in proportion to opacity, and adds copies of such draws; the N that share
+a place get the opacity and the size that keep their sum as it was. Every iteration adds noise to the positions
 (stochastic gradient Langevin dynamics), shaped by the covariance and large only for nearly transparent Gaussians. Two
 decays, of opacity and of size, let those die that the photos do not need.
 
@@ -21,10 +21,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.densify import Growth, rotate
+from splatpipe.pipeline.train.densify import DensitySchedule, Growth, rotate
 from splatpipe.pipeline.train.density.strategy import Density, DensityStep, Seen
 from splatpipe.pipeline.train.draws import POSITION_NOISE, RELOCATION, normal, uniform
-from splatpipe.pipeline.train.options import TrainConfig
 
 OPACITY_DECAY, SCALE_DECAY = 0.01, 0.01  # weights of the means over all Gaussians in the loss: published
 NOISE = 5e5  # of positions, times their learning rate and the covariance: published
@@ -40,7 +39,7 @@ class McmcDensity(Density):
 
     def __init__(self, count: int) -> None: ...
 
-    def observe(self, seen: Seen, options: TrainConfig) -> None:
+    def observe(self, seen: Seen, schedule: DensitySchedule) -> None:
         """Nothing."""
 
     def add_gradients(self, gaussians: Gaussians, visible: Bool[Tensor, " n"], extent: float) -> None:
@@ -52,21 +51,21 @@ class McmcDensity(Density):
             logits.grad += (OPACITY_DECAY / len(gaussians)) * visible * opacity * (1.0 - opacity)
             scales.grad += (SCALE_DECAY / (len(gaussians) * extent)) * visible[:, None] * torch.exp(scales)
 
-    def stepped(self, gaussians: Gaussians, options: TrainConfig, means_rate: float, iteration: int) -> None:
+    def stepped(self, gaussians: Gaussians, schedule: DensitySchedule, means_rate: float, iteration: int) -> None:
         """Disturb the positions."""
-        if options.densify:
-            disturb(gaussians, means_rate, options.seed, iteration)
+        if schedule.on:
+            disturb(gaussians, means_rate, schedule.seed, iteration)
 
     def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[Growth, dict[str, int]]:
         """Relocate the dead and add up to the limit."""
-        options = step.options
+        schedule = step.schedule
         opacity = torch.sigmoid(step.rendered.opacity_logits.double())
-        dead = (opacity < options.prune_opacity) | ~gaussians.finite() | step.unwanted
+        dead = (opacity < schedule.prune_opacity) | ~gaussians.finite() | step.unwanted
         live, moved = torch.nonzero(~dead).flatten(), torch.nonzero(dead).flatten()
         added = max(0, step.limit - len(gaussians))
         if len(live) == 0:
             moved, added = moved[:0], 0
-        parents = draw_parents(live, opacity[live], len(moved) + added, options.seed, step.iteration)
+        parents = draw_parents(live, opacity[live], len(moved) + added, schedule.seed, step.iteration)
         source = torch.cat((torch.arange(len(gaussians)), parents[len(moved) :]))
         source[moved] = parents[: len(moved)]
         copies = 1 + torch.bincount(parents, minlength=len(gaussians))

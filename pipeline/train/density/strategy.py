@@ -13,8 +13,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.densify import DensityStatistics, Growth, grow, prune_mask
-from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.densify import DensitySchedule, DensityStatistics, Growth, grow, prune_mask
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class DensityStep:
     """A step of density control.
 
     Attributes:
-        options: Resolved.
+        schedule: Of density control.
         extent: Of the scene, world units.
         limit: The most Gaussians that may be left.
         iteration: The one that ends.
@@ -59,7 +58,7 @@ class DensityStep:
         unwanted: (n,) Gaussians that have to go, whatever their size and opacity.
     """
 
-    options: TrainConfig
+    schedule: DensitySchedule
     extent: float
     limit: int
     iteration: int
@@ -80,7 +79,7 @@ class Density(ABC):
     def __init__(self, count: int) -> None: ...
 
     @abstractmethod
-    def observe(self, seen: Seen, options: TrainConfig) -> None:
+    def observe(self, seen: Seen, schedule: DensitySchedule) -> None:
         """Add an iteration that was rendered as ``look`` asks for."""
 
     @abstractmethod
@@ -94,12 +93,12 @@ class Density(ABC):
         """
 
     @abstractmethod
-    def stepped(self, gaussians: Gaussians, options: TrainConfig, means_rate: float, iteration: int) -> None:
+    def stepped(self, gaussians: Gaussians, schedule: DensitySchedule, means_rate: float, iteration: int) -> None:
         """Change the parameters after the optimiser has stepped them, in place.
 
         Args:
             gaussians: Detached.
-            options: Resolved.
+            schedule: Of density control.
             means_rate: Learning rate of positions, world units.
             iteration: Names the random numbers.
         """
@@ -139,18 +138,18 @@ class ScoredDensity(Density):
     def add_gradients(self, gaussians: Gaussians, visible: Bool[Tensor, " n"], extent: float) -> None:
         """Nothing."""
 
-    def stepped(self, gaussians: Gaussians, options: TrainConfig, means_rate: float, iteration: int) -> None:
+    def stepped(self, gaussians: Gaussians, schedule: DensitySchedule, means_rate: float, iteration: int) -> None:
         """Nothing: the optimiser alone moves the Gaussians."""
 
     def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[Growth, dict[str, int]]:
         """Prune, then grow to at most the limit."""
-        options, extent, iteration = step.options, step.extent, step.iteration
-        gone = prune_mask(step.rendered, options, extent, iteration, self.statistics.max_radius_px)
+        schedule, extent, iteration = step.schedule, step.extent, step.iteration
+        gone = prune_mask(step.rendered, schedule, extent, iteration, self.statistics.max_radius_px)
         if not bool((gone | step.unwanted).all()):  # a model is never emptied
             gone |= step.unwanted
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, self.statistics.score())
-        growth, counts = grow(gaussians, score, step.limit - len(gaussians) + pruned, options, extent, iteration)
+        growth, counts = grow(gaussians, score, step.limit - len(gaussians) + pruned, schedule, extent, iteration)
         return growth.select(~gone[growth.source]), {**counts, "pruned": pruned}
 
     def restart(self, count: int) -> None:
@@ -168,7 +167,7 @@ class ScoredDensity(Density):
                 raise RuntimeError(f"{name} is {tuple(arrays[name].shape)}, not {tuple(tensor.shape)}")
             tensor.copy_(arrays[name])
 
-    def observe_radii(self, seen: Seen, options: TrainConfig) -> None:
+    def observe_radii(self, seen: Seen, schedule: DensitySchedule) -> None:
         """Add the sizes on screen where pruning looks at them."""
-        if options.prune_screen_px > 0.0:
+        if schedule.prune_screen_px > 0.0:
             self.statistics.observe_radii(seen.rendered.radii)

@@ -1,0 +1,139 @@
+"""The schedule of a training: what is done from which iteration on, resolved once from options and photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
+
+FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
+FEW_DROPOUT = 0.2
+SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings
+RESET_EVERY = 3000  # iterations, published: what is reset needs them to come back
+BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the forecast, but not into noise
+
+
+@dataclass(frozen=True)
+class _Strategy:
+    """What a strategy of density control takes.
+
+    Attributes:
+        gradient: Score above which Gaussians are densified: image-plane gradient (NDC).
+        until: Last step, as a share of the run.
+        resets: Runs of fewer iterations have no opacity resets; None: no run has.
+    """
+
+    gradient: float
+    until: float = 0.5
+    resets: int | None = SHORT_RUN
+
+
+_STRATEGIES = {
+    "published": _Strategy(2e-4, resets=0),
+    "absolute": _Strategy(1.2e-3),
+    "mcmc": _Strategy(1.0, until=25 / 30, resets=None),  # it has no score
+}
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What changes in the course of a training, and when.
+
+    Attributes:
+        iterations: Until the rates' last values.
+        seed: Of everything random.
+        sh_degree: Degree of the spherical harmonics at the end.
+        sh_every: Iterations until one degree more is trained.
+        coarse_levels: How often photos are halved at the start.
+        coarse_until: Iteration from which they have their full size.
+        dropout: Share of the Gaussians left out at the end.
+        rates: Learning rates.
+        density: Of density control.
+    """
+
+    iterations: int
+    seed: int
+    sh_degree: int
+    sh_every: int
+    coarse_levels: int
+    coarse_until: int
+    dropout: float
+    rates: Rates
+    density: DensitySchedule
+
+    @staticmethod
+    def from_json(fields: Mapping[str, Any]) -> Schedule:
+        """Read ``dataclasses.asdict``'s values back.
+
+        Raises:
+            KeyError, TypeError: if they are no schedule's.
+        """
+        parts = {"rates": Rates(**fields["rates"]), "density": DensitySchedule(**fields["density"])}
+        return Schedule(**{**fields, **parts})
+
+    def sh_degree_at(self, iteration: int) -> int:
+        """The degree trained at an iteration (from 1): one more every ``sh_every``."""
+        return min(self.sh_degree, iteration // self.sh_every)
+
+    def coarse_level_at(self, iteration: int) -> int:
+        """How often an iteration's photo (from 1) is halved: equal shares of ``coarse_until``, coarsest first."""
+        if iteration > self.coarse_until:
+            return 0
+        return self.coarse_levels - (iteration - 1) * self.coarse_levels // self.coarse_until
+
+    def coarse_levels_to(self, last: int) -> list[int]:
+        """``coarse_level_at`` for every iteration up to the last."""
+        return [self.coarse_level_at(iteration) for iteration in range(1, last + 1)]
+
+    def means_rate(self, place: int) -> float:
+        """Learning rate of the positions at a place in the schedule, times the scene's extent."""
+        return self.rates.means_at(place / self.iterations)
+
+
+def share_of_few(photos: int) -> float:
+    """How much of what few photos need a training takes: all of it up to FEW_PHOTOS, nothing from MANY_PHOTOS on."""
+    return min(1.0, max(0.0, (MANY_PHOTOS - photos) / (MANY_PHOTOS - FEW_PHOTOS)))
+
+
+def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> Schedule:
+    """The published schedule, changed for short runs and few photos.
+
+    Args:
+        config: The options.
+        photos: That are trained on.
+    """
+    run = config.iterations
+    density = _density(config)
+    return Schedule(
+        iterations=run,
+        seed=config.seed,
+        sh_degree=config.sh_degree,
+        sh_every=max(1, min(1000, run // 5)),
+        coarse_levels=config.coarse_levels,
+        coarse_until=int(run * _STRATEGIES[config.density].until),
+        dropout=round(FEW_DROPOUT * share_of_few(photos), 4) if config.dropout == "auto" else config.dropout,
+        rates=PUBLISHED if config.density == "published" else rates_of(run),
+        density=density,
+    )
+
+
+def _density(config: TrainConfig) -> DensitySchedule:
+    run, strategy = config.iterations, _STRATEGIES[config.density]
+    published = config.density == "published"
+    resets = strategy.resets is not None and run >= strategy.resets
+    return DensitySchedule(
+        on=config.densify,
+        seed=config.seed,
+        cap=config.max_gaussians,
+        first=max(1, min(500, run // 5)),
+        last=max(1, int(run * strategy.until)),
+        every=max(1, min(100, run // 10)),
+        gradient=strategy.gradient * (BUDGET_SHARE if config.time_budget_s else 1.0),
+        reset_every=RESET_EVERY if resets else 0,
+        prune_screen_px=PRUNE_SCREEN_PX if published else 0.0,
+        prune_free_space=config.prune_free_space,
+    )
