@@ -87,9 +87,8 @@ def same_places(
     z = depth[rows, columns].astype(np.float64)
     here = np.stack([columns + 0.5, rows + 0.5], axis=1)[z > 0.0]
     z = z[z > 0.0]
-    rays = np.append((here - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((len(here), 1)), axis=1)
-    world = (z[:, None] * rays - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
-    ahead = world @ following.cam_from_world[2, :3] + following.cam_from_world[2, 3]
+    world = camera.unproject(here, z)
+    ahead = following.depths(world)
     here, world, ahead = here[ahead > 0.0], world[ahead > 0.0], ahead[ahead > 0.0]
     there = following.project(world)
     inside = ((there >= 1.0) & (there <= [following.width - 1.0, following.height - 1.0])).all(axis=1)
@@ -128,10 +127,7 @@ class Surroundings:
     def look(self, frame: Frame, index: int) -> Row:
         """How near a frame's things are, between photo ``index`` and the next."""
         points = np.vstack(self.seen[index : index + 2])
-        z = points @ frame.camera.cam_from_world[2, :3] + frame.camera.cam_from_world[2, 3]
-        points, z = points[z > 0.0], z[z > 0.0]
-        pixels = frame.camera.project(points)
-        z = z[((pixels >= 0.0) & (pixels <= [frame.camera.width, frame.camera.height])).all(axis=1)]
+        _, _, z = frame.camera.in_view(points)
         limit = IN_THE_AIR * float(np.quantile(z, NEAREST)) if z.size else 0.0
         photos = [median for median in self.medians[index : index + 2] if median is not None]
         median = _median(frame.depth)

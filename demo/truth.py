@@ -92,7 +92,7 @@ def _boxes(camera: Camera, corners: Triangles) -> list[list[int]]:
     z = corners[..., 2:]
     ahead = (z > 0.0).all(axis=(1, 2))
     safe = np.where(ahead[:, None, None], z, 1.0)
-    places = corners[..., :2] / safe * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    places = camera.pixels_of(corners[..., :2] / safe)
     limit = np.array([camera.width, camera.height])
     low = np.clip(np.floor(places.min(axis=1) - 0.5), 0, limit)
     high = np.clip(np.ceil(places.max(axis=1) + 0.5), 0, limit)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.splat.sky_mask import agreed, find_skies, find_sky, points_in, up_of, votes_of
+from splatpipe.pipeline.splat.sky_mask import agreed, find_skies, find_sky, up_of, votes_of
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
@@ -16,7 +16,7 @@ WHITE = (0.92, 0.92, 0.91)
 
 
 def found(photo: skies.SkyPhoto, points: np.ndarray) -> np.ndarray:
-    return find_sky(photo, points_in(photo.camera, points), skies.UP)
+    return find_sky(photo, photo.camera.in_view(points)[1], skies.UP)
 
 
 @pytest.mark.parametrize("colours", [skies.BLUE, skies.OVERCAST])
@@ -79,7 +79,7 @@ def test_few_wrong_points_in_the_sky_cost_no_more_than_their_surroundings() -> N
     points = np.concatenate([skies.points_on(), wrong])
     mask = found(photo, points)
     assert skies.overlap(mask, truth) > 0.94
-    columns, rows = points_in(photo.camera, wrong).astype(int).T
+    columns, rows = photo.camera.in_view(wrong)[1].astype(int).T
     assert len(rows) == 3 and not mask[rows, columns].any()
 
 

@@ -58,7 +58,7 @@ class Capture:
         """Median depth of each photo's points, world units; NaN where it sees none."""
         medians = np.full(len(self.cameras), np.nan)
         for number, (camera, rows) in enumerate(zip(self.cameras, self.seen, strict=True)):
-            z = self.points[rows] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+            z = camera.depths(self.points[rows])
             z = z[np.isfinite(z) & (z > 0.0)]
             medians[number] = np.median(z) if len(z) else np.nan
         return medians

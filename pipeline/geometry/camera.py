@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,29 @@ class Camera:
             points: World points; those at or behind the camera's plane have no meaningful projection.
         """
         in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
-        in_image = in_camera[:, :2] / in_camera[:, 2:]
-        return np.asarray(in_image * [self.fx, self.fy] + [self.cx, self.cy])
+        return self.pixels_of(in_camera[:, :2] / in_camera[:, 2:])
+
+    def pixels_of(self, rays: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
+        """Pixels of rays, which are x / z and y / z in the camera."""
+        return np.asarray(rays * [self.fx, self.fy] + [self.cx, self.cy])
+
+    def in_view(
+        self, points: Float64[np.ndarray, "n 3"]
+    ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
+        """Which world points lie in front of the camera and in its picture: their rows, their pixels, their depths."""
+        depths = self.depths(points)
+        rows = np.flatnonzero((depths > 0.0) & np.isfinite(depths))
+        pixels = self.project(points[rows])
+        inside = ((pixels >= 0.0) & (pixels < [self.width, self.height])).all(axis=1)
+        return rows[inside], pixels[inside], depths[rows[inside]]
+
+    def unproject(
+        self, pixels: Float64[np.ndarray, "n 2"], depths: Float64[np.ndarray, " n"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        """World points of pixels at depths along the view axis: what ``project`` brings back to them."""
+        x, y = (pixels - [self.cx, self.cy]).T / np.array([[self.fx], [self.fy]])
+        rays = np.stack([x, y, np.ones(len(pixels))], axis=1)
+        return np.asarray((rays * depths[:, None] - self.cam_from_world[:3, 3]) @ self.cam_from_world[:3, :3])
 
 
 def rotation_matrix(rotation_vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:

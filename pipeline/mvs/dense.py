@@ -151,7 +151,7 @@ def _agreed(capture: _Capture, number: int) -> DensePoints | None:
     free = depths.inverse > 0.0
     rows, columns = np.nonzero(free)
     inverse = depths.inverse[rows, columns].astype(np.float64)
-    points = unproject(camera, columns + 0.5, rows + 0.5, 1.0 / inverse)
+    points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), 1.0 / inverse)
     total, votes = points.copy(), np.ones(len(points))
     for other in capture.near[number]:
         theirs = _kept(capture, other)
@@ -173,26 +173,14 @@ def _agreed(capture: _Capture, number: int) -> DensePoints | None:
     return DensePoints(xyz, colour[rows[chosen], columns[chosen]], scores[first], spacing)
 
 
-def unproject(
-    camera: Camera, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], depth: Float64[np.ndarray, " n"]
-) -> Float64[np.ndarray, "n 3"]:
-    """World points of pixels at depths along the camera's z."""
-    in_camera = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(depth)], axis=1)
-    return np.asarray((in_camera * depth[:, None] - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3])
-
-
 def _confirmed(
     points: Float64[np.ndarray, "n 3"], camera: Camera, inverse: Float32[np.ndarray, "h w"]
 ) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Points where a camera's own depths put them along its rays, and whether that is where they are."""
-    depth = points @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
-    ahead = depth > 0.0
-    x, y = np.full((2, len(points)), -1.0)
-    x[ahead], y[ahead] = camera.project(points[ahead]).T
-    inside = (x >= 0.0) & (x < camera.width) & (y >= 0.0) & (y < camera.height)
+    rows, pixels, depth = camera.in_view(points)
+    x, y = pixels.T.astype(np.int64)
     ratio = np.zeros(len(points))  # of the point's depth over the one that the camera found
-    at = inverse[y[inside].astype(np.int64), x[inside].astype(np.int64)]
-    ratio[inside] = depth[inside] * at
+    ratio[rows] = depth * inverse[y, x]
     agrees = np.abs(ratio - 1.0) < TOLERANCE
     centre = camera.centre()
     moved = centre + (points - centre) / np.where(agrees, ratio, 1.0)[:, None]

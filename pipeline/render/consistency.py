@@ -91,14 +91,9 @@ def depth_differences(
     z = depth[rows, columns].astype(np.float64)
     usable = np.isfinite(z) & (z > 0.0)
     rows, columns, z = rows[usable], columns[usable], z[usable]
-    rays = np.stack(((columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(z))), 1)
-    world = (z[:, None] * rays - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
-    there = world @ neighbour.cam_from_world[2, :3] + neighbour.cam_from_world[2, 3]
-    front = there > 0.0
-    world, there = world[front], there[front]
-    pixels = neighbour.project(world)
-    inside = ((pixels >= 0.0) & (pixels < [neighbour.width, neighbour.height])).all(axis=1)
-    best = _best_around(pixels[inside].astype(np.int64), there[inside], neighbour_depth)
+    world = camera.unproject(np.stack((columns + 0.5, rows + 0.5), axis=1), z)
+    _, pixels, there = neighbour.in_view(world)
+    best = _best_around(pixels.astype(np.int64), there, neighbour_depth)
     return best[best >= -AGREEMENT]
 
 

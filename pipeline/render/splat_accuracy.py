@@ -175,12 +175,11 @@ def _chosen(point: Surveyed, held_out: Sequence[str]) -> list[Observation]:
 
 def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Frame) -> list[dict[str, Any]]:
     """Where the splat's depth puts an observation, in the world; nothing where it has none."""
-    pixel = seen.ray * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    pixel = camera.pixels_of(seen.ray)
     z = depth_at(depth, pixel)
     if z is None:
         return []
-    in_model = (z * np.append(seen.ray, 1.0) - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
-    place = frame.world_from_model.apply(in_model[None])[0]
+    place = frame.world_from_model.apply(camera.unproject(pixel[None], np.array([z])))[0]
     return [{"photo": seen.photo, "depth_m": z * frame.world_from_model.scale, "place": place}]
 
 

@@ -75,12 +75,9 @@ def light_stopped(gaussians: Gaussians, camera: Camera, xyz: Float64[np.ndarray,
     Returns:
         The accumulated opacity of each point in the picture, in the order of their depths.
     """
-    depths = camera.depths(xyz)
-    xyz, depths = xyz[depths > 0.0], depths[depths > 0.0]
-    pixels = camera.project(xyz)
-    inside = ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1)
-    order = np.argsort(depths[inside], kind="stable")
-    pixels, depths = pixels[inside][order], depths[inside][order]
+    _, pixels, depths = camera.in_view(xyz)
+    order = np.argsort(depths, kind="stable")
+    pixels, depths = pixels[order], depths[order]
     reach = camera.depths(gaussians.means.detach().numpy().astype(np.float64))
     reach += spread_along(gaussians, np.arange(len(gaussians)), camera.cam_from_world[2, :3])
     stopped = np.zeros(len(depths))

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.focal import adjust_within
 from splatpipe.pipeline.sfm.judging import TRUSTED_SOURCES
 from splatpipe.pipeline.sfm.verified import Verified
@@ -121,7 +122,7 @@ def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
             if seen:
                 pose = np.asarray(image.cam_from_world().matrix(), np.float64)
                 places = np.array([model.points3D[point.point3D_id].xyz for point in seen])
-                shown = np.asarray(camera.img_from_cam(places @ pose[:, :3].T + pose[:, 3]), np.float64)
+                shown, _ = project_through_lens(camera, pose, places)
                 off = np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1)
                 total, count = total + float(off[np.isfinite(off)].sum()), count + int(np.isfinite(off).sum())
         if count and math.isfinite(total):

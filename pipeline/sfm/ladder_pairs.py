@@ -15,6 +15,7 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.capture import Capture
 from splatpipe.pipeline.sfm.matching import match_pairs
 from splatpipe.pipeline.sfm.pairs import Pair
@@ -132,14 +133,8 @@ def _seen_alike(
     centre: Float64[np.ndarray, " 3"],
 ) -> Bool[np.ndarray, " m"]:
     """Which points lie in a picture and are seen at nearly the angle and distance at which their owners see them."""
-    pose = image.cam_from_world().matrix()
-    in_camera = points @ pose[:, :3].T + pose[:, 3]
-    inside = in_camera[:, 2] > 0.0
-    pixels = np.full((len(points), 2), -1.0)
-    if inside.any():
-        pixels[inside] = camera.img_from_cam(in_camera[inside])
-    size = np.array([camera.width, camera.height])
-    inside &= ((pixels >= 0.0) & (pixels < size)).all(axis=1)
+    pixels, _ = project_through_lens(camera, image.cam_from_world().matrix(), points)
+    inside = ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1)  # nowhere behind the camera
     here, there = points - centre, points - owners
     far, near = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
     cosines = (here * there).sum(axis=1) / np.maximum(far * near, 1e-12)

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float32, Float64, Int64
 
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.verified import Verified
 
 ERROR = 0.003  # of the longer side, within which a point has to lie: COLMAP's 12 pixels of a photo of 4,000
@@ -193,10 +194,6 @@ def _explained(
     limit_px: float,
 ) -> Bool[np.ndarray, " k"]:
     """Which points a pose puts where they were seen."""
-    matrix = pose.matrix()
-    in_camera = spots @ matrix[:, :3].T + matrix[:, 3]
-    found = in_camera[:, 2] > 0.0
-    if found.any():
-        errors = np.linalg.norm(camera.img_from_cam(in_camera[found]) - places[found], axis=1)
-        found[found] = errors <= limit_px
-    return np.asarray(found)
+    shown, _ = project_through_lens(camera, pose.matrix(), spots)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.linalg.norm(shown - places, axis=1) <= limit_px)

@@ -174,13 +174,9 @@ def _cells(
     camera: Camera, points: Float64[np.ndarray, "n 3"]
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"], Int64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
     """Which points fall into a photo: their rows, their pixels, their cells (row, column), and their depths."""
-    depths = camera.depths(points)
-    rows = np.flatnonzero((depths > 0.0) & np.isfinite(depths))
-    pixels = camera.project(points[rows])
-    inside = ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1)
-    rows, pixels = rows[inside], pixels[inside]
+    rows, pixels, depths = camera.in_view(points)
     cells = (pixels[:, ::-1] * (CELLS / max(camera.width, camera.height))).astype(np.int64)
-    return rows, pixels, np.minimum(cells, np.array(_grid(camera)) - 1), depths[rows]
+    return rows, pixels, np.minimum(cells, np.array(_grid(camera)) - 1), depths
 
 
 def _judge(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:

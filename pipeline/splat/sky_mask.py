@@ -121,7 +121,7 @@ def find_skies(
 
     def search(index: int) -> tuple[SkyMask, Votes, bool]:
         seen = photo(index)
-        mask = find_sky(seen, points_in(seen.camera, points), up) if seen.drawn is None else seen.drawn
+        mask = find_sky(seen, seen.camera.in_view(points)[1], up) if seen.drawn is None else seen.drawn
         return SkyMask.packed(mask), votes_of(seen.camera, mask, up), seen.drawn is not None
 
     searched = list(ordered_map(search, range(len(cameras)), threads))
@@ -193,16 +193,6 @@ def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
     y = (step * np.arange(-((1 - camera.height) // step) + 1) + 0.5 - camera.cy) / camera.fy
     rotation = camera.cam_from_world[:3, :3]
     return np.asarray(x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2])
-
-
-def points_in(camera: Camera, points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n 2"]:
-    """Where points in front of a camera project to, those within its picture, pixels."""
-    in_front = points[points @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3] > 0.0]
-    if len(in_front) == 0:
-        return np.zeros((0, 2))
-    places = camera.project(in_front)
-    inside = np.isfinite(places).all(axis=1) & (places >= 0.0).all(axis=1)
-    return np.asarray(places[inside & (places < [camera.width, camera.height]).all(axis=1)])
 
 
 def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarray, " 3"]) -> Votes:

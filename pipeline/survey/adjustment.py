@@ -20,6 +20,7 @@ import pycolmap
 import pycolmap.cost_functions
 from jaxtyping import Float64
 
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity, cross_matrix, fit_similarity
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
 from splatpipe.pipeline.sfm.lens_blocks import hold, keep_shape
@@ -144,12 +145,12 @@ def feature_sigma(model: pycolmap.Reconstruction) -> float:
     errors = []
     for number in sorted(model.reg_image_ids()):
         image = model.images[number]
-        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
         seen = [point for point in image.points2D if point.has_point3D()]
         if not seen:
             continue
         xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
-        shown = camera.img_from_cam(xyz @ pose.rotation.matrix().T + pose.translation)
+        shown, _ = project_through_lens(camera, pose, xyz)
         errors.append(np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1))
     squares = np.concatenate([np.zeros(0), *errors]) ** 2
     squares = squares[np.isfinite(squares)]
@@ -289,8 +290,8 @@ def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) ->
         seen = [place[p.point3D_id] for p in image.points2D if p.has_point3D() and p.point3D_id in place]
         if not seen:
             continue
-        camera, pose = before.cameras[image.camera_id], image.cam_from_world()
-        shown = [camera.img_from_cam(xyz[seen] @ pose.rotation.matrix().T + pose.translation) for xyz in (old, back)]
+        camera, pose = before.cameras[image.camera_id], image.cam_from_world().matrix()
+        shown = [project_through_lens(camera, pose, xyz[seen])[0] for xyz in (old, back)]
         squares.append(((shown[1] - shown[0]) ** 2).sum(axis=1))
     together = np.concatenate(squares)
     return float(np.sqrt(together[np.isfinite(together)].mean()))

@@ -14,6 +14,7 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.photos.names import match_names
 
 RAY_STEP = 1e-5  # of x/z: a hundredth of a pixel, for differences
@@ -50,11 +51,8 @@ class View:
 
     def pixel(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 2"]:
         """Where the photo shows a point of the model; not finite behind the camera."""
-        seen = self.cam_from_model[:, :3] @ point + self.cam_from_model[:, 3]
-        if seen[2] <= 0.0:
-            return np.full(2, np.nan)
-        found = self.camera.img_from_cam(seen[None])
-        return np.full(2, np.nan) if found is None else np.asarray(found, np.float64).reshape(2) / self.scale
+        pixels, _ = project_through_lens(self.camera, self.cam_from_model, point[None])
+        return np.asarray(pixels[0] / self.scale)
 
 
 @dataclass(frozen=True)

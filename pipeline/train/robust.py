@@ -123,7 +123,8 @@ class Robust:
         if len(u) == 0 or not self.cameras:
             return result
         z = (depth_sum[asked] / alpha[asked]).numpy()
-        places = _unproject(camera, (u + 0.5) / GRID, (v + 0.5) / GRID, z)
+        cell = np.array([camera.width, camera.height]) / GRID
+        places = camera.unproject((np.stack((u, v), axis=1) + 0.5) * cell, z)
         agree, seen = np.zeros(len(u), np.int64), np.zeros(len(u), np.int64)
         limit = float(self.threshold)
         for other in self._witnesses(row):
@@ -221,21 +222,10 @@ def _near(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
     return functional.max_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0.0
 
 
-def _unproject(camera: Camera, across: np.ndarray, down: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """World points (n, 3) at shares of a photo's width and height, and depths along its axis."""
-    x = (across * camera.width - camera.cx) / camera.fx * z
-    y = (down * camera.height - camera.cy) / camera.fy * z
-    pose = camera.cam_from_world
-    return np.asarray((np.stack((x, y, z), axis=1) - pose[:3, 3]) @ pose[:3, :3])
-
-
 def _looked_up(scores: np.ndarray, camera: Camera, places: np.ndarray) -> np.ndarray:
     """A photo's residuals at world points, ``UNKNOWN`` at those that it does not show."""
-    in_camera = places @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    ahead = in_camera[:, 2] > 0.0
-    z = np.where(ahead, in_camera[:, 2], 1.0)
-    across = (in_camera[:, 0] / z * camera.fx + camera.cx) / camera.width
-    down = (in_camera[:, 1] / z * camera.fy + camera.cy) / camera.height
-    inside = ahead & (across >= 0.0) & (across < 1.0) & (down >= 0.0) & (down < 1.0)
-    u, v = np.where(inside, across, 0.0) * GRID, np.where(inside, down, 0.0) * GRID
-    return np.where(inside, scores[v.astype(np.int64), u.astype(np.int64)], UNKNOWN)
+    found = np.full(len(places), UNKNOWN)
+    rows, pixels, _ = camera.in_view(places)
+    u, v = (pixels * (GRID / np.array([camera.width, camera.height]))).astype(np.int64).T.clip(max=GRID - 1)
+    found[rows] = scores[v, u]
+    return found

@@ -127,14 +127,7 @@ def start_camera(scene: ViewerScene) -> int:
     """The camera to begin from: the one that shows the most sparse points, the first of equals."""
     if not len(scene.points):
         return 0
-    return int(np.argmax([_points_shown(shown.camera, scene.points) for shown in scene.cameras]))
-
-
-def _points_shown(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> int:
-    in_camera = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    in_camera = in_camera[in_camera[:, 2] > 0.0]
-    pixels = in_camera[:, :2] / in_camera[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    return int(((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1).sum())
+    return int(np.argmax([len(shown.camera.in_view(scene.points)[0]) for shown in scene.cameras]))
 
 
 def _facts(scene: ViewerScene) -> dict[str, Any]:

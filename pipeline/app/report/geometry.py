@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity
 
 BORDER_STEPS = 6  # rays along each side of a picture, for its footprint
@@ -232,7 +233,7 @@ def _fields(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) ->
             observed = np.array([point.xy for point in seen], np.float64)
             xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen], np.float64)
             pose = np.asarray(image.cam_from_world().matrix(), np.float64)
-            projected = np.asarray(image.camera.img_from_cam(xyz @ pose[:, :3].T + pose[:, 3]), np.float64)
+            projected, _ = project_through_lens(image.camera, pose, xyz)
             by_camera.setdefault(image.camera_id, []).append((observed, projected - observed))
     fields = []
     for number, seen in sorted(by_camera.items()):

@@ -60,7 +60,11 @@ class Live:
             held_out = set(checkpoint_render.held_out_of(opened))
             model: JSON = None
             if source is not None and views:
-                model = {"kind": source.kind, "stamp": source.stamp, "iteration": checkpoint_render.iteration_of(source)}
+                model = {
+                    "kind": source.kind,
+                    "stamp": source.stamp,
+                    "iteration": checkpoint_render.iteration_of(source),
+                }
                 model["in_3d"] = source.rendering is not None
             return {
                 "name": self._run.name,

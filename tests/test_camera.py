@@ -1,0 +1,54 @@
+"""Projection, one for pinholes and one for lenses: each other's inverse, and what pycolmap says."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
+
+
+@pytest.fixture
+def camera() -> Camera:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_matrix(np.array([0.3, -0.2, 0.9])), [0.4, -0.3, 2.0]
+    return Camera("a.jpg", 90, 60, 80.0, 85.0, 44.0, 31.0, pose)
+
+
+def pixels_everywhere() -> np.ndarray:
+    return np.random.default_rng(0).uniform([0.0, 0.0], [90.0, 60.0], (40, 2))
+
+
+def test_unprojected_pixels_project_back_and_lie_at_their_depths(camera: Camera) -> None:
+    pixels, depths = pixels_everywhere(), np.linspace(0.5, 30.0, 40)
+    places = camera.unproject(pixels, depths)
+    np.testing.assert_allclose(camera.project(places), pixels, atol=1e-10)
+    np.testing.assert_allclose(camera.depths(places), depths, atol=1e-12)
+
+
+def test_only_what_is_in_front_and_in_the_picture_is_in_view(camera: Camera) -> None:
+    corners = np.array([[0.001, 0.001], [89.999, 59.999], [-0.001, 5.0], [90.001, 5.0], [5.0, 60.001], [45.0, 30.0]])
+    places = camera.unproject(corners, np.full(6, 3.0))
+    behind = camera.unproject(corners[5:], np.array([-3.0]))
+    rows, pixels, depths = camera.in_view(np.vstack([behind, places, [[np.nan, 0.0, 0.0]], [[np.inf, 0.0, 0.0]]]))
+    assert rows.tolist() == [1, 2, 6]
+    np.testing.assert_allclose(pixels, corners[[0, 1, 5]], atol=1e-6)
+    np.testing.assert_allclose(depths, 3.0)
+
+
+def test_a_lens_without_distortion_is_the_pinhole(camera: Camera) -> None:
+    lens = pycolmap.Camera(model="PINHOLE", width=90, height=60, params=[80.0, 85.0, 44.0, 31.0])
+    places = camera.unproject(pixels_everywhere(), np.linspace(-5.0, 30.0, 40))
+    pixels, depths = project_through_lens(lens, camera.cam_from_world[:3], places)
+    behind = depths <= 0.0
+    assert 0 < behind.sum() < 20 and np.isnan(pixels[behind]).all()
+    np.testing.assert_allclose(pixels[~behind], camera.project(places[~behind]), atol=1e-10)
+    assert np.isnan(project_through_lens(lens, camera.cam_from_world[:3], places[behind])[0]).all()
+
+
+def test_a_distorted_lens_is_colmaps(camera: Camera) -> None:
+    lens = pycolmap.Camera(model="OPENCV", width=90, height=60, params=[80.0, 85.0, 44.0, 31.0, -0.1, 0.02, 1e-3, 2e-3])
+    places = camera.unproject(pixels_everywhere(), np.full(40, 4.0))
+    pose = camera.cam_from_world[:3]
+    seen = np.array([lens.img_from_cam(pose[:, :3] @ place + pose[:, 3]) for place in places])
+    np.testing.assert_allclose(project_through_lens(lens, pose, places)[0], seen, atol=1e-10)
