@@ -21,6 +21,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train import plan as planned
 from splatpipe.pipeline.train.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
@@ -163,18 +164,20 @@ def test_killed_training_with_every_technique_ends_with_the_same_bits(scene: Pat
         assert (tmp_path / "killed" / part).read_bytes() == (whole / part).read_bytes()
 
 
-@pytest.mark.parametrize(("density", "when"), [("published", 18), ("mcmc", 35)])
-def test_killed_training_of_every_strategy_ends_with_the_same_bits(
-    scene: Path, undisturbed: Path, tmp_path: Path, density: str, when: int
+def test_killed_training_by_the_published_method_ends_with_the_same_bits(
+    scene: Path, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = TrainConfig.model_validate(QUICK.model_dump() | {"density": density})
+    limits = {"first": 10, "last": 60, "every": 10, "reset_every": 25, "gradient": 1e-6}
+    monkeypatch.setattr(planned, "resolve_schedule", tiny_scene.resolver(**limits))
+    config = QUICK.model_copy(update={"density": "published"})
     whole = trained(scene, tmp_path / "whole", config)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
-        die_at(patch, when, killed)
+        die_at(patch, 38, killed)
         trained(scene, tmp_path / "killed", config)
     assert digest(trained(scene, tmp_path / "killed", config, threads=2)) == digest(whole) != digest(undisturbed)
-    events = json.loads((whole / "history.json").read_text())["density"]
-    assert sum(event["added"] + event["cloned"] + event["split"] for event in events) > 0
+    history = json.loads((whole / "history.json").read_text())
+    assert history["resets"] == [25, 50]
+    assert sum(event["cloned"] + event["split"] for event in history["density"]) > 0
 
 
 def test_interrupt_saves_a_checkpoint_and_is_passed_on(scene: Path, undisturbed: Path, tmp_path: Path) -> None:

@@ -59,14 +59,12 @@ def test_short_runs_have_every_phase_and_no_reset(iterations: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("density", "gradient", "until", "reset"),
-    [("published", 2e-4, 15_000, 3000), ("absolute", 1.2e-3, 15_000, 3000), ("mcmc", 1.0, 25_000, 0)],
+    ("density", "gradient"),
+    [("published", 2e-4), ("absolute", 1.2e-3)],
 )
-def test_each_strategy_of_density_control_has_its_defaults(
-    density: str, gradient: float, until: int, reset: int
-) -> None:
+def test_each_score_of_density_control_has_its_threshold(density: str, gradient: float) -> None:
     found = resolve_schedule(TrainConfig.model_validate({"density": density})).density
-    assert (found.gradient, found.last, found.reset_every) == (gradient, until, reset)
+    assert (found.gradient, found.last, found.reset_every) == (gradient, 15_000, 3000)
 
 
 def test_published_density_takes_the_rates_resets_and_pruning_of_that_method_however_short_the_run() -> None:

@@ -1,7 +1,7 @@
 """Adaptive density control: how Gaussians are cloned, split, pruned and their opacity reset, and how many there may be.
 
 Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023,
-section 5 and its published settings, changed in two ways whatever the score (which the strategies in `density/` make).
+section 5 and its published settings, changed in two ways whatever the score (see `density.py`).
 The number of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
 "Taming 3DGS", SIGGRAPH Asia 2024). And two that take the place of one have the opacity that lets as much light through
 as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024).
@@ -113,8 +113,6 @@ class DensityEvent:
         pruned: Gaussians removed.
         held_back: Gaussians that the schedule kept from being densified.
         gaussians: How many there are now.
-        relocated: Dead Gaussians that took the place of live ones.
-        added: Copies of live Gaussians that were drawn.
     """
 
     iteration: int
@@ -123,8 +121,6 @@ class DensityEvent:
     pruned: int
     held_back: int
     gaussians: int
-    relocated: int = 0
-    added: int = 0
 
     def to_json(self) -> dict[str, int]:
         """For `history.json`."""

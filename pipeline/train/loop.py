@@ -22,7 +22,6 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
-from splatpipe.pipeline.train.density import BLIND, Seen
 from splatpipe.pipeline.train.draws import BACKGROUND, ELSEWHERE, uniform
 from splatpipe.pipeline.train.dropout import dropped
 from splatpipe.pipeline.train.exposure import exposures_json
@@ -259,12 +258,11 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
     options = plan.options
     density = plan.schedule.density
     observed = density.on and iteration <= density.last
-    look = state.density.look if observed else BLIND
     place = place_in_schedule(plan, state.history.flat_at, iteration)
-    settings = render_options(plan, iteration, look.magnitudes)
+    settings = render_options(plan, iteration, observed and state.density.magnitudes)
     if spread := is_spread_counted(options, place):
         settings = replace(settings, depth=True, depth_origin=depth_origin(state.gaussians.means, photo.camera))
-    probe = state.probe() if look.probe else None
+    probe = state.probe() if observed else None
     model = dropped(state.rendered_model(options), plan.schedule, place)
     rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     photometric, penalties = losses(state, plan, photo, rendered, settings.background)
@@ -273,10 +271,9 @@ def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int)
         loss = loss + options.distortion_weight * spread_loss(rendered, settings.depth_origin, photo.camera)
     loss.backward()  # type: ignore[no-untyped-call]
     state.history.add_loss(float(photometric.detach()))
-    state.density.add_gradients(state.gaussians, rendered.visible, plan.extent)
     with torch.no_grad():
-        if observed:
-            state.density.observe(Seen(rendered, None if probe is None else probe.grad), density)
+        if probe is not None and probe.grad is not None:
+            state.density.observe(rendered, probe.grad, density)
         means_rate = plan.extent * plan.schedule.means_rate(place)
         state.step(rendered.visible, means_rate, plan.extent, plan.schedule)
         share = min(1.0, place / options.iterations)

@@ -70,10 +70,9 @@ class TrainConfig(StageConfig):
     """Start with photos halved this many times and double them on the way: faster, a little smoother."""
     densify: bool = True
     """Clone, split and prune Gaussians (adaptive density control)."""
-    density: Literal["published", "absolute", "mcmc"] = "absolute"
+    density: Literal["published", "absolute"] = "absolute"
     """Where Gaussians are added: where the screen gradient is large, summed as `absolute` magnitudes or as `published`,
-    which takes that method's rates, resets of opacity and pruning by size on screen, too; or `mcmc`: where opacity is
-    high, dead ones moving there."""
+    which takes that method's rates, resets of opacity and pruning by size on screen, too."""
     prune_free_space: NonNegativeInt = 1
     """Gaussians before the surface for at least so many photos, or right before a camera, are removed; 0 for never."""
     distortion_weight: NonNegativeFloat = 0.0

@@ -12,31 +12,12 @@ from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
 
 FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
 FEW_DROPOUT = 0.2
-SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings
+SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings; the published method has it
 RESET_EVERY = 3000  # iterations, published: what is reset needs them to come back
+UNTIL = 0.5  # of the run there is density control: published
+GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified, some six times the signed sum
+PUBLISHED_GRADIENT = 2e-4  # the same of the signed sum
 BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the forecast, but not into noise
-
-
-@dataclass(frozen=True)
-class _Strategy:
-    """What a strategy of density control takes.
-
-    Attributes:
-        gradient: Score above which Gaussians are densified: image-plane gradient (NDC).
-        until: Last step, as a share of the run.
-        resets: Runs of fewer iterations have no opacity resets; None: no run has.
-    """
-
-    gradient: float
-    until: float = 0.5
-    resets: int | None = SHORT_RUN
-
-
-_STRATEGIES = {
-    "published": _Strategy(2e-4, resets=0),
-    "absolute": _Strategy(1.2e-3),
-    "mcmc": _Strategy(1.0, until=25 / 30, resets=None),  # it has no score
-}
 
 
 @dataclass(frozen=True)
@@ -114,7 +95,7 @@ def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> Schedule
         sh_degree=config.sh_degree,
         sh_every=max(1, min(1000, run // 5)),
         coarse_levels=config.coarse_levels,
-        coarse_until=int(run * _STRATEGIES[config.density].until),
+        coarse_until=int(run * UNTIL),
         dropout=round(FEW_DROPOUT * share_of_few(photos), 4) if config.dropout == "auto" else config.dropout,
         rates=PUBLISHED if config.density == "published" else rates_of(run),
         density=density,
@@ -122,18 +103,17 @@ def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> Schedule
 
 
 def _density(config: TrainConfig) -> DensitySchedule:
-    run, strategy = config.iterations, _STRATEGIES[config.density]
-    published = config.density == "published"
-    resets = strategy.resets is not None and run >= strategy.resets
+    run, published = config.iterations, config.density == "published"
+    gradient = PUBLISHED_GRADIENT if published else GRADIENT
     return DensitySchedule(
         on=config.densify,
         seed=config.seed,
         cap=config.max_gaussians,
         first=max(1, min(500, run // 5)),
-        last=max(1, int(run * strategy.until)),
+        last=max(1, int(run * UNTIL)),
         every=max(1, min(100, run // 10)),
-        gradient=strategy.gradient * (BUDGET_SHARE if config.time_budget_s else 1.0),
-        reset_every=RESET_EVERY if resets else 0,
+        gradient=gradient * (BUDGET_SHARE if config.time_budget_s else 1.0),
+        reset_every=RESET_EVERY if published or run >= SHORT_RUN else 0,
         prune_screen_px=PRUNE_SCREEN_PX if published else 0.0,
         prune_free_space=config.prune_free_space,
     )

@@ -26,7 +26,7 @@ from splatpipe.pipeline.train.densify import (
     room_at,
     unchanged,
 )
-from splatpipe.pipeline.train.density import Density, DensityStep, make_density
+from splatpipe.pipeline.train.density import Density, DensityStep
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.options import TrainConfig
@@ -58,7 +58,7 @@ class TrainState:
     Attributes:
         gaussians: The model, raw; its tensors are leaves of autograd.
         adam: The optimiser's moments.
-        density: The strategy of density control, with what it has observed since its last step.
+        density: Density control, with what it has observed since its last step.
         history: What happened so far.
         iteration: The last whole one.
         seconds: Spent so far, over all runs; of no influence.
@@ -110,7 +110,8 @@ class TrainState:
     def of(gaussians: Gaussians, plan: Plan, history: History, sky: SkyModel | None) -> TrainState:
         """Gaussians with everything that the plan wants beside them, nothing of it trained."""
         options = plan.options
-        state = TrainState(gaussians, Adam(gaussians.tensors()), make_density(options, len(gaussians)), history)
+        density = Density(len(gaussians), options.density == "absolute")
+        state = TrainState(gaussians, Adam(gaussians.tensors()), density, history)
         state.exposure = Exposure(plan.train_views) if options.exposure == "affine" else None
         state.robust = Robust(plan.train_views) if options.robust else None
         state.sky = sky
@@ -156,7 +157,6 @@ class TrainState:
         for tensor in tensors.values():
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))
-        self.density.stepped(self.gaussians.detach(), schedule.density, means_rate, self.iteration + 1)
 
     def end_epoch(self, iteration: int, plan: Plan) -> None:
         """After the last iteration of an epoch, with `robust`: take its threshold."""
