@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 import torch
 
@@ -30,7 +29,6 @@ from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.web.options import ExportConfig
 from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
 
-Doubles = npt.NDArray[np.float64]
 Facts = dict[str, Any]
 
 VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy", "pyproj")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -48,7 +50,7 @@ def ply_comments(frame: Frame, antialias: bool) -> list[str]:
     ]
 
 
-def cameras_json(cameras: Sequence[Camera], frame: Frame) -> list[Facts]:
+def cameras_json(cameras: Sequence[Camera], frame: Frame) -> list[dict[str, Any]]:
     """The cameras as 3DGS viewers read them: world-from-camera rotation and centre, in the splat's frame."""
     listed = []
     for index, camera in enumerate(cameras):
@@ -68,7 +70,7 @@ def cameras_json(cameras: Sequence[Camera], frame: Frame) -> list[Facts]:
     return listed
 
 
-def pose_in_world(camera: Camera, frame: Frame) -> tuple[Doubles, Doubles]:
+def pose_in_world(camera: Camera, frame: Frame) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
     """A camera's world-from-camera rotation (3, 3) and centre (3,) in the world frame."""
     similarity = frame.world_from_model
     rotation = np.asarray(similarity.rotation) @ camera.cam_from_world[:3, :3].T

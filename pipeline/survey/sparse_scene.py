@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import trimesh
+from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import Points
@@ -40,7 +41,7 @@ def sparse_glb(points: Points, cameras: Sequence[Camera], frame: Frame) -> bytes
 def _frusta(cameras: Sequence[Camera], frame: Frame) -> trimesh.path.Path3D:
     poses = [pose_in_world(camera, frame) for camera in cameras]
     depth = FRUSTUM_PER_SPACING * _camera_spacing(np.array([centre for _, centre in poses]))
-    vertices: list[Doubles] = []
+    vertices: list[Float64[np.ndarray, "5 3"]] = []
     lines: list[list[int]] = []
     for camera, (rotation, centre) in zip(cameras, poses, strict=True):
         u = (np.array([0.0, camera.width, camera.width, 0.0]) - camera.cx) / camera.fx
@@ -55,7 +56,7 @@ def _frusta(cameras: Sequence[Camera], frame: Frame) -> trimesh.path.Path3D:
     return trimesh.path.Path3D(entities, vertices=np.vstack(vertices), process=False, colors=colours)
 
 
-def _camera_spacing(centres: Doubles) -> float:
+def _camera_spacing(centres: Float64[np.ndarray, "n 3"]) -> float:
     """Median distance from a camera to its nearest neighbour elsewhere, world units; 1 for a single place."""
     nearest = []
     for centre in centres:
