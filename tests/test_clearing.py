@@ -66,7 +66,7 @@ def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: Free
 
 
 @pytest.mark.parametrize("density", ["published", "absolute"])
-def test_every_strategy_takes_it_away(dataset: Path, space: FreeSpace, density: str) -> None:
+def test_density_control_takes_it_away(dataset: Path, space: FreeSpace, density: str) -> None:
     config = TrainConfig.model_validate({"prune_free_space": 2, "density": density})
     plan = make_plan(config, load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     state = TrainState.begin(haze_and_wall(), plan)

@@ -15,7 +15,7 @@ FEW_DROPOUT = 0.2
 SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings; the published method has it
 RESET_EVERY = 3000  # iterations, published: what is reset needs them to come back
 UNTIL = 0.5  # of the run there is density control: published
-GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified, some six times the signed sum
+GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified
 PUBLISHED_GRADIENT = 2e-4  # the same of the signed sum
 BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the forecast, but not into noise
 
@@ -88,7 +88,6 @@ def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> Schedule
         photos: That are trained on.
     """
     run = config.iterations
-    density = _density(config)
     return Schedule(
         iterations=run,
         seed=config.seed,
@@ -98,7 +97,7 @@ def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> Schedule
         coarse_until=int(run * UNTIL),
         dropout=round(FEW_DROPOUT * share_of_few(photos), 4) if config.dropout == "auto" else config.dropout,
         rates=PUBLISHED if config.density == "published" else rates_of(run),
-        density=density,
+        density=_density(config),
     )
 
 

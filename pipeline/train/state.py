@@ -196,7 +196,7 @@ class TrainState:
             logits.clamp_(max=raw_opacity_limits(self.gaussians, self._filter(self.sampling), RESET_OPACITY))
 
     def _densify(self, plan: Plan, limit: int, iteration: int) -> None:
-        """Give the model the rows that the strategy chooses, at most ``limit`` where it adds any."""
+        """Give the model the rows that density control chooses, at most ``limit`` where it adds any."""
         self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
         gaussians = self.gaussians.detach()
         rendered = self._filtered(gaussians)
