@@ -130,7 +130,7 @@ class Parts:
 @contextlib.contextmanager
 def timed_parts(parts: Parts) -> Iterator[None]:
     """Put a clock around the functions that training's ``descend`` calls; they stay what they are."""
-    places = ((loop.raster, "render"), (loop, "photo_loss"), (torch.Tensor, "backward"), (TrainState, "step"))
+    places = ((loop.rasterizer, "render"), (loop, "photo_loss"), (torch.Tensor, "backward"), (TrainState, "step"))
     with contextlib.ExitStack() as undo:
         for part, (owner, name) in zip(PARTS, places, strict=True):
             function = getattr(owner, name)
