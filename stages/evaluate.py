@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.photos.images import reduced_camera, reduced_view
@@ -53,8 +53,7 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
         accuracy = measure_accuracy(inputs.parts, cameras, held_out, partial(render_depth, gaussians, options=options))
     result = {"test_views": len(per_view), "mean": means, "floaters": floaters, "accuracy": accuracy}
     result["per_view"] = per_view
-    text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False)
-    (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
+    write_json(out / "metrics.json", result)
     summary: dict[str, Any] = {"test_views": len(per_view)}
     summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
     return summary | {"veil": floaters["veil"]["mean"]}

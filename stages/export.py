@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import platform
-from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import pycolmap
 import torch
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
 from splatpipe.pipeline.render.rendering import as_trained, load_rendering
@@ -59,17 +59,17 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     elif config.sky:
         report.warning("There is no sky to hand over.", hint="It takes train.sky=model, and photos that show the sky.")
     report.progress(1, 4, "writing the cameras and the points", "files")
-    _write_json(out / "cameras.json", cameras_json(cameras, frame))
+    write_json(out / "cameras.json", cameras_json(cameras, frame))
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))
     centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
     box = scene_box(frame.world_from_model.apply(points.xyz), centres)
     placed = georeference(frame, box)
-    _write_json(out / "georef.json", {**placed, "uncertainty": frame.residuals.get("uncertainty")})
+    write_json(out / "georef.json", {**placed, "uncertainty": frame.residuals.get("uncertainty")})
     if frame.origin is not None:
         report.note(told_in_a_line(placed))
     report.progress(2, 4, "collecting the figures", "files")
     figures = collect_metrics(inputs, points, len(cameras), len(gaussians))
-    _write_json(out / "metrics.json", figures)
+    write_json(out / "metrics.json", figures)
     report.progress(3, 4, "writing the viewer", "files")
     write_viewer_of(inputs, gaussians, out / "viewer", config)
     report.progress(4, 4, "writing the viewer", "files")
@@ -168,7 +168,3 @@ def _read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun.") from error
-
-
-def _write_json(path: Path, value: Sequence[Facts] | Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")

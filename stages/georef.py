@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
 from splatpipe.pipeline.sfm.sparse_model import write_model
@@ -128,8 +129,7 @@ def _write_accuracy(
         control = no_control()
         accuracy = _accuracy_of_positions(*alone)
     for name, value in (("control.json", control), ("accuracy.json", accuracy)):
-        text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
-        (out / name).write_text(text + "\n", encoding="utf-8")
+        write_json(out / name, value)
     return accuracy
 
 

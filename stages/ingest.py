@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.source import find_model
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.camera_groups import (
     CameraGroup,
@@ -29,7 +30,6 @@ from splatpipe.pipeline.photos.photo_list import (
     SKY_DIR,
     Photo,
     PhotoList,
-    colmap_model,
     photo_root,
     save_photo_list,
 )
@@ -89,13 +89,13 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     _tell_positions(positions, report)
     described = describe_cameras(photos, groups, camera_of)
     tell_cameras(described, report)
-    if colmap_model(inputs.photos_dir) is None:  # a given model has its calibration
+    if find_model(inputs.photos_dir) is None:  # a given model has its calibration
         _tell_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
-    _write_json(out / "cameras.json", cameras_json(groups))
-    _write_json(out / "lenses.json", lenses_json(lenses))
-    _write_json(out / "positions.json", positions_json(positions))
-    _write_json(out / "left_out.json", {"left_out": [{"name": e.name, "reason": e.reason} for e in left_out]})
+    write_json(out / "cameras.json", cameras_json(groups))
+    write_json(out / "lenses.json", lenses_json(lenses))
+    write_json(out / "positions.json", positions_json(positions))
+    write_json(out / "left_out.json", {"left_out": [{"name": e.name, "reason": e.reason} for e in left_out]})
     return {
         "photos": len(photos),
         "left_out": len(left_out),
@@ -161,7 +161,7 @@ def _lenses(
     report: Reporter,
 ) -> tuple[list[CameraGroup], list[StatedLens | None]]:
     """The groups with the lenses that are stated; a given model has its own."""
-    if colmap_model(inputs.photos_dir) is not None:
+    if find_model(inputs.photos_dir) is not None:
         return list(groups), [None] * len(groups)
     members: dict[int, list[CheckedPhoto]] = {}
     for photo in photos:
@@ -250,7 +250,3 @@ def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: R
             f"Nothing is known of the focal length of {unknown} photos; calibration has to find it.",
             "Photos as the camera wrote them, with their EXIF, give a better result.",
         )
-
-
-def _write_json(path: Path, value: JSON) -> None:
-    path.write_text(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")

@@ -113,7 +113,7 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
         named[file.part] = _choose(file, f"{section}.{option}", setting, beside)
     passed = {path for paths in beside.values() for path in paths.values()}
     passed |= {path for path in named.values() if path is not None}
-    return Source(folder, _find_model(folder), named, frozenset(passed))
+    return Source(folder, find_model(folder), named, frozenset(passed))
 
 
 def with_absolute_files(config: BaseModel, stages: Sequence[Stage]) -> BaseModel:
@@ -172,7 +172,8 @@ def _checked(path: Path, option: str) -> Path:
     return path
 
 
-def _find_model(folder: Path) -> Path | None:
+def find_model(folder: Path) -> Path | None:
+    """The sparse model of a COLMAP-style folder (``images/`` beside ``sparse/0`` or ``sparse``), or None."""
     if not (folder / "images").is_dir():
         return None
     for model in (folder / "sparse" / "0", folder / "sparse"):

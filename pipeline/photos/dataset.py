@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.colmap_model import Cloud, Photo, read_cloud, read_photos
 from splatpipe.pipeline.photos.names import NameFinder, some
@@ -194,7 +195,7 @@ class Split:
     def to_json(self) -> str:
         """The text of `split.json`."""
         fields = {"train": self.train, "held_out": self.held_out}
-        return json.dumps(fields, indent=1, ensure_ascii=False) + "\n"
+        return json_text(fields)
 
 
 def load_split(path: Path) -> Split:

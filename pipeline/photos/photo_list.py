@@ -20,6 +20,8 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.source import find_model
 
 # MPO, a JPEG that carries a second picture, as DJI and phones write, is opened by Pillow's JPEG.
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
@@ -27,7 +29,6 @@ LIST_NAME = "photos.json"
 CONVERTED_DIR = "converted"
 MASK_DIR = "masks"
 SKY_DIR = "sky_masks"
-MODEL_FILES = ("cameras.bin", "cameras.txt")
 UNTURN = {  # the inverse of the turn that each EXIF orientation asks for
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -85,8 +86,7 @@ class PhotoList:
 def save_photo_list(photo_list: PhotoList, part: Path) -> None:
     """Write ``photos.json`` into a part's folder (which must exist); the bytes depend on the list alone."""
     records = [asdict(photo) for photo in sorted(photo_list.photos, key=lambda photo: photo.name)]
-    text = json.dumps({"photos": records}, indent=1, ensure_ascii=False) + "\n"
-    (part / LIST_NAME).write_text(text, encoding="utf-8")
+    write_json(part / LIST_NAME, {"photos": records})
 
 
 def load_photo_list(part: Path) -> PhotoList:
@@ -108,19 +108,9 @@ def load_photo_list(part: Path) -> PhotoList:
     return PhotoList(tuple(sorted(photos, key=lambda photo: photo.name)))
 
 
-def colmap_model(photos_dir: Path) -> Path | None:
-    """The sparse model of a COLMAP-style folder (``images/`` beside ``sparse/0`` or ``sparse``), or None."""
-    if not (photos_dir / "images").is_dir():
-        return None
-    for model in (photos_dir / "sparse" / "0", photos_dir / "sparse"):
-        if any((model / name).is_file() for name in MODEL_FILES):
-            return model
-    return None
-
-
 def photo_root(photos_dir: Path) -> Path:
     """The folder that photo names are relative to: ``images/`` in a COLMAP-style folder, else the folder itself."""
-    return photos_dir if colmap_model(photos_dir) is None else photos_dir / "images"
+    return photos_dir if find_model(photos_dir) is None else photos_dir / "images"
 
 
 def photo_path(photo: Photo, part: Path, photos_dir: Path) -> Path:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
@@ -83,7 +84,7 @@ def save_frame(frame: Frame, path: Path) -> None:
         "left_out": list(frame.left_out),
         "note": frame.note,
     }
-    path.write_text(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(path, value)
 
 
 def load_frame(path: Path) -> Frame:

@@ -8,7 +8,6 @@ neutral appearance.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 
@@ -16,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.train.side import SideModel
 
@@ -81,4 +81,4 @@ class Exposure(SideModel):
 def exposures_json(exposure: Exposure | None) -> str:
     """The text of `exposures.json`."""
     fields = {"model": "off", "views": {}} if exposure is None else {"model": "affine", "views": exposure.maps()}
-    return json.dumps(fields, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text(fields)
