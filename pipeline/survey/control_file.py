@@ -14,17 +14,16 @@ from pathlib import Path
 from typing import Literal
 
 from splatpipe.pipeline.survey.survey_text import (
-    CRS_COMMENT,
     MAX_LINE_CHARS,
     UNKNOWN,
     LineError,
     TableKind,
+    csv_rows,
     delimiter_of,
     find_columns,
     is_number,
     number_in,
     read_lines,
-    title_of,
     told_by_line,
     written_lines,
 )
@@ -57,7 +56,6 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 }
 _NEEDED = ("x", "y", "photo", "px", "py")  # columns of a table
 _NEEDED_OF_POINTS = ("name", "x", "y")  # of one without marks
-GEOGRAPHIC = ("lon", "longitude", "lat", "latitude")
 ROLES: Mapping[str, Role] = {
     "control": "control",
     "gcp": "control",
@@ -200,7 +198,11 @@ def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[s
     written = written_lines(lines, path, kind)
     header = next((i for i, (_, line) in enumerate(written[:2]) if _is_header(line, needed)), None)
     with told_by_line(path, kind):
-        crs, rows = _odm_rows(written) if header is None else _csv_rows(lines, written, header)
+        if header is None:
+            crs, rows = _odm_rows(written)
+        else:
+            crs, cells = csv_rows(lines, written, header, COLUMNS)
+            rows = [_csv_row(number, row) for number, row in cells]
     return Table(tuple(lines), None if header is None else written[header][0], crs, tuple(rows))
 
 
@@ -251,37 +253,6 @@ def _require_no_header(number: int, line: str) -> None:
     if missing and len(columns) >= len(_NEEDED) - 2:
         titles = ", ".join(COLUMNS[name][1] for name in missing)
         raise LineError(number, f"a header without the columns {titles}", _EXPECTED)
-
-
-def _csv_rows(
-    lines: Sequence[tuple[int, str]], written: Sequence[tuple[int, str]], header: int
-) -> tuple[str, list[Row]]:
-    number, line = written[header]
-    delimiter = delimiter_of(line)
-    titles = next(csv.reader([line], delimiter=delimiter))
-    columns = find_columns(titles, COLUMNS)
-    crs = written[0][1].strip() if header == 1 else ""
-    comments = (CRS_COMMENT.match(text.strip()) for _, text in lines)
-    crs = crs or next((found.group(1).strip() for found in comments if found), "")
-    if not crs and title_of(titles[columns["x"]]) in GEOGRAPHIC:
-        crs = "EPSG:4326"
-    rows = []
-    for number, text in written[header + 1 :]:
-        try:
-            cells = next(csv.reader([text], delimiter=delimiter))
-        except csv.Error as error:
-            raise LineError(number, str(error)) from error
-        row = {name: cells[place].strip() if place < len(cells) else "" for name, place in columns.items()}
-        stated = row.get("crs", "")
-        if stated:
-            stated = f"EPSG:{stated}" if stated.isdigit() else stated
-            if crs and crs.casefold() != stated.casefold():
-                raise LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})", "Use one CRS a file.")
-            crs = stated
-        rows.append(_csv_row(number, row))
-    if not crs:
-        raise LineError(0, "it names no CRS", "Put it into the first line, e.g. EPSG:32633, or into a column crs.")
-    return crs, rows
 
 
 def _csv_row(number: int, row: Mapping[str, str]) -> Row:

@@ -15,16 +15,15 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.survey.survey_text import (
-    CRS_COMMENT,
     UNKNOWN,
     LineError,
     TableKind,
+    csv_rows,
     delimiter_of,
     find_columns,
     is_number,
     number_in,
     read_lines,
-    title_of,
     told_by_line,
     written_lines,
 )
@@ -51,7 +50,6 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "sigma_vertical": ("sigma_vertical", "sigma_vertical_m", "sigma_v", "sigma_z", "vert_accuracy", "accuracy_z"),
     "crs": ("crs", "epsg", "srs"),
 }
-GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "x/longitude")
 NUMBERS = ("x", "y", "z", "yaw", "pitch", "roll", "sigma_horizontal", "sigma_vertical")
 ODM_ORDER = ("name", *NUMBERS)
 ANGLES_FROM = 7  # fields of a line of geo.txt
@@ -107,7 +105,7 @@ def read_position_file(path: Path) -> PositionFile:
         if header is None:
             crs, rows = _odm_rows(written)
         else:
-            crs, rows = _csv_rows([line for _, line in lines], written, header)
+            crs, rows = csv_rows(lines, written, header, COLUMNS)
         photos = [_photo(number, row) for number, row in rows]
         _require_once(photos)
     if not photos:
@@ -131,33 +129,6 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[tuple[int, 
             row = {key: row[key] for key in ("name", "x", "y", "z") if key in row}
         rows.append((number, row))
     return crs.strip(), rows
-
-
-def _csv_rows(
-    lines: Sequence[str], written: Sequence[tuple[int, str]], header: int
-) -> tuple[str, list[tuple[int, Mapping[str, str]]]]:
-    _, titles = written[header]
-    delimiter = delimiter_of(titles)
-    columns = _header(titles)
-    comments = (CRS_COMMENT.match(line.strip()) for line in lines)
-    crs = written[0][1].strip() if header == 1 else next((found[1].strip() for found in comments if found), "")
-    if not crs and title_of(next(csv.reader([titles], delimiter=delimiter))[columns["x"]]) in GEOGRAPHIC:
-        crs = "EPSG:4326"
-    rows: list[tuple[int, Mapping[str, str]]] = []
-    for number, line in written[header + 1 :]:
-        try:
-            cells = next(csv.reader([line], delimiter=delimiter))
-        except csv.Error as error:
-            raise LineError(number, str(error)) from error
-        row = {key: cells[place].strip() if place < len(cells) else "" for key, place in columns.items()}
-        stated = f"EPSG:{row['crs']}" if row.get("crs", "").isdigit() else row.get("crs", "")
-        if stated and crs and crs.casefold() != stated.casefold() and rows:
-            raise LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})")
-        crs = stated or crs
-        rows.append((number, row))
-    if not crs:
-        raise LineError(0, "it names no CRS: put it into the first line, e.g. EPSG:32633, or into a column crs")
-    return crs, rows
 
 
 def _header(line: str) -> dict[str, int]:

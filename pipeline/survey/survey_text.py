@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ MAX_LINE_CHARS = 2000
 LARGEST = 1e9  # of a coordinate, metres or pixels: beyond it there is neither an earth nor a photo
 UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
 CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg)\s*[:=]\s*(\S.*)", re.IGNORECASE)
+GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "x/longitude")  # titles of x that name no other CRS
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
@@ -130,3 +132,47 @@ def number_in(line: int, what: str, text: str) -> float:
     if not is_number(text) or abs(float(text)) > LARGEST:
         raise LineError(line, f"{what} is {text[:40]!r}, no number that it can be")
     return float(text)
+
+
+def csv_rows(
+    lines: Sequence[tuple[int, str]],
+    written: Sequence[tuple[int, str]],
+    header: int,
+    columns: Mapping[str, tuple[str, ...]],
+) -> tuple[str, list[tuple[int, Mapping[str, str]]]]:
+    """The CRS of a table with a header, and its rows by the columns' names, numbered by their lines.
+
+    The CRS stands in the line before the header, in a comment, or in a column; without, degrees are those of WGS 84.
+
+    Args:
+        lines: All of the file.
+        written: Those that say something.
+        header: Place of the header among them, 0 or 1.
+        columns: Titles of each column, in small letters.
+
+    Raises:
+        LineError: if a line is broken, or the table names no CRS or two.
+    """
+    _, line = written[header]
+    delimiter = delimiter_of(line)
+    titles = next(csv.reader([line], delimiter=delimiter))
+    places = find_columns(titles, columns)
+    comments = (CRS_COMMENT.match(text.strip()) for _, text in lines)
+    crs = written[0][1].strip() if header == 1 else next((found[1].strip() for found in comments if found), "")
+    rows: list[tuple[int, Mapping[str, str]]] = []
+    for number, text in written[header + 1 :]:
+        try:
+            cells = next(csv.reader([text], delimiter=delimiter))
+        except csv.Error as error:
+            raise LineError(number, str(error)) from error
+        row = {name: cells[place].strip() if place < len(cells) else "" for name, place in places.items()}
+        stated = f"EPSG:{row['crs']}" if row.get("crs", "").isdigit() else row.get("crs", "")
+        if stated and crs and crs.casefold() != stated.casefold():
+            raise LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})", "Use one CRS a file.")
+        crs = stated or crs
+        rows.append((number, row))
+    if not crs and title_of(titles[places["x"]]) in GEOGRAPHIC:
+        crs = "EPSG:4326"
+    if not crs:
+        raise LineError(0, "it names no CRS", "Put it into the first line, e.g. EPSG:32633, or into a column crs.")
+    return crs, rows
