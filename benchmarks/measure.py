@@ -38,13 +38,14 @@ from splatpipe.pipeline.photos.images import load_colour, load_mask
 from splatpipe.pipeline.raster import _native, rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train import iteration
 from splatpipe.pipeline.train.draws import permutation
+from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
-from splatpipe.pipeline.train.smoothing import sampling_of
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
+from splatpipe.pipeline.train.techniques import make_techniques
 from splatpipe.stages import initialize
 
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
@@ -75,7 +76,6 @@ class Case:
         sh_degree: Of the Gaussians' colours, all of it from the first iteration that counts.
         seed: Of the order of photos.
         statistics: Collect what density control ranks by, as the first half of a training does.
-        filter_3d: Train with the 3D smoothing filter.
     """
 
     dataset: str
@@ -86,7 +86,6 @@ class Case:
     sh_degree: int = 3
     seed: int = 0
     statistics: bool = True
-    filter_3d: bool = False
 
 
 @dataclass
@@ -129,8 +128,8 @@ class Parts:
 
 @contextlib.contextmanager
 def timed_parts(parts: Parts) -> Iterator[None]:
-    """Put a clock around the functions that training's ``descend`` calls; they stay what they are."""
-    places = ((loop.rasterizer, "render"), (loop, "photo_loss"), (torch.Tensor, "backward"), (TrainState, "step"))
+    """Put a clock around the functions that ``iterate`` calls; they stay what they are."""
+    places = ((rasterizer, "render"), (iteration, "photo_loss"), (torch.Tensor, "backward"), (TrainState, "step"))
     with contextlib.ExitStack() as undo:
         for part, (owner, name) in zip(PARTS, places, strict=True):
             function = getattr(owner, name)
@@ -151,7 +150,6 @@ def time_case(case: Case) -> Row:
         seed=case.seed,
         max_gaussians=10**9,
         densify=case.statistics,
-        filter_3d=case.filter_3d,
     )
     views = load_views(Path(case.dataset))
     start = read_splat(Path(case.splat))
@@ -163,22 +161,21 @@ def time_case(case: Case) -> Row:
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
     with same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
-        state = TrainState.begin(start, plan)
-        state.sampling = sampling_of(plan, views)
+        state = TrainState.begin(start, plan, make_techniques(plan))
         for photo in islice(photos, warmup):
-            loop.train_step(state, plan, photo)
+            iterate(state, plan, photo)
 
-        def iteration() -> str:
+        def one() -> str:
             photo = next(photos)
-            loop.train_step(state, plan, photo)
+            iterate(state, plan, photo)
             return photo.camera.name
 
         for _ in range(case.repeats):
             camera = camera_of(views, case.seed, state.iteration + 1)
-            pairs.append(contributing_pairs(state.rendered_model(plan.options), camera, plan, state.iteration + 1))
+            pairs.append(contributing_pairs(state.gaussians, camera, plan, state.iteration + 1))
             pixels += camera.width * camera.height
             with timed_parts(parts):
-                trained_on = parts.timed("iteration", iteration)()
+                trained_on = parts.timed("iteration", one)()
             assert trained_on == camera.name
         alone = raster_alone(state, plan, [camera_of(views, case.seed, 1 + i) for i in range(case.repeats)])
     return (
@@ -197,9 +194,9 @@ def time_case(case: Case) -> Row:
     )
 
 
-def camera_of(views: Sequence[View], seed: int, iteration: int) -> Camera:
+def camera_of(views: Sequence[View], seed: int, number: int) -> Camera:
     """Which view's turn it is in an iteration (from 1)."""
-    epoch, place = divmod(iteration - 1, len(views))
+    epoch, place = divmod(number - 1, len(views))
     return views[int(permutation(seed, epoch, len(views))[place])].camera
 
 

@@ -13,7 +13,7 @@ import torch
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import _native, rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.iteration import render_options
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.state import TrainState
 
@@ -31,7 +31,7 @@ def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> di
     Returns:
         Median wall seconds of a view, and pairs a second and core (CPU seconds of all threads, over all views).
     """
-    options = loop.render_options(plan, max(1, state.iteration), False)
+    options = render_options(plan, plan.schedule.at(max(1, state.iteration)), False)
     pairs, wall, cpu = 0, [], 0.0
     for index, camera in enumerate([*cameras[:WARMUP], *cameras]):
         generator = torch.Generator().manual_seed(index)
@@ -59,13 +59,13 @@ def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iterati
         plan: The training's.
         iteration: From 1.
     """
-    options = plan.options
+    now = plan.schedule.at(iteration)
     n, h, w = len(gaussians), camera.height, camera.width
     frame = _native.Frame()
     frame.forward(
         tuple(tensor.detach().contiguous() for tensor in gaussians.tensors().values()),
         (np.ascontiguousarray(camera.cam_from_world, np.float64), (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
-        (plan.schedule.sh_degree_at(iteration), options.antialias, plan.near, 0.0, loop.background(options, iteration)),
+        (now.sh_degree, plan.options.antialias, plan.near, 0.0, now.background),
         (torch.empty(h, w, 3), torch.empty(h, w), None, torch.empty(n), torch.empty(n, dtype=torch.uint8)),
     )
     return int(frame.contributing_pairs())

@@ -25,11 +25,13 @@ from splatpipe.pipeline.render.view_measures import measure
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.flatness import ends_at
+from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.surroundings import begin_sky, surround
+from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
 from splatpipe.stages.options import LineConfig
 
 COLUMNS = {
@@ -92,11 +94,10 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     with same_bits(arguments.threads):
         clocks.start()
         sky = begin_sky(config.train, trained_on, dataset, arguments.threads, SilentReporter())
-        state = TrainState.begin(start, plan, sky)
-        surround(state, plan, trained_on, dataset)
+        state = TrainState.begin(start, plan, make_techniques(plan, sky, trained_on, dataset))
         with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
-                loop.train_step(state, plan, photo)
+                iterate(state, plan, photo)
                 last = state.iteration == ends_at(plan, state.history.flat_at)
                 if clocks.cpu_now() < due and not last:
                     continue
@@ -116,7 +117,8 @@ def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
     """Mean PSNR, PSNR after a colour fit and SSIM of the views that were held out, as `evaluate` measures them."""
     gaussians = state.finished()
     options = plan.rendering().options(gaussians)
-    model = (gaussians, None if state.sky is None else state.sky.panorama)
+    sky = state.techniques.find(SkyModel)
+    model = (gaussians, None if sky is None else sky.panorama)
     measured = [
         measure(render_pixels(model, view.camera, options), load_colour(view), load_mask(view))
         for view in load_views(dataset)

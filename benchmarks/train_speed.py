@@ -56,7 +56,6 @@ def main() -> None:
     options.add_argument("--sh-degree", type=int, default=3, choices=range(4))
     options.add_argument("--max-angle", type=float, default=0.1, help="initialize.max_angle; 1 leaves sizes uncapped")
     options.add_argument("--no-statistics", action="store_true", help="as in the half without density control")
-    options.add_argument("--filter-3d", action="store_true", help="with the 3D smoothing filter")
     options.add_argument("--repeats", type=int, default=30, help="iterations that count")
     options.add_argument("--warmup", type=int, default=5, help="iterations before them, at least an epoch")
     arguments = parse(options)
@@ -79,7 +78,6 @@ def main() -> None:
                     arguments.warmup,
                     arguments.sh_degree,
                     statistics=not arguments.no_statistics,
-                    filter_3d=arguments.filter_3d,
                 )
                 row = {"points": points} | run_apart([__file__], case)
                 # Multiplications and additions that the core could have done in the time of a pair.

@@ -17,7 +17,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop, planning
+from splatpipe.pipeline.train import iteration, loop, planning
 from splatpipe.pipeline.train import plan as planning_of_schedule
 from splatpipe.pipeline.train.budget import (
     FEWEST,
@@ -251,7 +251,7 @@ def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
     scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained(scene, tmp_path / "whole", plan, monkeypatch)
-    step = loop.train_step
+    step = loop.iterate
 
     def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == 31:
@@ -261,7 +261,7 @@ def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "train_step", dying)
+        patch.setattr(loop, "iterate", dying)
         trained(scene, tmp_path / "killed", plan, patch)
     assert (tmp_path / "killed" / loop.CHECKPOINT).exists()
     recorder = trained(scene, tmp_path / "killed", plan, monkeypatch)
@@ -292,7 +292,7 @@ def test_iterations_beyond_the_schedule_fill_the_time_and_change_none_before(
     assert longer["density"] == schedule["density"]
     assert longer["curve"][0] == schedule["curve"][0]
     assert [point["iteration"] for point in longer["curve"]] == [50, 80]
-    assert plan.schedule.means_rate(80) == plan.schedule.means_rate(60)
+    assert plan.schedule.at(80).means_rate == plan.schedule.at(60).means_rate
     assert digest(tmp_path / "longer") != digest(tmp_path / "schedule")
 
 
@@ -368,7 +368,7 @@ def test_a_memory_limit_binds_and_the_resident_memory_stays_below_it(scene: Path
 def test_growth_ends_where_memory_runs_out_all_the_same_and_pruning_goes_on(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(loop, "over_memory", lambda options: True)
+    monkeypatch.setattr(iteration, "over_memory", lambda options: True)
     limits = {"first": 10, "last": 60, "every": 10, "gradient": 1e-9, "prune_opacity": 0.08, "reset_every": 25}
     monkeypatch.setattr(planning_of_schedule, "resolve_schedule", tiny_scene.resolver(**limits))
     recorder = tiny_scene.Recorder()

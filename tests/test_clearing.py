@@ -12,11 +12,12 @@ import torch
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.splat.free_space import FreeSpace, near_or_free
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.clearing import STEPS_BETWEEN, free_space_of, is_clearing_step, unwanted
+from splatpipe.pipeline.train.clearing import STEPS_BETWEEN, Clearing, free_space_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.pipeline.train.schedule import resolve_schedule
 from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.techniques import Techniques, make_techniques
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -52,25 +53,22 @@ def haze_and_wall() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def space(dataset: Path) -> FreeSpace:
-    found = free_space_of(load_views(dataset), dataset, OPTIONS)
-    assert found is not None
-    return found
+    return free_space_of(load_views(dataset), dataset)
 
 
 def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: FreeSpace) -> None:
-    gaussians = haze_and_wall()
-    assert unwanted(gaussians, space, SCHEDULE, LOOKS).tolist() == [True] * 4 + [False] * 4
-    assert torch.equal(unwanted(gaussians, space, SCHEDULE, LOOKS), near_or_free(gaussians, space, 2))
-    assert not unwanted(gaussians, space, SCHEDULE, LOOKS + SCHEDULE.density.every).any()
-    assert not unwanted(gaussians, None, SCHEDULE, LOOKS).any()
+    gaussians, clearing = haze_and_wall(), Clearing(space, SCHEDULE)
+    found = clearing.unwanted(gaussians, LOOKS)
+    assert found is not None and found.tolist() == [True] * 4 + [False] * 4
+    assert torch.equal(found, near_or_free(gaussians, space, 2))
+    assert clearing.unwanted(gaussians, LOOKS + SCHEDULE.density.every) is None
 
 
 @pytest.mark.parametrize("density", ["published", "absolute"])
 def test_density_control_takes_it_away(dataset: Path, space: FreeSpace, density: str) -> None:
     config = TrainConfig.model_validate({"prune_free_space": 2, "density": density})
     plan = make_plan(config, load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
-    state = TrainState.begin(haze_and_wall(), plan)
-    state.free_space = space
+    state = TrainState.begin(haze_and_wall(), plan, Techniques((Clearing(space, plan.schedule),)))
     state.control_density(plan, LOOKS)
     assert len(state.gaussians) >= 4
     assert not near_or_free(state.gaussians.detach(), space, 2).any()
@@ -80,10 +78,10 @@ def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: 
     plan = make_plan(TrainConfig(prune_free_space=2), load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     step = STEPS_BETWEEN * plan.schedule.density.every
     after = (plan.schedule.density.last // step + 1) * step
-    assert is_clearing_step(space, plan.schedule, after) and not is_clearing_step(space, plan.schedule, after + 1)
-    assert not is_clearing_step(space, plan.schedule, plan.options.iterations)
-    state = TrainState.begin(haze_and_wall(), plan)
-    state.free_space = space
+    clearing = Clearing(space, plan.schedule)
+    assert clearing.is_due(after) and not clearing.is_due(after + 1)
+    assert not clearing.is_due(plan.options.iterations)
+    state = TrainState.begin(haze_and_wall(), plan, Techniques((Clearing(space, plan.schedule),)))
     before = state.gaussians.detach().select(torch.arange(4, 8))
     state.control_density(plan, after)
     for name, tensor in before.tensors().items():
@@ -94,4 +92,7 @@ def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: 
 
 
 def test_nobody_asks_nothing_is_looked_at(dataset: Path) -> None:
-    assert free_space_of(load_views(dataset), dataset, TrainConfig(prune_free_space=0)) is None
+    views = load_views(dataset)
+    for times, found in ((0, False), (1, True)):
+        plan = make_plan(TrainConfig(prune_free_space=times), views, tiny_scene.split_of(views), 8)
+        assert (make_techniques(plan, None, views, dataset).find(Clearing) is not None) == found

@@ -87,7 +87,7 @@ def test_density_control_keeps_to_the_limit_and_its_statistics_survive(magnitude
     density.statistics.add(torch.ones(50), torch.ones(50, dtype=torch.bool))
     again.load({key: tensor.clone() for key, tensor in density.to_arrays().items()})
     for limit in (50, 61):
-        step = DensityStep(schedule, 5.0, limit, 600, gaussians, torch.zeros(50, dtype=torch.bool))
+        step = DensityStep(schedule, 5.0, limit, 600, torch.zeros(50, dtype=torch.bool))
         growth, counts = density.control(gaussians, step)
         assert len(growth.source) == limit
         repeated, same = again.control(gaussians, step)

@@ -17,7 +17,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import state
+from splatpipe.pipeline.train import techniques
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.stages import initialize, train
 
@@ -47,7 +47,7 @@ def trained(scene: Path, out: Path, exposure: str) -> Path:
     parts |= tiny_scene.split_part(scene / "dataset")
     config = tiny_scene.plain(iterations=400, exposure=exposure)
     with pytest.MonkeyPatch.context() as patch:  # too few visits for the exposures to be learnt at their rate
-        patch.setattr(state, "Exposure", partial(Exposure, first_rate=1e-2))
+        patch.setattr(techniques, "Exposure", partial(Exposure, first_rate=1e-2))
         train.run(config, Inputs(parts, scene, machine=Machine("cpu", 2)), out, tiny_scene.Recorder())
     return out
 
@@ -81,7 +81,7 @@ def test_maps_are_the_photos_gains_and_the_splat_is_neutral(scene: Path, tmp_pat
 def test_a_step_changes_one_photo_and_keeps_the_mean() -> None:
     exposure = Exposure(["b", "a", "c"])
     picture = torch.full((8, 8, 3), 0.5)
-    exposure.shown(picture, "b").sum().backward()
+    exposure.applied(picture, "b").sum().backward()
     exposure.step("b", 0.1)
     maps = {name: torch.tensor(rows) for name, rows in exposure.maps().items()}
     assert torch.allclose(sum(maps.values()) / 3.0, torch.eye(3, 4), atol=1e-6)
@@ -96,6 +96,6 @@ def test_maps_are_drawn_to_the_identity() -> None:
         exposure.tensors["deviations"][1] -= 0.2
     for iteration in range(1, 201):
         name = "ab"[iteration % 2]
-        (exposure.shown(torch.zeros(8, 8, 3), name).sum() * 0.0).backward()
+        (exposure.applied(torch.zeros(8, 8, 3), name).sum() * 0.0).backward()
         exposure.step(name, iteration / 1000)
     assert float(exposure.tensors["deviations"].detach().abs().max()) < 0.02

@@ -74,11 +74,11 @@ def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None
     plan = make_plan(7000, 0.1)
     assert flatness.ends_at(plan, 0) == 7000 and flatness.ends_at(plan, 5000) == 5500
     assert flatness.ends_at(replace(plan, last_iteration=5200), 5000) == 5200
-    places = [flatness.place_in_schedule(plan, 5000, iteration) for iteration in range(4990, 5501)]
+    places = [plan.schedule.place(iteration, 5000) for iteration in range(4990, 5501)]
     assert places[:11] == list(range(4990, 5001)) and places[-1] == 7000
     assert set(np.diff(places[10:])) == {4}
-    assert plan.schedule.means_rate(places[-1]) == plan.schedule.means_rate(7000)
-    assert flatness.place_in_schedule(plan, 0, 6000) == 6000
+    assert plan.schedule.at(5500, 5000).means_rate == plan.schedule.at(7000).means_rate
+    assert plan.schedule.place(6000, 0) == 6000
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
     scene: Path, tmp_path: Path, before_end: int
 ) -> None:
     whole, _ = trained(scene, tmp_path / "whole", FLAT)
-    step = loop.train_step
+    step = loop.iterate
 
     def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == int(str(whole["iterations"])) - before_end:
@@ -135,7 +135,7 @@ def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "train_step", dying)
+        patch.setattr(loop, "iterate", dying)
         trained(scene, tmp_path / "killed", FLAT)
     resumed, _ = trained(scene, tmp_path / "killed", FLAT)
     assert resumed["iterations"] == whole["iterations"] and resumed["flat_at"] == whole["flat_at"]

@@ -217,14 +217,14 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
     parts |= tiny_scene.split_part(scene / "dataset", names=held_out)
     inputs = Inputs(parts, scene, machine=Machine("cpu", 1))
     kept: list[TrainState] = []
-    step = loop.train_step
+    step = loop.iterate
 
     def keeping(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
         kept[:] = [state]
         step(state, plan, photo)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "train_step", keeping)
+        patch.setattr(loop, "iterate", keeping)
         config = tiny_scene.plain(iterations=iterations, robust=robust)
         summary = dict(train.run(config, inputs, out, tiny_scene.Recorder()))
     model = read_splat(out / "model.ply")
@@ -238,7 +238,7 @@ def test_held_out_photos_are_better_without_what_moved(scene: Path, tmp_path: Pa
     off, on = trained(scene, tmp_path / "off", 0.0), trained(scene, tmp_path / "on", 0.05)
     assert on.psnr > off.psnr + 0.3
     assert "robust_left_out" not in off.summary and 0.01 < float(str(on.summary["robust_left_out"])) < 0.03
-    robust = on.state.robust
+    robust = on.state.techniques.find(Robust)
     assert robust is not None
     names = sorted(camera.name for number, camera in enumerate(cameras()) if number not in HELD_OUT)
     left_out = dict(zip(names, robust.left_out.tolist(), strict=True))
@@ -255,14 +255,14 @@ def test_killed_training_leaves_the_same_out_and_ends_with_the_same_bits(scene: 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        step = loop.train_step
+        step = loop.iterate
 
         def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
             if state.iteration == 71:
                 raise KeyboardInterrupt
             step(state, plan, photo)
 
-        patch.setattr(loop, "train_step", dying)
+        patch.setattr(loop, "iterate", dying)
         trained(scene, tmp_path / "killed", 0.05, 120)
     killed = trained(scene, tmp_path / "killed", 0.05, 120)
     for part in ("model.ply", "history.json"):

@@ -20,7 +20,7 @@ from splatpipe.pipeline.photos.images import load_colour
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train import iteration, loop
 from splatpipe.pipeline.train import plan as planned
 from splatpipe.pipeline.train.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.options import TrainConfig
@@ -35,7 +35,6 @@ import tiny_scene
 PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "rendering.json", "sky.npz"]
 TECHNIQUES: dict[str, object] = {  # all at once, most with a state of their own
     "exposure": "affine",
-    "filter_3d": True,
     "antialias": True,
     "dropout": 0.2,
     "distortion_weight": 0.05,
@@ -121,7 +120,7 @@ class Killed(BaseException):
 
 def die_at(monkeypatch: pytest.MonkeyPatch, iteration: int, how: Callable[[], None]) -> None:
     """Let ``how`` happen in the middle of an iteration, with a checkpoint after every one before."""
-    step = loop.train_step
+    step = loop.iterate
 
     def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == iteration:
@@ -130,7 +129,7 @@ def die_at(monkeypatch: pytest.MonkeyPatch, iteration: int, how: Callable[[], No
 
     monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-    monkeypatch.setattr(loop, "train_step", dying)
+    monkeypatch.setattr(loop, "iterate", dying)
 
 
 def killed() -> None:
@@ -243,7 +242,6 @@ def test_fewer_gaussians_than_points_may_be_asked_for(scene: Path, tmp_path: Pat
         {"background": "random"},
         {"background": "white"},
         {"antialias": True},
-        {"filter_3d": True},
         {"loss": "kornia", "iterations": 20},
     ],
 )
@@ -260,12 +258,12 @@ def test_options_train_to_a_finite_model_and_repeat(
 def test_gradients_that_are_not_finite_skip_that_gaussian_and_are_counted(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    loss = loop.photo_loss
+    loss = iteration.photo_loss
 
     def poisoned(render: torch.Tensor, *rest: object) -> torch.Tensor:
         return loss(render, *rest) + 0.0 * torch.sqrt(render[0, 0, 0] - render[0, 0, 0].detach())
 
-    monkeypatch.setattr(loop, "photo_loss", poisoned)
+    monkeypatch.setattr(iteration, "photo_loss", poisoned)
     gaussians = read_splat(trained(scene, tmp_path) / "model.ply")
     assert bool(gaussians.finite().all())
     assert json.loads((tmp_path / "history.json").read_text())["skipped_gradients"] > 0

@@ -102,7 +102,7 @@ def test_extent_is_a_tenth_more_than_the_farthest_camera() -> None:
 
 def test_rate_of_positions_falls_exponentially() -> None:
     schedule = replace(resolve_schedule(TrainConfig(iterations=100)), rates=Rates())
-    found = [schedule.means_rate(place) for place in (0, 50, 100, 200)]
+    found = [schedule.at(place).means_rate for place in (0, 50, 100, 200)]
     assert found == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6, 1.6e-6])
 
 
@@ -110,8 +110,8 @@ def test_short_runs_take_longer_steps() -> None:
     boosts = [rates_of(run).boost for run in (100, 7500, 30_000, 100_000)]
     assert boosts == [4.0, 2.0, 1.0, 1.0]
     schedule = resolve_schedule(TrainConfig(iterations=7500))
-    assert schedule.means_rate(0) == pytest.approx(2.0 * 1.6e-4)
-    assert schedule.means_rate(7500) == pytest.approx(4.0 * 1.6e-6)
+    assert schedule.at(0).means_rate == pytest.approx(2.0 * 1.6e-4)
+    assert schedule.at(7500).means_rate == pytest.approx(4.0 * 1.6e-6)
 
 
 def test_coarse_photos_come_first_in_equal_shares() -> None:

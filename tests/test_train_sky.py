@@ -137,7 +137,7 @@ def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() 
     seen = sky.seen(camera)
     for number in range(120):
         composite = sky.composite(empty_render(camera), camera, seen, BLACK, (0.1, 0.1, 0.1))
-        ((composite - photo).abs().mean() + sky.penalty(torch.zeros(photo.shape[:2]), seen)).backward()
+        ((composite - photo).abs().mean() + sky.loss(torch.zeros(photo.shape[:2]), seen)).backward()
         sky.step(number / 120)
     with torch.no_grad():
         learnt = sky.panorama.behind(camera, (0.0, 0.0, 0.0))
@@ -165,7 +165,7 @@ def test_penalty_is_the_mean_opacity_before_the_sky() -> None:
     mask[:60] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
     alpha = torch.rand(mask.shape, generator=torch.Generator().manual_seed(1)).requires_grad_()
-    loss = sky.penalty(alpha, sky.seen(camera))
+    loss = sky.loss(alpha, sky.seen(camera))
     assert float(loss.detach()) == pytest.approx(0.1 * float(alpha.detach()[:60].sum()) / mask.size, rel=1e-5)
     loss.backward()
     assert alpha.grad is not None and torch.equal(alpha.grad != 0.0, torch.from_numpy(mask))
@@ -204,7 +204,7 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize("when", [2, 25])
 def test_killed_training_goes_on_to_the_same_bits(scene: Path, tmp_path: Path, when: int) -> None:
-    step = loop.train_step
+    step = loop.iterate
 
     def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == when:
@@ -214,7 +214,7 @@ def test_killed_training_goes_on_to_the_same_bits(scene: Path, tmp_path: Path, w
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "train_step", dying)
+        patch.setattr(loop, "iterate", dying)
         trained(scene, tmp_path / "killed")
     digest, recorder = trained(scene, tmp_path / "killed", threads=2)
     assert not recorder.warnings
@@ -270,9 +270,10 @@ def test_a_budget_measures_iterations_with_the_sky_and_leaves_it_as_it_was(scene
     moved = []
 
     def step(state: TrainState, trial: Plan, photo: TrainingPhoto) -> None:
-        loop.train_step(state, trial, photo)
-        assert state.sky is not None
-        moved.append(not torch.equal(state.sky.panorama.colours, before))
+        loop.iterate(state, trial, photo)
+        trained = state.techniques.find(SkyModel)
+        assert trained is not None
+        moved.append(not torch.equal(trained.panorama.colours, before))
 
     measure(plan, start, views, step, Effort(0.0, 1e-3), sky)
     assert any(moved) and torch.equal(sky.panorama.colours, before)

@@ -32,7 +32,6 @@ class DensityStep:
         extent: Of the scene, world units.
         limit: The most Gaussians that may be left, where any are added.
         iteration: The one that ends.
-        rendered: The model as it is rendered, for its opacities and sizes.
         unwanted: (n,) Gaussians that have to go, whatever their size and opacity.
     """
 
@@ -40,7 +39,6 @@ class DensityStep:
     extent: float
     limit: int
     iteration: int
-    rendered: Gaussians
     unwanted: Bool[Tensor, " n"]
 
 
@@ -79,7 +77,7 @@ class Density:
             The new rows of the model, and the counts of a ``DensityEvent``; nothing is changed.
         """
         schedule, extent, iteration = step.schedule, step.extent, step.iteration
-        gone = prune_mask(step.rendered, schedule, extent, iteration, self.statistics.max_radius_px)
+        gone = prune_mask(gaussians, schedule, extent, iteration, self.statistics.max_radius_px)
         if not bool((gone | step.unwanted).all()):  # a model is never emptied
             gone |= step.unwanted
         pruned = int(gone.sum())

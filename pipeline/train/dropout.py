@@ -15,7 +15,8 @@ from torch import Tensor
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.draws import DROPOUT, uniform
-from splatpipe.pipeline.train.schedule import Schedule
+from splatpipe.pipeline.train.hooks import Technique
+from splatpipe.pipeline.train.schedule import Moment, Schedule
 
 DROPPED_LOGIT = -30.0  # an opacity of 1e-13: the projection culls it, so it costs nothing and learns nothing
 LARGEST_OPACITY = 0.999  # of the scaled ones, which a logit has to hold; the blending caps alpha at 0.99
@@ -43,6 +44,23 @@ def dropped(gaussians: Gaussians, schedule: Schedule, iteration: int) -> Gaussia
     drawn = torch.from_numpy(uniform(schedule.seed, iteration, DROPOUT, np.arange(len(gaussians))))
     logits = _Dropped.apply(gaussians.opacity_logits, drawn >= share, share)  # type: ignore[no-untyped-call]
     return replace(gaussians, opacity_logits=logits)
+
+
+class Dropout(Technique):
+    """Leaves a random share of the Gaussians out of each iteration.
+
+    Args:
+        schedule: The training's.
+    """
+
+    name = "dropout"
+
+    def __init__(self, schedule: Schedule) -> None:
+        self._schedule = schedule
+
+    def before_render(self, model: Gaussians, now: Moment) -> Gaussians:
+        """The Gaussians without those left out."""
+        return dropped(model, self._schedule, now.place)
 
 
 class _Dropped(torch.autograd.Function):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.raster.colour import affine_colour
+from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.side import SideModel
 
 FIRST_RATE = 1e-3  # of learning: a photo has some hundred visits, in which its exposure moves by a tenth at most
@@ -25,7 +26,7 @@ DECAY = 1e-3  # times the maps' deviation from the identity joins the loss's gra
 _NAME = "deviations"
 
 
-class Exposure(SideModel):
+class Exposure(SideModel, Technique):
     """An affine map of the colours for each photo.
 
     Args:
@@ -33,6 +34,8 @@ class Exposure(SideModel):
         first_rate: Learning rate at the start.
         decay: How strongly the maps are drawn to the identity.
     """
+
+    name = "exposure"
 
     def __init__(self, names: Sequence[str], first_rate: float = FIRST_RATE, decay: float = DECAY) -> None:
         super().__init__({_NAME: torch.zeros(len(names), 12)})
@@ -43,9 +46,17 @@ class Exposure(SideModel):
         """What a photo's map is now: its colours are A c + b of the splat's, [A b]."""
         return torch.eye(3, 4) + self._deviations()[self._row[name]].view(3, 4)
 
-    def shown(self, picture: Float[Tensor, "h w 3"], name: str) -> Float[Tensor, "h w 3"]:
-        """A render as the photo's exposure would show it; differentiable."""
+    def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
+        """A render as the photo's exposure would show it."""
+        return self.applied(picture, shot.photo.camera.name)
+
+    def applied(self, picture: Float[Tensor, "h w 3"], name: str) -> Float[Tensor, "h w 3"]:
+        """A picture through a photo's map; differentiable."""
         return affine_colour(picture, self.map_of(name))
+
+    def after_step(self, shot: Shot) -> None:
+        """Step the photo's map."""
+        self.step(shot.photo.camera.name, shot.now.share)
 
     @torch.no_grad()
     def step(self, name: str, share: float) -> None:

@@ -15,12 +15,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.schedule import Schedule
+from splatpipe.pipeline.train.schedule import Schedule, tail_of
 
 WINDOW_SHARE = 0.25  # of the iterations done: what the line is drawn through
 FEWEST_EPOCHS = 8  # in it, so that their scatter is known
 STANDARD_ERRORS = 2.0  # the line is taken so much steeper: noise does not end a training that still gains
-TAIL_SHARE = 0.1  # of the iterations done: what the rest of the schedule is compressed into
 
 
 def settled_from(schedule: Schedule) -> int:
@@ -66,7 +65,7 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> 
     scheduled = plan.options.iterations
     recent = [epoch for epoch in epochs if epoch[0] > (1.0 - WINDOW_SHARE) * iteration]
     recent = list(epochs[-max(FEWEST_EPOCHS, len(recent)) :])
-    if len(recent) < FEWEST_EPOCHS or iteration + _tail(iteration) >= scheduled:
+    if len(recent) < FEWEST_EPOCHS or iteration + tail_of(iteration) >= scheduled:
         return False
     return expected_gain(recent, scheduled) < plan.options.stop_when_flat
 
@@ -78,21 +77,4 @@ def ends_at(plan: Plan, flat_at: int) -> int:
         plan: The training's.
         flat_at: Iteration after which the tail began; 0 where it did not.
     """
-    return min(plan.last_iteration, flat_at + _tail(flat_at)) if flat_at else plan.last_iteration
-
-
-def place_in_schedule(plan: Plan, flat_at: int, iteration: int) -> int:
-    """The iteration of the schedule whose rates an iteration has: in the tail it runs ahead, to the schedule's last.
-
-    Args:
-        plan: The training's.
-        flat_at: As above.
-        iteration: From 1.
-    """
-    if flat_at == 0 or iteration <= flat_at:
-        return iteration
-    return flat_at + (iteration - flat_at) * (plan.options.iterations - flat_at) // _tail(flat_at)
-
-
-def _tail(flat_at: int) -> int:
-    return max(1, round(TAIL_SHARE * flat_at))
+    return min(plan.last_iteration, flat_at + tail_of(flat_at)) if flat_at else plan.last_iteration

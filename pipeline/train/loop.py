@@ -3,50 +3,37 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.engine.stage import Inputs, Machine, Reporter, Summary
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
-from splatpipe.pipeline.train.draws import BACKGROUND, ELSEWHERE, uniform
-from splatpipe.pipeline.train.dropout import dropped
-from splatpipe.pipeline.train.exposure import exposures_json
-from splatpipe.pipeline.train.flatness import ends_at, is_flat, place_in_schedule, settled_from
+from splatpipe.pipeline.train.exposure import Exposure, exposures_json
+from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
-from splatpipe.pipeline.train.layers import depth_origin, is_spread_counted, spread_loss
-from splatpipe.pipeline.train.memory import over_memory
+from splatpipe.pipeline.train.iteration import curve_facts, iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import (
-    Plan,
-    load_or_write_plan,
-    make_plan,
-)
+from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
 from splatpipe.pipeline.train.planning import Scene, under_budgets
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.surroundings import begin_sky, surround
+from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
 
 CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
 REPORT_EVERY = 10  # iterations
-SSIM_WEIGHT = 0.2  # share of 1 - SSIM in the loss, the rest is L1: published
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -66,7 +53,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
 
     def make() -> Plan:
-        return under_budgets(free, replace(scene, sky=sky), train_step, report)
+        return under_budgets(free, replace(scene, sky=sky), iterate, report)
 
     with same_bits(inputs.machine.threads):
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
@@ -74,9 +61,12 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         write_durably(out / "rendering.json", plan.rendering().to_json())
         if budgeted(plan):
             report.note(plan.described())
-        state = resume(out / CHECKPOINT, plan, report, sky) or TrainState.begin(start, plan, sky)
+
+        def techniques() -> Techniques:
+            return make_techniques(plan, sky, trained_on, dataset)
+
+        state = resume(out / CHECKPOINT, plan, techniques, report) or TrainState.begin(start, plan, techniques())
         levels = plan.schedule.coarse_levels_to(ends_at(plan, state.history.flat_at))
-        surround(state, plan, trained_on, dataset)
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(trained_on, levels, plan.options.seed, first, out, size) as photos:
             photos.tell(report)
@@ -88,8 +78,20 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
-    return {
-        "gaussians": len(gaussians),
+    write_side_models(out, state.techniques)
+    return {"gaussians": len(gaussians)} | summary_of(state, plan)
+
+
+def write_side_models(out: Path, techniques: Techniques) -> None:
+    """Write what was trained beside the Gaussians, where it was."""
+    sky = techniques.find(SkyModel)
+    write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
+    (out / "exposures.json").write_text(exposures_json(techniques.find(Exposure)), encoding="utf-8")
+
+
+def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
+    """What the stage says of a training that is done."""
+    found: dict[str, JSON] = {
         "iterations": state.iteration,
         "planned_iterations": plan.options.iterations,
         "loss": state.history.last_loss(),
@@ -98,22 +100,13 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         "peak_memory_bytes": peak_memory_bytes(),
         "device": "cpu",
         "instruction_set": rasterizer.isa_name(),
-        "plan": plan.options.model_dump(mode="json") | {"initial_gaussians": plan.initial_gaussians},
-    } | write_side_models(out, state, plan.options)
-
-
-def write_side_models(out: Path, state: TrainState, options: TrainConfig) -> dict[str, int | float]:
-    """Write what was trained beside the Gaussians; what the summary says of techniques that were asked for."""
-    write_panorama(out / "sky.npz", None if state.sky is None else state.sky.panorama)
-    (out / "exposures.json").write_text(exposures_json(state.exposure), encoding="utf-8")
-    summary: dict[str, int | float] = {}
-    if options.sky != "off":
-        summary["sky_photos"] = 0 if state.sky is None else state.sky.photos
+        "plan": plan.figures(),
+    }
+    if plan.options.sky != "off":
+        found["sky_photos"] = 0
     if state.history.flat_at:
-        summary["flat_at"] = state.history.flat_at
-    if state.robust is not None:
-        summary["robust_left_out"] = round(state.robust.share_left_out(), 5)
-    return summary
+        found["flat_at"] = state.history.flat_at
+    return found | state.techniques.summary()
 
 
 def views_of(plan: Plan, views: Sequence[View]) -> list[View]:
@@ -140,11 +133,18 @@ def check_device(machine: Machine) -> None:
         )
 
 
-def resume(path: Path, plan: Plan, report: Reporter, sky: SkyModel | None) -> TrainState | None:
-    """The state that a killed run left, or None; a broken one is told and ignored."""
+def resume(path: Path, plan: Plan, make: Callable[[], Techniques], report: Reporter) -> TrainState | None:
+    """The state that a killed run left, or None; a broken one is told and ignored.
+
+    Args:
+        path: The checkpoint.
+        plan: The training's.
+        make: Its techniques, untrained.
+        report: Takes warnings.
+    """
     try:
         checkpoint = load_checkpoint(path, plan.digest())
-        state = TrainState.restore(checkpoint, plan, sky)
+        state = TrainState.restore(checkpoint, plan, make())
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:
@@ -168,7 +168,7 @@ def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Pat
     clock = _Clock(state.seconds)
     with deferred_interrupts() as interrupt:
         for photo in photos:
-            train_step(state, plan, photo)
+            iterate(state, plan, photo)
             state.seconds = clock.seconds()
             if state.history.growth_ended == state.iteration:
                 report.warning(
@@ -211,128 +211,6 @@ def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
     if (loss := state.history.recent_loss()) is not None:
         report.metric("loss", loss, state.iteration)
     report.metric("gaussians", len(state.gaussians), state.iteration)
-
-
-def train_step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
-    """One iteration: render, compare, step the parameters, then density control where it is due.
-
-    Args:
-        state: Changed in place; afterwards it is of the next iteration.
-        plan: The training's.
-        photo: What to compare with.
-    """
-    options, iteration = plan.options, state.iteration + 1
-    if photo.mask is None or bool(photo.mask.any()):
-        descend(state, plan, photo, iteration)
-    state.end_epoch(iteration, plan)
-    state.control_density(plan, iteration)
-    growing = not state.history.growth_ended
-    if growing and plan.schedule.density.is_step(iteration) and over_memory(options):
-        state.history.growth_ended = iteration
-    state.iteration = iteration
-    if options.stop_when_flat > 0.0 and iteration % len(plan.train_views) == 0:
-        judge_epoch(state, plan)
-    is_last = iteration == ends_at(plan, state.history.flat_at)
-    state.history.end_iteration(iteration, is_last, curve_facts(state, plan, photo))
-
-
-def judge_epoch(state: TrainState, plan: Plan) -> None:
-    """Close an epoch, and note where the loss is flat."""
-    history, photos = state.history, len(plan.train_views)
-    history.end_epoch(state.iteration - photos // 2, state.iteration - photos >= settled_from(plan.schedule))
-    if not history.flat_at and is_flat(history.epochs, plan, state.iteration):
-        history.flat_at = state.iteration
-
-
-def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str, int]:
-    """What a point of the history's curve says besides the loss."""
-    return {
-        "gaussians": len(state.gaussians),
-        "sh_degree": plan.schedule.sh_degree_at(state.iteration),
-        "width": photo.camera.width,
-    }
-
-
-def descend(state: TrainState, plan: Plan, photo: TrainingPhoto, iteration: int) -> None:
-    """Render the photo's view and step the parameters against the loss's gradient."""
-    options = plan.options
-    density = plan.schedule.density
-    observed = density.on and iteration <= density.last
-    place = place_in_schedule(plan, state.history.flat_at, iteration)
-    settings = render_options(plan, iteration, observed and state.density.magnitudes)
-    if spread := is_spread_counted(options, place):
-        settings = replace(settings, depth=True, depth_origin=depth_origin(state.gaussians.means, photo.camera))
-    probe = state.probe() if observed else None
-    model = dropped(state.rendered_model(options), plan.schedule, place)
-    rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
-    photometric, penalties = losses(state, plan, photo, rendered, settings.background)
-    loss = photometric + penalties
-    if spread:
-        loss = loss + options.distortion_weight * spread_loss(rendered, settings.depth_origin, photo.camera)
-    loss.backward()  # type: ignore[no-untyped-call]
-    state.history.add_loss(float(photometric.detach()))
-    with torch.no_grad():
-        if probe is not None and probe.grad is not None:
-            state.density.observe(rendered, probe.grad, density)
-        means_rate = plan.extent * plan.schedule.means_rate(place)
-        state.step(rendered.visible, means_rate, plan.extent, plan.schedule)
-        share = min(1.0, place / options.iterations)
-        if state.exposure is not None:
-            state.exposure.step(photo.camera.name, share)
-        if state.sky is not None:
-            state.sky.step(share)
-
-
-def losses(
-    state: TrainState, plan: Plan, photo: TrainingPhoto, rendered: rasterizer.Render, behind: tuple[float, float, float]
-) -> tuple[Tensor, Tensor]:
-    """How far a render is from its photo, shown as the photo's sky and exposure would, and what the sky adds to that.
-
-    Args:
-        state: Of whose side models the render is completed.
-        plan: The training's.
-        photo: What to compare with.
-        rendered: The Gaussians alone.
-        behind: The colour that they were rendered over.
-    """
-    options, shown, penalty = plan.options, rendered.colour, rendered.colour.new_zeros(())
-    if state.sky is not None:
-        elsewhere = random_colour(options, state.iteration + 1, ELSEWHERE)
-        seen = state.sky.seen(photo.camera)
-        shown = state.sky.composite(rendered, photo.camera, seen, behind, elsewhere)
-        penalty = state.sky.penalty(rendered.alpha, seen)
-    if state.exposure is not None:
-        shown = state.exposure.shown(shown, photo.camera.name)
-    if state.robust is not None:
-        photo = state.robust.look(photo, rendered, shown)
-    measure = photo_loss if options.loss == "native" else photo_loss_reference
-    return measure(shown, photo.colour, SSIM_WEIGHT, photo.mask), penalty
-
-
-def render_options(plan: Plan, iteration: int, magnitudes: bool) -> rasterizer.RenderOptions:
-    """How an iteration renders; with ``magnitudes`` of the screen gradient where density control looks on."""
-    options = plan.options
-    return rasterizer.RenderOptions(
-        sh_degree=plan.schedule.sh_degree_at(iteration),
-        background=background(options, iteration),
-        antialias=options.antialias,
-        near=plan.near,
-        depth=options.robust > 0.0,
-        magnitudes=magnitudes,
-    )
-
-
-def background(options: TrainConfig, iteration: int) -> tuple[float, float, float]:
-    """What is behind the Gaussians in an iteration, red, green, blue."""
-    if options.background == "random":
-        return random_colour(options, iteration, BACKGROUND)
-    return BACKGROUNDS[options.background]
-
-
-def random_colour(options: TrainConfig, iteration: int, stream: int) -> tuple[float, float, float]:
-    """A colour of its own for every iteration, red, green, blue; ``stream`` as in ``draws``."""
-    red, green, blue = uniform(options.seed, iteration, stream, [0, 1, 2]).tolist()
-    return red, green, blue
 
 
 class _Clock:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -21,9 +20,9 @@ from splatpipe.pipeline.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, 
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.schedule import Schedule
 from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.smoothing import sampling_of
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.techniques import make_techniques
 
 MOST_VIEWS = 8  # a size is timed on: their mean is within a few percent of all photos'
 PICTURES = 3  # that evaluate keeps of a view: photo, render, error
@@ -84,7 +83,7 @@ def measure(
     small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
     models = [stretched(start, count, plan.options.seed) for count in counts]
-    states = [_pilot_state(model, trial, views, copy.deepcopy(sky)) for model in models]
+    states = [_pilot_state(model, trial, sky) for model in models]
     _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
     first = _timed(states[0], trial, small[0], step)
     # Cost grows a little slower than size, so the line through two sizes is right near them only.
@@ -125,9 +124,9 @@ def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
     return model
 
 
-def _pilot_state(start: Gaussians, trial: Plan, views: Sequence[View], sky: SkyModel | None) -> TrainState:
-    state = TrainState.begin(start, trial, sky)
-    state.iteration, state.sampling = PILOT_ITERATION, sampling_of(trial, views)
+def _pilot_state(start: Gaussians, trial: Plan, sky: SkyModel | None) -> TrainState:
+    state = TrainState.begin(start, trial, make_techniques(trial, sky))
+    state.iteration = PILOT_ITERATION
     return state
 
 

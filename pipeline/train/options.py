@@ -29,7 +29,7 @@ GONE = {
     **dict.fromkeys(
         (
             *("exposure_side", "exposure_levels", "exposure_smoothness", "refine_cameras", "refine_decay"),
-            *("lr_cameras", "opacity_decay", "scale_decay", "depth_weight", "sh_limit", "max_anisotropy"),
+            *("lr_cameras", "opacity_decay", "scale_decay", "depth_weight", "sh_limit", "max_anisotropy", "filter_3d"),
         ),
         _NO_GAIN,
     ),
@@ -62,8 +62,6 @@ class TrainConfig(StageConfig):
     trained along. The splat keeps the photos' mean appearance."""
     antialias: bool = True
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
-    filter_3d: bool = False
-    """3D smoothing filter (Mip-Splatting): no Gaussian finer than the photos could show; for close-up views."""
     background: Literal["black", "white", "random"] = "random"
     """What is behind the Gaussians in training; `random` (a colour an iteration) forbids holes."""
     coarse_levels: Annotated[int, Field(ge=0, le=4)] = 0

@@ -13,6 +13,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import Split, View
 from splatpipe.pipeline.render.rendering import Rendering
@@ -67,6 +68,13 @@ class Plan:
         white = self.options.background == "white"
         behind = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
         return Rendering(self.options.antialias, behind, self.near, self.megapixels)
+
+    def figures(self) -> dict[str, JSON]:
+        """Options and schedule as one flat table, for people."""
+        schedule = asdict(self.schedule)
+        parts = {f"{part}_{name}": value for part in ("rates", "density") for name, value in schedule.pop(part).items()}
+        found = schedule | parts | self.options.model_dump(mode="json")
+        return found | {"initial_gaussians": self.initial_gaussians}
 
     def digest(self) -> str:
         """sha256 of ``to_json``: names the plan in its checkpoints."""

@@ -25,7 +25,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster.rasterizer import Render
+from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them
@@ -53,11 +56,13 @@ def share_at(robust: float, begin: int, iteration: int) -> float:
     return robust * min(1.0, max(0.0, iteration / begin - 1.0))
 
 
-class Robust:
+class Robust(Technique):
     """What is known of every photo's residuals, and what follows for its pixels.
 
     Args:
         names: Of the photos trained on.
+        most: Share of the cells that stand out at most.
+        begin: First iteration of density control.
 
     Attributes:
         scores: (n, GRID, GRID) residual of each cell, ``UNKNOWN`` where there is none.
@@ -66,7 +71,10 @@ class Robust:
         cameras: Of the photos in the order of ``scores``; not in the checkpoint.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
+    name = "robust"
+
+    def __init__(self, names: Sequence[str], most: float = 0.0, begin: int = 1) -> None:
+        self._most, self._begin = most, begin
         self._row = {name: row for row, name in enumerate(sorted(names))}
         self.scores = torch.full((len(names), GRID, GRID), UNKNOWN)
         self.threshold = torch.full((1,), torch.inf)
@@ -76,6 +84,22 @@ class Robust:
     def watch(self, cameras: Iterable[Camera]) -> None:
         """Say where the photos were taken, of any size; without it nothing is contradicted, so nothing left out."""
         self.cameras = sorted(cameras, key=lambda camera: self._row[camera.name])
+
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+        """With depths, by which the photos' places are compared."""
+        return replace(settings, depth=True)
+
+    def counted(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
+        """The photo without what the others contradict."""
+        return self.look(photo, shot.rendered, picture)
+
+    def after_epoch(self, iteration: int) -> None:
+        """Take the threshold for the next one."""
+        self.end_epoch(share_at(self._most, self._begin, iteration))
+
+    def summary(self) -> dict[str, int | float]:
+        """What the last visits left out."""
+        return {"robust_left_out": round(self.share_left_out(), 5)}
 
     def look(self, photo: TrainingPhoto, rendered: Render, shown: Float[Tensor, "h w 3"]) -> TrainingPhoto:
         """Remember a photo's residuals; the photo without what the others contradict, or itself.

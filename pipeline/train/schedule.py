@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
+from splatpipe.pipeline.train.draws import BACKGROUND, uniform
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
 
@@ -18,6 +19,39 @@ UNTIL = 0.5  # of the run there is density control: published
 GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified
 PUBLISHED_GRADIENT = 2e-4  # the same of the signed sum
 BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the forecast, but not into noise
+TAIL_SHARE = 0.1  # of the iterations done when the loss is flat: what the rest of the schedule is compressed into
+
+RGB = tuple[float, float, float]
+BACKGROUNDS: dict[str, RGB | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What the schedule says of one iteration.
+
+    Attributes:
+        iteration: Which, from 1.
+        place: The iteration of the schedule whose rates it has: in the tail of a flat training it runs ahead.
+        share: Of the schedule that is done, 0..1.
+        seed: Of everything random.
+        sh_degree: That is trained.
+        background: What is behind the Gaussians, red, green, blue.
+        means_rate: Learning rate of positions, times the scene's extent.
+        is_observed: Whether density control looks on.
+    """
+
+    iteration: int
+    place: int
+    share: float
+    seed: int
+    sh_degree: int
+    background: RGB
+    means_rate: float
+    is_observed: bool
+
+    def colour(self, stream: int) -> RGB:
+        """A random colour of the iteration's own; ``stream`` as in ``draws``."""
+        return random_colour(self.seed, self.iteration, stream)
 
 
 @dataclass(frozen=True)
@@ -32,6 +66,7 @@ class Schedule:
         coarse_levels: How often photos are halved at the start.
         coarse_until: Iteration from which they have their full size.
         dropout: Share of the Gaussians left out at the end.
+        background: What is behind the Gaussians, red, green, blue; None for another colour each iteration.
         rates: Learning rates.
         density: Of density control.
     """
@@ -43,6 +78,7 @@ class Schedule:
     coarse_levels: int
     coarse_until: int
     dropout: float
+    background: RGB | None
     rates: Rates
     density: DensitySchedule
 
@@ -54,7 +90,34 @@ class Schedule:
             KeyError, TypeError: if they are no schedule's.
         """
         parts = {"rates": Rates(**fields["rates"]), "density": DensitySchedule(**fields["density"])}
-        return Schedule(**{**fields, **parts})
+        behind = fields["background"]
+        return Schedule(**{**fields, **parts, "background": None if behind is None else tuple(behind)})
+
+    def at(self, iteration: int, flat_at: int = 0) -> Moment:
+        """What holds in an iteration.
+
+        Args:
+            iteration: From 1.
+            flat_at: Iteration after which the tail of a flat training began; 0 where it did not.
+        """
+        place = self.place(iteration, flat_at)
+        share = min(1.0, place / self.iterations)
+        return Moment(
+            iteration=iteration,
+            place=place,
+            share=share,
+            seed=self.seed,
+            sh_degree=self.sh_degree_at(iteration),
+            background=self.background or random_colour(self.seed, iteration, BACKGROUND),
+            means_rate=self.rates.means_at(share),
+            is_observed=self.density.on and iteration <= self.density.last,
+        )
+
+    def place(self, iteration: int, flat_at: int) -> int:
+        """The iteration of the schedule whose rates an iteration has: in the tail it runs ahead, to the last."""
+        if flat_at == 0 or iteration <= flat_at:
+            return iteration
+        return flat_at + (iteration - flat_at) * (self.iterations - flat_at) // tail_of(flat_at)
 
     def sh_degree_at(self, iteration: int) -> int:
         """The degree trained at an iteration (from 1): one more every ``sh_every``."""
@@ -70,9 +133,16 @@ class Schedule:
         """``coarse_level_at`` for every iteration up to the last."""
         return [self.coarse_level_at(iteration) for iteration in range(1, last + 1)]
 
-    def means_rate(self, place: int) -> float:
-        """Learning rate of the positions at a place in the schedule, times the scene's extent."""
-        return self.rates.means_at(place / self.iterations)
+
+def tail_of(flat_at: int) -> int:
+    """Iterations that a training goes on for after its loss was flat."""
+    return max(1, round(TAIL_SHARE * flat_at))
+
+
+def random_colour(seed: int, iteration: int, stream: int) -> RGB:
+    """A colour of its own for every iteration; ``stream`` as in ``draws``."""
+    red, green, blue = uniform(seed, iteration, stream, [0, 1, 2]).tolist()
+    return red, green, blue
 
 
 def share_of_few(photos: int) -> float:
@@ -96,6 +166,7 @@ def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> Schedule
         coarse_levels=config.coarse_levels,
         coarse_until=int(run * UNTIL),
         dropout=round(FEW_DROPOUT * share_of_few(photos), 4) if config.dropout == "auto" else config.dropout,
+        background=BACKGROUNDS[config.background],
         rates=PUBLISHED if config.density == "published" else rates_of(run),
         density=_density(config),
     )

@@ -26,6 +26,8 @@ from splatpipe.pipeline.photos.images import reduced_sky, reduced_view
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
+from splatpipe.pipeline.train.draws import ELSEWHERE
+from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.side import SideModel
 
 LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
@@ -57,12 +59,14 @@ class SeenSky:
     around: Bool[Tensor, "h w"]
 
 
-class SkyModel(SideModel):
+class SkyModel(SideModel, Technique):
     """The panorama that is trained, and the sky's masks.
 
     Attributes:
         panorama: Its colours are a leaf of autograd.
     """
+
+    name = "sky"
 
     def __init__(
         self, up: Float64[np.ndarray, " 3"], colours: Float32[np.ndarray, "cells 3"], masks: Mapping[str, SkyMask]
@@ -77,6 +81,7 @@ class SkyModel(SideModel):
         super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
         self.panorama = Panorama(up, self.tensors[_COLOURS])
         self._masks = {name: mask for name, mask in masks.items() if mask.any()}
+        self._seen: SeenSky | None = None  # of the photo that is trained on
 
     @property
     def photos(self) -> int:
@@ -112,6 +117,24 @@ class SkyModel(SideModel):
         colours = first_colours(((photo(index), masks[index].unpacked()) for index in shown), up)
         return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
 
+    def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
+        """The render before the sky, or before another colour where the photo shows none."""
+        camera, behind = shot.photo.camera, shot.settings.background
+        self._seen = self.seen(camera)
+        return self.composite(shot.rendered, camera, self._seen, behind, shot.now.colour(ELSEWHERE))
+
+    def penalty(self, shot: Shot) -> Float[Tensor, ""]:
+        """Opacity before the sky, and the sky's roughness."""
+        return self.loss(shot.rendered.alpha, self._seen)
+
+    def after_step(self, shot: Shot) -> None:
+        """Step the colours."""
+        self.step(shot.now.share)
+
+    def summary(self) -> dict[str, int | float]:
+        """In how many photos it is."""
+        return {"sky_photos": self.photos}
+
     def composite(
         self, rendered: Render, camera: Camera, seen: SeenSky | None, background: RGB, elsewhere: RGB
     ) -> Float[Tensor, "h w 3"]:
@@ -134,7 +157,7 @@ class SkyModel(SideModel):
         behind = torch.where(seen.around[:, :, None], behind, flat.behind(camera, background))
         return laid_over(rendered.colour, rendered.alpha, background, behind)
 
-    def penalty(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None) -> Float[Tensor, ""]:
+    def loss(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None) -> Float[Tensor, ""]:
         """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness."""
         loss = SMOOTHNESS * roughness(self.panorama.colours)
         return loss if seen is None else loss + OPACITY_WEIGHT * torch.where(seen.mask, alpha, 0.0).mean()

@@ -23,13 +23,12 @@ from splatpipe.pipeline.splat.panorama import Panorama, read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.handover import in_world
-from splatpipe.pipeline.train.smoothing import smoothed
 from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, viewer_splat
 
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
 JPEG_QUALITY = 92
-SKY, FILTER = "sky.colours", "filter_sigmas"  # arrays of a checkpoint
+SKY = "sky.colours"  # array of a checkpoint
 
 
 @dataclass(frozen=True)
@@ -171,14 +170,10 @@ def _from_checkpoint(path: Path, opened: Contents) -> tuple[Gaussians, Panorama 
     try:
         with np.load(path, allow_pickle=False) as archive:
             tensors = {name: torch.from_numpy(archive[name]) for name in PARAMETERS}
-            sigmas = torch.from_numpy(archive[FILTER]) if FILTER in archive.files else None
             colours = torch.from_numpy(archive[SKY]) if SKY in archive.files else None
         gaussians = Gaussians.from_tensors(tensors)
     except Exception as error:  # the readers of zip, of headers and of arrays raise almost anything on broken files
         raise SplatpipeError(f"The checkpoint cannot be read: {' '.join(str(error).split())[:120]}") from error
-    if sigmas is not None:
-        with torch.no_grad():
-            gaussians = smoothed(gaussians, sigmas)
     gaussians = gaussians.select(gaussians.finite())
     sky = None
     if colours is not None and "georef.frame" in opened.parts:

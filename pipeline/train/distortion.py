@@ -9,13 +9,17 @@ no more than that: past a roof's edge a pixel rightly sees two depths.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.schedule import Moment
 
 FIRST_SHARE = 0.2  # of the run, without it: the surface has to be found first
 LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth
@@ -23,14 +27,34 @@ FREE_PX = 0.5  # standard deviation that costs nothing, pixels on the ground
 HALF_PX = 10.0  # beyond it at which half of the most is reached
 
 
-def is_spread_counted(options: TrainConfig, place: int) -> bool:
-    """Whether an iteration's loss has a part for the spread of depths.
+class Distortion(Technique):
+    """Adds the spread of the depths along each ray to the loss.
 
     Args:
-        options: The training's.
-        place: Of the iteration in the schedule, from 1.
+        weight: In the loss.
+        iterations: Of the schedule.
     """
-    return options.distortion_weight > 0.0 and place > FIRST_SHARE * options.iterations
+
+    name = "distortion"
+
+    def __init__(self, weight: float, iterations: int) -> None:
+        self._weight, self._iterations = weight, iterations
+
+    def is_counted(self, place: int) -> bool:
+        """Whether it has a part in the loss at a place of the schedule, from 1."""
+        return place > FIRST_SHARE * self._iterations
+
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+        """With depths, measured from where float32 tells them best."""
+        if not self.is_counted(now.place):
+            return settings
+        return replace(settings, depth=True, depth_origin=depth_origin(model.means, camera))
+
+    def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
+        """The spread of the photo's rays, weighted."""
+        if not self.is_counted(shot.now.place):
+            return None
+        return self._weight * spread_loss(shot.rendered, shot.settings.depth_origin, shot.photo.camera)
 
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:

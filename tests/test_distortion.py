@@ -11,11 +11,13 @@ import torch
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train.layers import FREE_PX, HALF_PX, depth_origin, is_spread_counted, spread_loss
+from splatpipe.pipeline.train.distortion import FREE_PX, HALF_PX, Distortion, depth_origin, spread_loss
+from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.techniques import make_techniques
 from splatpipe.stages import initialize, train
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -83,9 +85,12 @@ def test_gradient_agrees_with_finite_differences() -> None:
 
 
 def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> None:
-    options = tiny_scene.plain(iterations=100, distortion_weight=0.1)
-    assert not is_spread_counted(options, 20) and is_spread_counted(options, 21)
-    assert not is_spread_counted(tiny_scene.plain(iterations=100), 90)
+    distortion = Distortion(0.1, iterations=100)
+    assert not distortion.is_counted(20) and distortion.is_counted(21)
+    views = [View(camera, Path(), None) for camera in tiny_scene.cameras()]
+    for weight in (0.0, 0.1):
+        plan = make_plan(tiny_scene.plain(distortion_weight=weight), views, tiny_scene.split_of(views), 9)
+        assert (make_techniques(plan).find(Distortion) is not None) == (weight > 0.0)
 
 
 def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+"""One iteration of training, from top to bottom.
+
+What is not always there is a technique: an object with the hooks of ``hooks.Technique``, which ``iterate`` calls where
+it stands. To add one, write it in a file of its own with the hooks that it needs, and list it in ``techniques.py``; an
+option in ``options.py`` turns it on. What it trains is kept in checkpoints through ``to_arrays`` and ``load``.
+What changes with the iteration is told by ``Schedule.at``, resolved before the first one.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
+from splatpipe.pipeline.train.flatness import ends_at, is_flat, settled_from
+from splatpipe.pipeline.train.hooks import Shot
+from splatpipe.pipeline.train.memory import over_memory
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
+
+SSIM_WEIGHT = 0.2  # share of 1 - SSIM in the loss, the rest is L1: published
+
+
+def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    """Render, compare, step the parameters, then density control where it is due.
+
+    Args:
+        state: Changed in place; afterwards it is of the next iteration.
+        plan: The training's.
+        photo: What to compare with.
+    """
+    now = plan.schedule.at(state.iteration + 1, state.history.flat_at)
+    if photo.mask is None or bool(photo.mask.any()):
+        techniques = state.techniques
+        # Render.
+        magnitudes = now.is_observed and state.density.magnitudes
+        settings = techniques.settings(render_options(plan, now, magnitudes), state.gaussians, photo.camera, now)
+        probe = torch.zeros(len(state.gaussians), 2, requires_grad=True) if now.is_observed else None
+        model = techniques.before_render(state.gaussians, now)
+        rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
+        # Show.
+        shot = Shot(photo, rendered, settings, now)
+        picture = techniques.shown(shot)
+        # Loss.
+        counted = techniques.counted(picture, shot)
+        measure = photo_loss if plan.options.loss == "native" else photo_loss_reference
+        photometric = measure(picture, counted.colour, SSIM_WEIGHT, counted.mask)
+        loss = techniques.with_penalties(photometric, shot)
+        # Backward.
+        loss.backward()  # type: ignore[no-untyped-call]
+        state.history.add_loss(float(photometric.detach()))
+        # Step.
+        with torch.no_grad():
+            if probe is not None and probe.grad is not None:
+                state.density.observe(rendered, probe.grad, plan.schedule.density)
+            state.step(rendered.visible, now, plan)
+            techniques.after_step(shot)
+    # Density.
+    if now.iteration % len(plan.train_views) == 0:
+        state.techniques.after_epoch(now.iteration)
+    state.control_density(plan, now.iteration)
+    close(state, plan, photo, now)
+
+
+def render_options(plan: Plan, now: Moment, magnitudes: bool) -> rasterizer.RenderOptions:
+    """How an iteration renders; with ``magnitudes`` of the screen gradient where density control looks on."""
+    return rasterizer.RenderOptions(
+        sh_degree=now.sh_degree,
+        background=now.background,
+        antialias=plan.options.antialias,
+        near=plan.near,
+        depth=False,
+        magnitudes=magnitudes,
+    )
+
+
+def close(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> None:
+    """Count the iteration, and note what followed from it: the memory's end of growth, a flat loss, the curve."""
+    history, photos = state.history, len(plan.train_views)
+    if not history.growth_ended and plan.schedule.density.is_step(now.iteration) and over_memory(plan.options):
+        history.growth_ended = now.iteration
+    state.iteration = now.iteration
+    if plan.options.stop_when_flat > 0.0 and now.iteration % photos == 0:
+        history.end_epoch(now.iteration - photos // 2, now.iteration - photos >= settled_from(plan.schedule))
+        if not history.flat_at and is_flat(history.epochs, plan, now.iteration):
+            history.flat_at = now.iteration
+    is_last = now.iteration == ends_at(plan, history.flat_at)
+    history.end_iteration(now.iteration, is_last, curve_facts(state, plan, photo))
+
+
+def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str, int]:
+    """What a point of the history's curve says besides the loss."""
+    return {
+        "gaussians": len(state.gaussians),
+        "sh_degree": plan.schedule.sh_degree_at(state.iteration),
+        "width": photo.camera.width,
+    }

@@ -1,0 +1,169 @@
+"""The optional techniques of training, made in one place; each has a file of its own."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.clearing import Clearing, free_space_of
+from splatpipe.pipeline.train.distortion import Distortion
+from splatpipe.pipeline.train.dropout import Dropout
+from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.robust import Robust
+from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.stream import TrainingPhoto
+
+Kind = TypeVar("Kind", bound=Technique)
+
+
+def make_techniques(
+    plan: Plan, sky: SkyModel | None = None, views: Sequence[View] = (), dataset: Path | None = None
+) -> Techniques:
+    """Those that a plan asks for, nothing of them trained.
+
+    The order is that in which an iteration calls them: the sky lies behind what exposure changes, and what is moving
+    is told from the picture that both have made.
+
+    Args:
+        plan: The training's.
+        sky: As it begins; copied.
+        views: Those trained on.
+        dataset: Theirs, with the sparse points; None for a training that is thrown away.
+
+    Raises:
+        StageError: if the dataset is broken.
+    """
+    options, schedule = plan.options, plan.schedule
+    made: list[Technique] = []
+    if schedule.dropout:
+        made.append(Dropout(schedule))
+    if sky is not None:
+        made.append(copy.deepcopy(sky))
+    if options.exposure == "affine":
+        made.append(Exposure(plan.train_views))
+    if options.robust:
+        robust = Robust(plan.train_views, options.robust, schedule.density.first)
+        robust.watch(view.camera for view in views)
+        made.append(robust)
+    if options.distortion_weight:
+        made.append(Distortion(options.distortion_weight, options.iterations))
+    if options.prune_free_space and dataset is not None:
+        made.append(Clearing(free_space_of(views, dataset), schedule))
+    return Techniques(tuple(made))
+
+
+def begin_sky(
+    config: TrainConfig, views: Sequence[View], dataset: Path, threads: int, report: Reporter
+) -> SkyModel | None:
+    """The sky to be trained; None where it is off or none of the photos shows any."""
+    if config.sky == "off":
+        return None
+    sky = SkyModel.begin(views, dataset, threads)
+    if sky is not None:
+        report.note(f"sky in {sky.photos} photos")
+    return sky
+
+
+@dataclass(frozen=True)
+class Techniques:
+    """All of a training's, one after the other.
+
+    Attributes:
+        each: In the order in which they are called.
+    """
+
+    each: tuple[Technique, ...] = ()
+
+    def __iter__(self) -> Iterator[Technique]:
+        return iter(self.each)
+
+    def find(self, kind: type[Kind]) -> Kind | None:
+        """The one of a kind; None where it is off."""
+        return next((technique for technique in self.each if isinstance(technique, kind)), None)
+
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+        """How to render."""
+        for technique in self.each:
+            settings = technique.settings(settings, model, camera, now)
+        return settings
+
+    def before_render(self, model: Gaussians, now: Moment) -> Gaussians:
+        """The model as it is rendered in this iteration."""
+        for technique in self.each:
+            model = technique.before_render(model, now)
+        return model
+
+    def shown(self, shot: Shot) -> Float[Tensor, "h w 3"]:
+        """The render as the photo would show it."""
+        picture = shot.rendered.colour
+        for technique in self.each:
+            picture = technique.shown(picture, shot)
+        return picture
+
+    def counted(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
+        """The photo with what of it counts."""
+        photo = shot.photo
+        for technique in self.each:
+            photo = technique.counted(photo, picture, shot)
+        return photo
+
+    def with_penalties(self, loss: Float[Tensor, ""], shot: Shot) -> Float[Tensor, ""]:
+        """The photo's loss and what is added to it."""
+        for technique in self.each:
+            penalty = technique.penalty(shot)
+            loss = loss if penalty is None else loss + penalty
+        return loss
+
+    def after_step(self, shot: Shot) -> None:
+        """Step what is trained beside the Gaussians."""
+        for technique in self.each:
+            technique.after_step(shot)
+
+    def after_epoch(self, iteration: int) -> None:
+        """Every photo was trained on once more."""
+        for technique in self.each:
+            technique.after_epoch(iteration)
+
+    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+        """Which Gaussians have to go after an iteration; None where it is not one to look."""
+        found = [technique.unwanted(gaussians, iteration) for technique in self.each]
+        masks = [mask for mask in found if mask is not None]
+        return torch.stack(masks).any(dim=0) if masks else None
+
+    def summary(self) -> dict[str, int | float]:
+        """What the stage's summary says of them."""
+        return {name: value for technique in self.each for name, value in technique.summary().items()}
+
+    def to_arrays(self) -> dict[str, Tensor]:
+        """All that changes, for a checkpoint: ``technique.tensor``."""
+        return {
+            f"{technique.name}.{name}": tensor
+            for technique in self.each
+            for name, tensor in technique.to_arrays().items()
+        }
+
+    def load(self, arrays: Mapping[str, Tensor]) -> None:
+        """The inverse of ``to_arrays``; may have changed some where it fails.
+
+        Raises:
+            KeyError, ValueError: if something is missing or has another shape.
+        """
+        for technique in self.each:
+            under = f"{technique.name}."
+            technique.load({key.removeprefix(under): array for key, array in arrays.items() if key.startswith(under)})
