@@ -121,17 +121,18 @@ def _without_running(then: StageSources | None, now: StageSources) -> Verdict | 
 
 
 def _verdict(found: Mapping[str, Any], before: Mapping[str, str]) -> Verdict:
-    if "failed" in found:
-        return Verdict(False, f"fails on what was left before ({found['failed']})")
     now, reused = found["files"], found["reused"]
     names = {*now, *before} if reused else {*now} & {*before}
     changed = sorted(name for name in names if now.get(name) != before.get(name))
-    bits = f"other bits in {', '.join(changed)}" if changed else f"the same bits in all {len(names)} files"
+    if "failed" in found:
+        bits = f"fails on what was left before: {found['failed']}"
+    elif changed:
+        bits = f"other bits in {', '.join(changed)}"
+    else:
+        bits = f"the same bits in all {len(names)} files"
     if reused:
         return Verdict(not changed, bits)
-    return Verdict(
-        True, f"has other options, inputs or parts, so nothing from before is reused ({bits} that both leave)"
-    )
+    return Verdict(True, f"has other options, inputs or parts, so nothing from before is reused (else: {bits})")
 
 
 def _check(done: subprocess.CompletedProcess[str]) -> None:

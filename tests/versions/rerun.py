@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,22 +62,23 @@ def _run(stage: Stage, runner: Runner, parts: dict[str, Part], artifacts: Mappin
     """Run one stage; its parts join those that the earlier run left, and replace none."""
     line = replace(runner.line, stages=(stage,), source=parts)
     earlier = artifacts.get(stage.name)
+    inputs = asdict(line.inputs_of(stage, parts))
+    reused = earlier is not None and _asked(earlier.manifest["inputs"], earlier.manifest["parts"]) == _asked(
+        inputs, stage.parts
+    )
     try:
         done = replace(runner, line=line, outcome=Outcome(dict(artifacts))).walk().artifacts[stage.name]
     except SplatpipeError as error:
-        return {"failed": error.message}
+        return {"reused": reused, "failed": error.message, "files": {}}
     for name, part in done.parts.items():
         parts.setdefault(name, part)
-    reused = earlier is not None and _asks(earlier.manifest) == _asks(done.manifest)
     files = {file["path"]: file["sha256"] for part in done.manifest["parts"].values() for file in part["files"]}
     return {"reused": reused, "files": files}
 
 
-def _asks(manifest: Mapping[str, Any]) -> dict[str, list[str]]:
+def _asked(inputs: Mapping[str, Any], parts: Iterable[str]) -> dict[str, list[str]]:
     """What a key is made of and an artifact has to have, without their values: where it changed, nothing is reused."""
-    inputs = manifest["inputs"]
-    asked = {kind: sorted(inputs[kind]) for kind in ("config", "borrowed", "reads")}
-    return {**asked, "parts": sorted(manifest["parts"])}
+    return {**{kind: sorted(inputs[kind]) for kind in ("config", "borrowed", "reads")}, "parts": sorted(parts)}
 
 
 if __name__ == "__main__":
