@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from splatpipe.pipeline.engine.stage import JSON
 
@@ -50,6 +50,17 @@ class Event:
 
 
 Sink = Callable[[Event], None]
+
+
+def parse_event(line: bytes) -> Event | None:
+    """The event of a line of ``events.jsonl``; None where it is none: the log is for reading, not for believing."""
+    try:
+        told = json.loads(line)
+        if told["kind"] in get_args(Kind) and isinstance(told["data"], dict):
+            return Event(told["kind"], str(told["stage"]), told["data"], float(told["time_s"]))
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        pass
+    return None
 
 
 class EventReporter:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+
+from splatpipe.pipeline.engine.events import Event, parse_event
 
 Facts = Mapping[str, Any]
 State = Literal["finished", "reused", "failed", "stopped", "broken off", "running", "not reached"]
@@ -124,16 +125,13 @@ def read_story(path: Path, *, running: bool) -> Story:
     return reader.finish(running)
 
 
-def _events(path: Path) -> Iterator[Facts]:
+def _events(path: Path) -> Iterator[Event]:
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - MAX_BYTES))
             while line := file.readline(MAX_LINE):
-                try:
-                    event = json.loads(line)
-                except (ValueError, RecursionError):
-                    continue
-                if isinstance(event, dict) and isinstance(event.get("data"), dict):
+                event = parse_event(line)
+                if event is not None:
                     yield event
     except OSError:
         return
@@ -147,12 +145,9 @@ class _Reader:
         self._told: dict[tuple[str, str], Told] = {}
         self._keys: dict[str, str] = {}
 
-    def take(self, event: Facts) -> None:
-        data, name = event["data"], str(event["stage"])
-        self._story.ended_s = float(event["time_s"])
-        take = getattr(self, f"_{event['kind']}", None)
-        if take is not None:
-            take(name, data)
+    def take(self, event: Event) -> None:
+        self._story.ended_s = event.time_s
+        getattr(self, f"_{event.kind}")(event.stage, event.data)
 
     def finish(self, running: bool) -> Story:
         story = self._story

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from splatpipe.pipeline.app.view.files import NotThereError, open_inside
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.events import parse_event
 from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.stages.options import LineConfig
@@ -146,10 +145,12 @@ class RunLog:
         """A line that is no event of ours is passed over: the log is for reading, not for believing."""
         if len(line) > LONGEST_LINE:
             return
+        event = parse_event(line)
+        if event is None:
+            return
         try:
-            event: dict[str, Any] = json.loads(line)
-            self._event(str(event["kind"]), str(event["stage"]), event["data"], float(event["time_s"]))
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+            self._event(event.kind, event.stage, event.data, event.time_s)
+        except (ValueError, KeyError, TypeError, OverflowError):
             return
 
     def _event(self, kind: str, stage: str, data: Mapping[str, JSON], time_s: float) -> None:
