@@ -18,6 +18,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.photos.images import load_colour
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import iteration, loop
@@ -144,6 +145,7 @@ def test_killed_training_goes_on_and_ends_with_the_same_bits(
         die_at(patch, when, killed)
         trained(scene, tmp_path)
     assert (tmp_path / loop.CHECKPOINT).exists() == (when > 1)
+    assert load_rendering(tmp_path / "rendering.json").antialias == QUICK.antialias  # before the first iteration, too
     recorder = tiny_scene.Recorder()
     train.run(QUICK, make_inputs(scene, threads=2), tmp_path, recorder)
     assert not recorder.warnings

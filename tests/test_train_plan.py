@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.render.rendering import Rendering, load_rendering
 from splatpipe.pipeline.train.checkpoint import (
     BrokenCheckpointError,
     Checkpoint,
@@ -112,6 +113,29 @@ def test_short_runs_take_longer_steps() -> None:
     schedule = resolve_schedule(TrainConfig(iterations=7500))
     assert schedule.at(0).means_rate == pytest.approx(2.0 * 1.6e-4)
     assert schedule.at(7500).means_rate == pytest.approx(4.0 * 1.6e-6)
+
+
+def test_what_holds_in_an_iteration_is_told_by_the_schedule() -> None:
+    schedule = resolve_schedule(TrainConfig(iterations=1000, background="white"))
+    first, later, flat = schedule.at(1), schedule.at(600), schedule.at(550, flat_at=500)
+    assert (first.sh_degree, later.sh_degree) == (0, 3) and (first.is_observed, later.is_observed) == (True, False)
+    assert (later.place, later.share) == (600, 0.6) and (flat.place, flat.share) == (1000, 1.0)
+    assert first.background == later.background == (1.0, 1.0, 1.0)
+    random = resolve_schedule(TrainConfig(iterations=1000, background="random"))
+    assert random.at(7) == random.at(7) and random.at(7).background != random.at(8).background
+    assert all(0.0 < channel < 1.0 for channel in random.at(7).background)
+
+
+@pytest.mark.parametrize(("background", "behind"), [("black", 0.0), ("white", 1.0), ("random", 0.0)])
+def test_how_to_render_follows_from_the_plan_and_survives_its_file(
+    tmp_path: Path, background: str, behind: float
+) -> None:
+    config = TrainConfig.model_validate({"background": background, "antialias": behind > 0.0})
+    plan = make_plan(config, views(), tiny_scene.split_of(views()), 9)
+    assert Plan.from_json(plan.to_json()) == plan
+    (tmp_path / "rendering.json").write_text(plan.rendering().to_json())
+    found = load_rendering(tmp_path / "rendering.json")
+    assert found == plan.rendering() == Rendering(behind > 0.0, (behind,) * 3, plan.near, None)
 
 
 def test_coarse_photos_come_first_in_equal_shares() -> None:

@@ -65,8 +65,7 @@ class Plan:
 
     def rendering(self) -> Rendering:
         """How the model is to be rendered: a random background is black."""
-        white = self.options.background == "white"
-        behind = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+        behind = self.schedule.background or (0.0, 0.0, 0.0)
         return Rendering(self.options.antialias, behind, self.near, self.megapixels)
 
     def figures(self) -> dict[str, JSON]:
