@@ -269,7 +269,7 @@ def test_what_changed_while_a_stage_read_it_becomes_no_artifact(numbers: Path, o
             (numbers / "b.txt").write_text("30")
 
     with (
-        pytest.raises(SplatpipeError, match="photos changed while the stage read"),
+        pytest.raises(SplatpipeError, match="photos changed while the stage read was reading them"),
         open_session(request_of(numbers, out), meddle) as runner,
     ):
         runner.walk()

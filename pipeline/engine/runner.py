@@ -277,9 +277,9 @@ class Runner:
         now = self.source_now()
         changed = [name for name in read if now.get(name, "") not in ("", self.line.source[name].digest)]
         if changed:
-            what = "The photos" if "source.photos" in changed else self.line.source[changed[0]].path.name
+            what = "The photos" if "source.photos" in changed else "The survey's files"
             raise SplatpipeError(
-                f"{what} changed while the stage {stage.name} read them.",
+                f"{what} changed while the stage {stage.name} was reading them.",
                 hint="Run again, when nobody writes there any more: what was made before is reused.",
             )
 
