@@ -9,6 +9,7 @@ cover yet is not painted into the sky. Away from the sky a random colour takes i
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -82,6 +83,10 @@ class SkyModel(SideModel, Technique):
         self.panorama = Panorama(up, self.tensors[_COLOURS])
         self._masks = {name: mask for name, mask in masks.items() if mask.any()}
         self._seen: SeenSky | None = None  # of the photo that is trained on
+
+    def copied(self) -> SkyModel:
+        """The same with tensors of its own; the masks, which nothing changes, are shared."""
+        return copy.deepcopy(self, {id(self._masks): self._masks})
 
     @property
     def photos(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +53,7 @@ def make_techniques(
     if schedule.dropout:
         made.append(Dropout(schedule))
     if sky is not None:
-        made.append(copy.deepcopy(sky))
+        made.append(sky.copied())
     if options.exposure == "affine":
         made.append(Exposure(plan.train_views))
     if options.robust:

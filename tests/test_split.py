@@ -1,0 +1,60 @@
+"""The stage that decides what is held out: its part, what it refuses, and who is asked for it."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Inputs
+from splatpipe.pipeline.photos.dataset import load_split
+from splatpipe.pipeline.photos.options import SplitConfig
+from splatpipe.stages import split
+from splatpipe.stages.line import LINE
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+NAMES = tuple(f"flight 1/photo_{number}.png" for number in range(tiny_scene.CAMERAS))
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    folder = tmp_path_factory.mktemp("split")
+    return Inputs({"undistort.dataset": tiny_scene.write_dataset(folder / "dataset")}, folder)
+
+
+@pytest.mark.parametrize(
+    ("config", "held_out"),
+    [
+        (SplitConfig(), (0, 8)),
+        (SplitConfig(every=4), (0, 4, 8)),
+        (SplitConfig(every=0), ()),
+        (SplitConfig(every=4, views="photo_3, photo_1"), (1, 3)),
+    ],
+)
+def test_its_part_names_both_kinds_in_order(
+    inputs: Inputs, tmp_path: Path, config: SplitConfig, held_out: tuple[int, ...]
+) -> None:
+    summary = split.run(config, inputs, tmp_path, tiny_scene.Recorder())
+    found = load_split(tmp_path / "split.json")
+    assert found.held_out == tuple(NAMES[number] for number in held_out)
+    assert found.train == tuple(name for name in NAMES if name not in found.held_out)
+    assert summary == {"trained_on": len(NAMES) - len(held_out), "held_out": len(held_out)}
+
+
+@pytest.mark.parametrize("config", [SplitConfig(every=1), SplitConfig(views="photo_99")])
+def test_a_split_that_leaves_nothing_or_names_nobody_is_refused(
+    inputs: Inputs, tmp_path: Path, config: SplitConfig
+) -> None:
+    with pytest.raises(SplatpipeError) as raised:
+        split.run(config, inputs, tmp_path, tiny_scene.Recorder())
+    assert raised.value.hint and not (tmp_path / "split.json").exists()
+
+
+def test_no_stage_borrows_what_the_split_decides() -> None:
+    """All who ask read its part, after it."""
+    order = [stage.name for stage in LINE]
+    readers = [stage.name for stage in LINE if "split.views" in stage.reads]
+    assert readers == ["initialize", "train", "evaluate"] and order.index("split") < order.index("initialize")
+    assert not [name for stage in LINE for name in stage.borrows if name.startswith(("split.", "evaluate."))]
