@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
@@ -26,9 +26,6 @@ NEIGHBOURS = 3
 SMALLEST_PER_EXTENT = 1e-6  # size of a point on top of others, over the scene's size
 TINY = 1e-12  # a scene of one point at its camera has a size, too
 QUERY_CHUNK = 65_536
-KD_TREE_SINGLE = 4  # FLANN_INDEX_KDTREE_SINGLE: one exact tree, without random choices
-LEAF_SIZE = 10
-EXACT = -1  # FLANN_CHECKS_UNLIMITED
 
 
 def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -110,12 +107,11 @@ def point_sizes(xyz: Doubles, centres: Doubles, max_angle: float, report: Report
 
 def _distances(targets: Singles, points: Singles, count: int, report: Reporter | None = None) -> Doubles:
     """(n, count) distances from each point to its nearest targets, ascending."""
-    tree = cv2.flann_Index(targets, {"algorithm": KD_TREE_SINGLE, "leaf_max_size": LEAF_SIZE})
+    tree = cKDTree(targets)
     distances = np.empty((len(points), count))
     for start in range(0, len(points), QUERY_CHUNK):
         chunk = slice(start, start + QUERY_CHUNK)
-        _, squares = tree.knnSearch(points[chunk], count, params={"checks": EXACT})
-        distances[chunk] = np.sqrt(squares.astype(np.float64))
+        distances[chunk] = tree.query(points[chunk], range(1, count + 1))[0]
         if report is not None:
             report.progress(min(start + QUERY_CHUNK, len(points)), len(points), "measuring neighbours", "points")
     return distances

@@ -14,7 +14,7 @@ from splatpipe.pipeline.web.options import ExportConfig
 
 INGEST = Stage(
     "ingest",
-    version=3,
+    version=4,
     config=IngestConfig,
     reads=("source.photos", "source.geo", "source.lens"),
     parts={
@@ -49,7 +49,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=3,
+    version=4,
     config=SparseConfig,
     reads=(
         "matches.database",
@@ -66,7 +66,7 @@ SPARSE = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=4,
+    version=5,
     config=GeorefConfig,
     reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
     parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
@@ -92,7 +92,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=1,
+    version=2,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views"),
     parts={"splat": "init.ply"},
@@ -100,7 +100,7 @@ INITIALIZE = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=5,
+    version=6,
     config=TrainConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat"),
     parts={
@@ -116,7 +116,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=7,
+    version=8,
     config=EvaluateConfig,
     reads=(
         "train.model",
@@ -133,7 +133,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=3,
+    version=4,
     config=ExportConfig,
     reads=(
         "train.model",
@@ -161,7 +161,7 @@ EXPORT = Stage(
 
 FLYTHROUGH = Stage(
     "flythrough",
-    version=1,
+    version=2,
     config=FlythroughConfig,
     reads=("train.model", "train.rendering", "train.sky", "undistort.dataset"),
     parts={"film": "film"},

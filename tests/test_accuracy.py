@@ -13,8 +13,8 @@ import torch
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
-from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render import rendering
 from splatpipe.pipeline.render.options import EvaluateConfig
@@ -28,8 +28,8 @@ from splatpipe.stages import evaluate
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-TURN = rotation_matrix(np.array([0.25, -0.2, 0.1]))  # of the wall, in the model's frame: seen at a slant
-WORLD_FROM_MODEL = Similarity(12.5, rotation_matrix(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
+TURN = rotation_from_vector(np.array([0.25, -0.2, 0.1]))  # of the wall, in the model's frame: seen at a slant
+WORLD_FROM_MODEL = Similarity(12.5, rotation_from_vector(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
 RENDERED = 6e-3  # metres, of a pixel's 0.089: the screen filter draws what is seen at a slant a little nearer
 
 

@@ -4,14 +4,15 @@ import numpy as np
 import pycolmap
 import pytest
 
-from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
+from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 
 
 @pytest.fixture
 def camera() -> Camera:
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation_matrix(np.array([0.3, -0.2, 0.9])), [0.4, -0.3, 2.0]
+    pose[:3, :3], pose[:3, 3] = rotation_from_vector(np.array([0.3, -0.2, 0.9])), [0.4, -0.3, 2.0]
     return Camera("a.jpg", 90, 60, 80.0, 85.0, 44.0, 31.0, pose)
 
 

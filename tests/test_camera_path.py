@@ -28,7 +28,8 @@ from splatpipe.pipeline.film.clearance import Clearance
 from splatpipe.pipeline.film.keyframe_file import read_keyframes
 from splatpipe.pipeline.film.orbit import orbit
 from splatpipe.pipeline.film.photo_route import Capture, followed_photos, photo_film
-from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
 UP = np.array([0.48, -0.64, 0.6])
@@ -44,7 +45,9 @@ def photo(place: tuple[float, float, float], target: tuple[float, float, float],
     right = np.cross(view, [0.0, 0.0, 1.0])
     right = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(np.array([0.0, 0.0, roll])) @ np.stack((right, np.cross(view, right), view)) @ TILT.T
+    pose[:3, :3] = (
+        rotation_from_vector(np.array([0.0, 0.0, roll])) @ np.stack((right, np.cross(view, right), view)) @ TILT.T
+    )
     pose[:3, 3] = -pose[:3, :3] @ (TILT @ np.array(place))
     return Camera("photo.jpg", 400, 300, 300.0, 300.0, 200.0, 150.0, pose)
 
@@ -187,7 +190,7 @@ def test_a_swaying_kite_is_followed_where_it_looked() -> None:
         lean = 33.0 if k == 6 else 17.0 + 3.0 * (-1) ** k
         camera = photo((0.0, y, 30.0), (0.0, y, 0.0))
         turn = np.eye(4)
-        turn[:3, :3] = rotation_matrix(np.array([0.0, math.radians(lean), 0.0]))  # about the picture's top
+        turn[:3, :3] = rotation_from_vector(np.array([0.0, math.radians(lean), 0.0]))  # about the picture's top
         cameras.append(replace(camera, cam_from_world=turn @ camera.cam_from_world))
     route = film(cameras)
     assert np.ptp(route.headings) < 1e-9

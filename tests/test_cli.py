@@ -31,7 +31,7 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
         assert command in done.stdout
     code = (
         "import sys; from splatpipe.pipeline.app import cli; from splatpipe.stages import line\n"
-        "print([name for name in ('torch', 'numpy', 'pycolmap', 'cv2', 'kornia') if name in sys.modules])"
+        "print([name for name in ('torch', 'numpy', 'scipy', 'pycolmap', 'cv2', 'kornia') if name in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 

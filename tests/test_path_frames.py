@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from path_frames import Frame, change, nearest_first
@@ -13,7 +14,7 @@ from path_frames import Frame, change, nearest_first
 
 def camera(place: tuple[float, float, float], turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Camera:
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(np.array(turn))
+    pose[:3, :3] = rotation_from_vector(np.array(turn))
     pose[:3, 3] = -pose[:3, :3] @ np.array(place)
     return Camera("photo", 120, 90, 100.0, 100.0, 60.0, 45.0, pose)
 

@@ -23,8 +23,8 @@ from splatpipe.pipeline.film.filming import coloured_depth, coloured_normals, op
 from splatpipe.pipeline.film.keyframe_file import read_keyframes
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.film.photo_route import photo_film
-from splatpipe.pipeline.geometry.camera import Camera, rotation_matrix
-from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
@@ -206,7 +206,7 @@ def test_a_wrong_call_ends_with_its_code_and_no_traceback(demo_run: Path, argume
 
 def test_keyframes_of_the_world_are_found_in_the_models_frame(tmp_path: Path) -> None:
     """The camera stands at its keyframe, its target is in the middle, and up in the world is up in the picture."""
-    world = Similarity(12.5, rotation_matrix(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
+    world = Similarity(12.5, rotation_from_vector(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
     path = tmp_path / "path.json"
     path.write_text(json.dumps([{"position": [300, -80, 30], "target": [312, -86, 21], "fov_deg": 70}]))
     camera = tiny_scene.cameras()[0]
@@ -276,7 +276,7 @@ def test_sizes_that_no_film_has_are_refused(size: str) -> None:
 
 def test_normals_of_a_slanted_wall_are_its_own() -> None:
     """Flat Gaussians in a plane, seen at a slant from several sides: normals face the camera, wherever it is."""
-    turn = rotation_matrix(np.array([0.35, -0.25, 0.1]))
+    turn = rotation_from_vector(np.array([0.35, -0.25, 0.1]))
     side = np.arange(-2.5, 2.5, 0.08)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     wall = Gaussians.empty(len(x), 0)

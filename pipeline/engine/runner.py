@@ -23,7 +23,17 @@ from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary
 from splatpipe.pipeline.engine.store import MIN_FREE_BYTES, Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.worker import Task
 
-VERSIONED = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", "kornia", "numpy", "pillow", "pyproj")
+VERSIONED = (
+    "splatpipe",
+    "torch",
+    "pycolmap",
+    "opencv-contrib-python-headless",
+    "kornia",
+    "numpy",
+    "scipy",
+    "pillow",
+    "pyproj",
+)
 State = Literal["valid", "stale", "missing", "waiting"]
 
 

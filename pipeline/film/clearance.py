@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float64
+from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 OPAQUE = 0.5  # least opacity of what a camera must not fly through
 MOST_POINTS = 400_000  # of which the distance is taken: more tell nothing more about metres
 WITNESSES = 8  # so many points have to be that near: a few floaters are no wall
-KD_TREE_SINGLE = {"algorithm": 4, "leaf_max_size": 10}  # FLANN's one exact tree, without random choices
-EXACT = {"checks": -1}
 
 
 class Clearance:
@@ -27,17 +25,13 @@ class Clearance:
         """
         solid = solid[np.isfinite(solid).all(axis=1)]
         solid = solid[:: max(1, -(-len(solid) // MOST_POINTS))]
-        self._origin = np.median(solid, axis=0) if len(solid) else np.zeros(3)
-        self._points = np.ascontiguousarray(solid - self._origin, np.float32)
-        self._tree = cv2.flann_Index(self._points, KD_TREE_SINGLE) if len(solid) >= WITNESSES else None
+        self._tree = cKDTree(solid) if len(solid) >= WITNESSES else None
 
     def at(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " m"]:
         """Distance from each place to the `WITNESSES`-th nearest point, world units; infinite where none is."""
         if self._tree is None or len(places) == 0:
             return np.full(len(places), np.inf)
-        asked = np.ascontiguousarray(places - self._origin, np.float32)
-        _, squares = self._tree.knnSearch(asked, WITNESSES, params=EXACT)
-        return np.asarray(np.sqrt(squares[:, -1].astype(np.float64)))
+        return np.asarray(self._tree.query(places, [WITNESSES])[0][:, 0])
 
     def between(
         self, start: Float64[np.ndarray, " 3"], end: Float64[np.ndarray, " 3"], step: float

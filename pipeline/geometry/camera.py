@@ -105,16 +105,6 @@ class Camera:
         return np.asarray((rays * depths[:, None] - self.cam_from_world[:3, 3]) @ self.cam_from_world[:3, :3])
 
 
-def rotation_matrix(rotation_vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The rotation by a vector's length (radians) about its direction: Rodrigues' formula."""
-    angle = float(np.sqrt((rotation_vector**2).sum()))
-    x, y, z = rotation_vector
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    # np.sinc(t / pi) is sin(t) / t, right at 0, too; 1 - cos t = 2 sin² (t / 2) does not cancel.
-    first, second = np.sinc(angle / math.pi), 0.5 * np.sinc(angle / (2.0 * math.pi)) ** 2
-    return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
-
-
 def reduced_size(width: int, height: int, max_megapixels: float) -> tuple[int, int]:
     """The largest size of a picture's shape within a limit; its own where that is within already.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 SIMILARITY = 7  # unknowns of a small change: a rotation vector, the scale's logarithm, the place of the points' mean
 FREE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: its direction is not determined
@@ -105,12 +106,8 @@ def fit_similarity(
 
 
 def rotation_from_vector(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Rodrigues' formula: the rotation about a vector by its length in radians."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.asarray(np.eye(3) + cross_matrix(vector))
-    k = cross_matrix(vector / angle)
-    return np.asarray(np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k))
+    """The rotation about a vector by its length in radians."""
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def turn_between(have: Float64[np.ndarray, "k 3"], want: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, " 3"]:

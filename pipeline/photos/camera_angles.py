@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Literal
 
-import numpy as np
+from scipy.spatial.transform import Rotation
 
 Convention = Literal["gimbal", "nadir"]
 DOWNWARD_DEG = -60.0  # who looks further down than this counts from the horizon: from nadir it would look back and up
@@ -35,23 +35,11 @@ def gimbal_from_nadir(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tupl
     Returns:
         Yaw, pitch (-90 straight down) and roll of the same view, degrees.
     """
-    yaw, pitch, roll = (math.radians(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
-    turned = _about_z(yaw) @ _about_y(pitch) @ _about_x(roll) @ _about_y(-math.pi / 2.0)
+    aircraft = Rotation.from_euler("ZYX", (yaw_deg, pitch_deg, roll_deg), degrees=True)
+    turned = (aircraft * Rotation.from_euler("Y", -90.0, degrees=True)).as_matrix()
     cosine = math.hypot(turned[0, 0], turned[1, 0])
     down = math.degrees(math.atan2(-turned[2, 0], cosine))
     if cosine < LOCKED:
         return math.degrees(math.atan2(-turned[0, 1], turned[1, 1])), down, 0.0
     heading = math.degrees(math.atan2(turned[1, 0], turned[0, 0]))
     return heading, down, math.degrees(math.atan2(turned[2, 1], turned[2, 2]))
-
-
-def _about_x(angle: float) -> np.ndarray:
-    return np.array([[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]])
-
-
-def _about_y(angle: float) -> np.ndarray:
-    return np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-
-
-def _about_z(angle: float) -> np.ndarray:
-    return np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])

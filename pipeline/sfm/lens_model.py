@@ -14,6 +14,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 
 WIDE, WIDE_FISHEYE = "FULL_OPENCV", "OPENCV_FISHEYE"
 FISHEYES = frozenset({"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"})
@@ -179,16 +180,10 @@ def apart_px(found: pycolmap.Camera, other: pycolmap.Camera, turn: bool = False)
         design, residual = np.stack(columns, axis=1), (want - have).ravel()
         good = np.isfinite(residual) & np.isfinite(design).all(axis=1)
         angle, *_ = np.linalg.lstsq(design[good], residual[good], rcond=None)
-        rotation = _rotation(angle) @ rotation
+        rotation = rotation_from_vector(angle) @ rotation
     have = np.asarray(found.img_from_cam(rays @ rotation.T), np.float64)
     distance = np.linalg.norm(have - want, axis=1)
     return np.where(np.isfinite(distance), distance, np.inf)
-
-
-def _rotation(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    angle = float(np.linalg.norm(vector))
-    quat = np.append(np.sin(angle / 2) * vector / max(angle, 1e-300), np.cos(angle / 2))  # x, y, z, w
-    return np.asarray(pycolmap.Rotation3d(quat).matrix(), np.float64)
 
 
 def indices(model: str, names: Sequence[str]) -> list[int]:

@@ -10,6 +10,8 @@ from pathlib import PurePosixPath
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.sfm.footprints import Views, overlaps
@@ -241,18 +243,9 @@ def connect(pairs: set[Pair], count: int, costs: Costs) -> list[Pair]:
 
 def components(pairs: Iterable[Pair], count: int) -> np.ndarray:
     """(count,) number of the connected piece that each photo is in; pieces by their first photo."""
-    parents = list(range(count))
-
-    def root(i: int) -> int:
-        while parents[i] != i:
-            parents[i] = parents[parents[i]]
-            i = parents[i]
-        return i
-
-    for i, j in pairs:
-        first, second = sorted((root(i), root(j)))
-        parents[second] = first
-    return np.unique([root(i) for i in range(count)], return_inverse=True)[1]
+    rows = np.array(sorted(pairs), np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(rows), np.bool_), (rows[:, 0], rows[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def _pair(i: int, j: int) -> Pair:

@@ -26,10 +26,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
@@ -45,8 +45,6 @@ SUPPORT_SHARE = 0.04  # of the distance to the nearest camera, a cell: nearer to
 NEAR_SHARE = 0.2  # of the depth where a photo's points begin
 NEAR_PERCENTILE = 5  # of the depths of its points: where they begin
 CHUNK = 65_536  # Gaussians at a time: a few megabytes
-KD_TREE_SINGLE = {"algorithm": 4, "leaf_max_size": 10}  # FLANN's one exact tree, without random choices
-EXACT = {"checks": -1}
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,16 +235,10 @@ def _supported(gaussians: Gaussians, rows: Int64[np.ndarray, " k"], space: FreeS
     """Those of the rows that lie beside a well-observed point."""
     if rows.size == 0 or len(space.support) == 0:
         return rows[:0]
-    origin = np.median(space.support, axis=0)
-    points = np.ascontiguousarray(space.support - origin, np.float32)
-    centres = np.array([photo.camera.centre() for photo in space.photos])
-    trees = [
-        cv2.flann_Index(np.ascontiguousarray(where, np.float32), KD_TREE_SINGLE) for where in (points, centres - origin)
-    ]
+    trees = cKDTree(space.support), cKDTree(np.array([photo.camera.centre() for photo in space.photos]))
     found = []
     for chunk in _chunks(rows):
         means = gaussians.means[torch.from_numpy(chunk)].detach().cpu().numpy().astype(np.float64)
-        means32 = np.ascontiguousarray(means - origin, np.float32)
-        to_point, to_camera = (tree.knnSearch(means32, 1, params=EXACT)[1][:, 0] for tree in trees)
-        found.append(chunk[to_point <= to_camera * SUPPORT_SHARE**2])  # both are squares
+        to_point, to_camera = (tree.query(means)[0] for tree in trees)
+        found.append(chunk[to_point <= to_camera * SUPPORT_SHARE])
     return np.concatenate(found)

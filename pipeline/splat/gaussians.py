@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from splatpipe.pipeline.splat.sh import MAX_DEGREE, check_rotation, coefficient_count, multiply_rows, rotate_sh
@@ -158,19 +159,6 @@ def multiply_quats(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Floa
 
 
 def quat_from_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
-    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
-
-    q qᵀ is linear in the matrix; its column with the largest diagonal entry is the best conditioned multiple of q.
-    """
-    m = rotation
-    outer = 0.25 * torch.stack(
-        [
-            torch.stack([1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
-            torch.stack([m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]),
-            torch.stack([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1]]),
-            torch.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2]]),
-        ]
-    )
-    quat: Tensor = outer[int(torch.argmax(torch.diagonal(outer)))]
-    quat = quat / torch.linalg.vector_norm(quat)
-    return -quat if quat[0] < 0 else quat
+    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix."""
+    x, y, z, w = Rotation.from_matrix(rotation.detach().cpu().double().numpy()).as_quat(canonical=True)
+    return torch.tensor([w, x, y, z], dtype=rotation.dtype, device=rotation.device)

@@ -9,12 +9,12 @@ itself took of the residuals; the fit is generalised least squares with them.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from splatpipe.pipeline.geometry.alignment import MEDIAN_OF_CHI3
 from splatpipe.pipeline.geometry.correspondences import LEAST_NOISE_FACTOR, REDUNDANT, Correspondences, DirectionPrior
 from splatpipe.pipeline.geometry.similarity import (
     SIMILARITY,
@@ -35,7 +35,6 @@ SEARCHED_ROUNDS = 3  # in which every correlation is tried; from there on the ne
 FACTOR_ROUNDS = 2  # each; the rounds of the fit do the rest
 LEAST_FACTOR = 1e-6  # of the stated sigmas: exact positions have no noise to tell
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
-MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import nnls
 
 from splatpipe.pipeline.train.densify import room_at
 from splatpipe.pipeline.train.options import TrainConfig
@@ -87,14 +88,7 @@ def fit_speed(timings: Sequence[Timing]) -> Speed:
     seconds = np.array([timing.seconds for timing in timings])
     scale = table.max(axis=0)  # brings the columns to one size
     weighted = table / scale / seconds[:, None]
-    costs = np.zeros(4)
-    free = [0, 1, 2, 3]
-    while free:  # leave out the most negative cost until none is: few columns, so this is close to the best
-        found = np.linalg.lstsq(weighted[:, free], np.ones(len(timings)), rcond=1e-9)[0]
-        if found.min() >= 0.0:
-            costs[free] = found / scale[free]
-            break
-        free.pop(int(found.argmin()))
+    costs = nnls(weighted, np.ones(len(timings)))[0] / scale
     return Speed(*costs.tolist())
 
 
