@@ -92,7 +92,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=1,
+    version=2,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views"),
     parts={"splat": "init.ply"},
@@ -100,7 +100,7 @@ INITIALIZE = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=5,
+    version=6,
     config=TrainConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat"),
     parts={
