@@ -66,7 +66,7 @@ SPARSE = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=4,
+    version=5,
     config=GeorefConfig,
     reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
     parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
