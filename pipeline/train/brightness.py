@@ -104,11 +104,9 @@ def _colours(
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """The points that a photo saw, where it is not clipped, and the logarithms of its colours there."""
     camera, pixels, mask = reduced_view(view, MEGAPIXELS)
-    rows = tracks[view.camera.name]
-    places = camera.project(xyz[rows])
-    inside = np.isfinite(places).all(axis=1) & (places >= 0.0).all(axis=1)
-    inside[inside] = (places[inside] < [camera.width, camera.height]).all(axis=1)
-    rows, (x, y) = rows[inside], places[inside].astype(np.int64).T
+    tracked = tracks[view.camera.name]
+    inside, places, _ = camera.in_view(xyz[tracked])
+    rows, (x, y) = tracked[inside], places.astype(np.int64).T
     colour = cv2.blur(pixels, (WINDOW_PX, WINDOW_PX))[y, x].astype(np.float64)
     counts = ((colour > DARKEST) & (colour < BRIGHTEST)).all(axis=1)
     if mask is not None:
