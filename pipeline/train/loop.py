@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.panorama import write_panorama
@@ -114,12 +114,6 @@ def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
     if state.history.flat_at:
         found["flat_at"] = state.history.flat_at
     return found | state.techniques.summary()
-
-
-def views_of(plan: Plan, views: Sequence[View]) -> list[View]:
-    """The views that the plan trains on."""
-    kept = set(plan.train_views)
-    return [view for view in views if view.camera.name in kept]
 
 
 def budgeted(plan: Plan) -> bool:
