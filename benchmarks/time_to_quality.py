@@ -35,7 +35,6 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import render_pixels
 from splatpipe.pipeline.render.view_measures import measure
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.iteration import iterate
