@@ -132,7 +132,7 @@ def test_time_to_quality_trains_and_measures_what_the_line_does(dataset: Path, t
     parts |= tiny_scene.split_part(dataset, names=held_out)
     inputs = Inputs(parts, tmp_path, machine=Machine("cpu", 1))
     recorder = tiny_scene.Recorder()
-    initialize.run(InitializeConfig(dense=False), inputs, tmp_path, recorder)
+    initialize.run(InitializeConfig(), inputs, tmp_path, recorder)
     summary = train.run(TrainConfig(iterations=iterations), inputs, tmp_path, recorder)
     quality = evaluate.run(EvaluateConfig(), inputs, tmp_path, recorder)
     assert (row["iteration"], row["gaussians"]) == (iterations, summary["gaussians"])
