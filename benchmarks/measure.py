@@ -51,7 +51,21 @@ from splatpipe.stages import initialize
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
 PARTS = ("forward", "loss", "backward", "adam")
 
-DEFAULT_START = InitializeConfig()
+
+@dataclass(frozen=True)
+class Start:
+    """How the points of a dataset become Gaussians.
+
+    Attributes:
+        options: Of `initialize`.
+        held_out: Names of photos that have no say in it.
+    """
+
+    options: InitializeConfig
+    held_out: tuple[str, ...] = ()
+
+
+DEFAULT_START = Start(InitializeConfig(dense=False))  # the sparse points alone fix the work
 
 
 class SilentReporter:
@@ -221,7 +235,7 @@ def prepare(
     factor: float,
     folder: Path,
     photos: int | None = None,
-    start: InitializeConfig = DEFAULT_START,
+    start: Start = DEFAULT_START,
 ) -> Path:
     """Write a dataset's photos and cameras in another size, lossless, as training reads them.
 
@@ -256,7 +270,10 @@ def prepare(
         if (mask := load_mask(view)) is not None:
             masked = cv2.resize((~mask).astype(np.float32), size, interpolation=how)  # the share of masked pixels
             _write_png(mask_path(folder, view.camera.name), np.where(masked == 0.0, 255, 0))
-    initialize.run(start, Inputs({"undistort.dataset": whole}, folder), folder, SilentReporter())
+    split = Split(tuple(view.camera.name for view in kept if view.camera.name not in start.held_out), start.held_out)
+    (folder / "split.json").write_text(split.to_json())
+    parts = {"undistort.dataset": whole, "split.views": folder / "split.json"}
+    initialize.run(start.options, Inputs(parts, folder), folder, SilentReporter())
     return folder
 
 

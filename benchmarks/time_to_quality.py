@@ -13,7 +13,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from measure import Row, SilentReporter, machine, parse, parser, prepare, report, restart_peak, scratch, size_factor
+from measure import (
+    Row,
+    SilentReporter,
+    Start,
+    machine,
+    parse,
+    parser,
+    prepare,
+    report,
+    restart_peak,
+    scratch,
+    size_factor,
+)
 
 from splatpipe.pipeline.engine.config import parse_set, resolve
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
@@ -23,12 +35,13 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import render_pixels
 from splatpipe.pipeline.render.view_measures import measure
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.start import with_room
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
@@ -88,13 +101,15 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     views = load_views(dataset)
     start = read_splat(dataset / "init.ply")
     split = split_views([view.camera.name for view in views], config.split.every, arguments.held_out)
-    plan = make_plan(config.train, views, split, len(start))
-    trained_on = loop.views_of(plan, views)
+    trained_on = [view for view in views if view.camera.name in set(split.train)]
+    options = decided_exposure(config.train, trained_on, dataset, arguments.threads, SilentReporter())
+    plan = make_plan(options, views, split, len(start))
     levels = plan.schedule.coarse_levels_to(plan.options.iterations)
     with same_bits(arguments.threads):
         clocks.start()
-        sky = begin_sky(config.train, trained_on, dataset, arguments.threads, SilentReporter())
-        state = TrainState.begin(start, plan, make_techniques(plan, sky, trained_on, dataset))
+        sky = begin_sky(options, trained_on, dataset, arguments.threads, SilentReporter())
+        room = with_room(start, dataset, plan.schedule.density.cap)
+        state = TrainState.begin(room, plan, make_techniques(plan, sky, trained_on, dataset))
         with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
                 iterate(state, plan, photo)
@@ -158,7 +173,9 @@ def main() -> None:
     with scratch() as folder:
         wanted = arguments.megapixels
         factor = arguments.scale if wanted is None else size_factor(arguments.data, wanted)
-        dataset = prepare(arguments.data, arguments.points, factor, folder / "dataset", start=config.initialize)
+        names = [view.camera.name for view in load_views(arguments.data)]
+        start = Start(config.initialize, split_views(names, config.split.every, arguments.held_out).held_out)
+        dataset = prepare(arguments.data, arguments.points, factor, folder / "dataset", start=start)
         rows = list(follow(dataset, config, arguments))
     facts |= {
         "data": arguments.data.name,

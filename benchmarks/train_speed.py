@@ -13,6 +13,7 @@ import json
 from measure import (
     Case,
     Row,
+    Start,
     machine,
     parse,
     parser,
@@ -64,7 +65,7 @@ def main() -> None:
         return
     facts = machine(arguments.threads)
     rows: list[Row] = []
-    start = InitializeConfig(max_angle=arguments.max_angle)
+    start = Start(InitializeConfig(max_angle=arguments.max_angle, dense=False))
     with scratch() as folder:
         for points in arguments.points or [path.name for path in point_sets(arguments.data)]:
             for megapixels in arguments.megapixels:

@@ -1,4 +1,4 @@
-"""initialize: a Gaussian for each point of the sparse model, as big as its neighbours are far."""
+"""initialize: a Gaussian for each point of the sparse model and of a plane sweep, as big as its neighbours are far."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ NEIGHBOURS = 3
 SMALLEST_PER_EXTENT = 1e-6  # size of a point on top of others, over the scene's size
 TINY = 1e-12  # a scene of one point at its camera has a size, too
 QUERY_CHUNK = 65_536
+MOST_DENSE = 50_000  # points of the sweep, an even cover; what is finer, density control adds where it pays
 
 
 def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `init.ply`: isotropic Gaussians at the sparse points, in the model's frame.
+    """Write `init.ply`: isotropic Gaussians at the sparse points and, after them, at the sweep's, in the model's frame.
 
     Raises:
         SplatpipeError: if the model has no points.
@@ -50,8 +51,8 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     centres = np.array([view.camera.centre() for view in views])
     xyz, rgb = points.xyz[chosen], points.rgb[chosen]
     summary = {}
-    if config.dense == "sweep":
-        more = _sweep(views, config, inputs, out, report)
+    if config.dense:
+        more = _sweep(views, inputs, out, report)
         xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
         summary = {"points": int(chosen.size), "dense_points": len(more)}
     sizes = point_sizes(xyz, centres, config.max_angle, report)
@@ -59,12 +60,12 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
 
 
-def _sweep(views: list[View], config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> DensePoints:
+def _sweep(views: list[View], inputs: Inputs, out: Path, report: Reporter) -> DensePoints:
     """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
     kept = set(load_split(inputs["split.views"]).train)
     used = [view for view in views if view.camera.name in kept]
     dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
-    return dense_points(dataset, used, config.dense_points, out, threads, report)
+    return dense_points(dataset, used, MOST_DENSE, out, threads, report)
 
 
 def choose_points(points: Points, usable: npt.NDArray[np.int64], limit: int) -> npt.NDArray[np.int64]:

@@ -24,6 +24,7 @@ class LineConfig(StageConfig):
         "evaluate.every": "It is called split.every.",
         "evaluate.views": "It is called split.views.",
         **{f"train.{name}": hint for name, hint in GONE_OF_TRAIN.items()},
+        "initialize.dense_points": "The sweep adds 50,000 points at most.",
     }
 
     ingest: IngestConfig = IngestConfig()

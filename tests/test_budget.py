@@ -182,7 +182,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     tiny_scene.write_dataset(folder / "dataset")
     parts = {"undistort.dataset": folder / "dataset"}
-    initialize.run(InitializeConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
     return folder
 
 

@@ -97,7 +97,7 @@ def initialized(
     inputs = Inputs(
         {"undistort.dataset": dataset} | split_part(dataset, names=held_out), out, machine=Machine(threads=threads)
     )
-    summary = run(InitializeConfig(**{"dense": "sweep", **options}), inputs, out, Recorder())
+    summary = run(InitializeConfig(**options), inputs, out, Recorder())
     assert [path.name for path in out.iterdir()] == ["init.ply"]
     return dict(summary), (out / "init.ply").read_bytes()
 
@@ -167,7 +167,7 @@ def test_threads_do_not_change_a_bit(room: Path, started: tuple[dict, bytes], tm
 def test_sparse_gaussians_stay_and_the_summary_counts_both(
     room: Path, started: tuple[dict, bytes], tmp_path: Path
 ) -> None:
-    off, _ = initialized(room, tmp_path / "off", dense="off")
+    off, _ = initialized(room, tmp_path / "off", dense=False)
     summary, written = started
     (tmp_path / "sweep.ply").write_bytes(written)
     before, after = read_splat(tmp_path / "off/init.ply"), read_splat(tmp_path / "sweep.ply")
@@ -181,8 +181,8 @@ def test_off_reads_no_photo_and_no_setting(room: Path, started: tuple[dict, byte
     dataset = tmp_path / "dataset"
     shutil.copytree(room / "sparse", dataset / "sparse")
     (tmp_path / "bare").mkdir()
-    run(InitializeConfig(), Inputs({"undistort.dataset": dataset}, tmp_path), tmp_path / "bare", Recorder())
-    _, written = initialized(room, tmp_path / "off", dense="off")
+    run(InitializeConfig(dense=False), Inputs({"undistort.dataset": dataset}, tmp_path), tmp_path / "bare", Recorder())
+    _, written = initialized(room, tmp_path / "off", dense=False)
     assert (tmp_path / "bare/init.ply").read_bytes() == written != started[1]
 
 

@@ -96,7 +96,7 @@ def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> N
 def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:
     tiny_scene.write_dataset(tmp_path / "dataset")
     parts = {"undistort.dataset": tmp_path / "dataset"}
-    initialize.run(InitializeConfig(), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())
     parts |= {"initialize.splat": tmp_path / "init.ply"} | tiny_scene.split_part(tmp_path / "dataset", 4)
     found = []
     for weight in (0.0, 0.05):

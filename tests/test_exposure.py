@@ -18,7 +18,9 @@ from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import techniques
+from splatpipe.pipeline.train.brightness import DIFFERING, decided_exposure, exposure_spread, log_gains
 from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.stages import initialize, train
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -37,8 +39,42 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         photo = cv2.imread(str(view.image_path)).astype(np.float32)
         cv2.imwrite(str(view.image_path), np.round(photo * gain).astype(np.uint8))
     parts = {"undistort.dataset": folder / "dataset"}
-    initialize.run(InitializeConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
     return folder
+
+
+def test_gains_are_those_that_the_photos_were_given_whatever_the_surface_and_a_few_highlights() -> None:
+    random = np.random.default_rng(3)
+    true = random.normal(scale=0.1, size=(7, 3))
+    photo, point = (grid.ravel() for grid in np.meshgrid(np.arange(7), np.arange(80), indexing="ij"))
+    seen = random.random(photo.size) < 0.6
+    photo, point = photo[seen], point[seen]
+    logs = random.normal(scale=0.5, size=(80, 3))[point] + true[photo] + random.normal(scale=0.02, size=(len(point), 3))
+    logs[random.random(len(logs)) < 0.05] += 0.7
+    found = log_gains(photo, point, logs, 7)
+    np.testing.assert_allclose(found, true - true.mean(axis=0), atol=0.025)
+
+
+def test_photos_without_points_in_common_tell_no_gains() -> None:
+    photo, point = np.repeat([0, 1], 30), np.arange(60)
+    assert log_gains(photo, point, np.random.default_rng(4).normal(size=(60, 3)), 3).shape == (0, 3)
+
+
+def test_exposures_are_modelled_where_they_differ_unless_told_otherwise(scene: Path, tmp_path: Path) -> None:
+    differing, alike = scene / "dataset", tiny_scene.write_dataset(tmp_path / "dataset")
+    for asked, dataset, told in (("auto", differing, "affine"), ("auto", alike, "off"), ("off", differing, "off")):
+        recorder = tiny_scene.Recorder()
+        found = decided_exposure(TrainConfig(exposure=asked), load_views(dataset), dataset, 1, recorder)
+        assert found.exposure == told
+        assert [note[:9] for note in recorder.notes] == (["exposures"] if told == "affine" else [])
+
+
+def test_spread_of_photos_that_were_exposed_differently_is_measured(scene: Path, tmp_path: Path) -> None:
+    dataset = scene / "dataset"
+    spread = exposure_spread(load_views(dataset), dataset, 2)
+    assert abs(spread - float(np.std(np.log(GAINS)))) < 0.02 and spread > DIFFERING
+    alike = tiny_scene.write_dataset(tmp_path / "dataset")
+    assert exposure_spread(load_views(alike), alike, 1) < DIFFERING
 
 
 def trained(scene: Path, out: Path, exposure: str) -> Path:

@@ -87,7 +87,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     tiny_scene.write_dataset(folder / "dataset")
     inputs = Inputs({"undistort.dataset": folder / "dataset"}, folder)
-    initialize.run(InitializeConfig(), inputs, folder, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), inputs, folder, tiny_scene.Recorder())
     return folder
 
 

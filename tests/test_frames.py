@@ -256,6 +256,13 @@ def test_up_of_nadir_strips_flown_back_and_forth_and_turned_alike() -> None:
     assert estimate([look(d, north * sign) for d, sign in zip(down, flown, strict=True)], centres) < 1.5
 
 
+def test_up_of_a_walk_along_a_street_is_where_the_pictures_have_their_top() -> None:
+    rng = np.random.default_rng(5)
+    centres = np.stack([np.linspace(0.0, 40.0, 30), rng.normal(scale=0.3, size=30), rng.normal(1.6, 0.3, 30)], axis=1)
+    ahead = np.array([1.0, 0.0, 0.0]) + rng.normal(size=(30, 3)) * 0.05
+    assert estimate([look(forward, np.array([0.0, 0.0, 1.0])) for forward in ahead], centres) < 3.0
+
+
 def test_up_below_a_swaying_kite_is_across_the_ground() -> None:
     rng = np.random.default_rng(1)
     centres = np.stack([rng.uniform(-20, 20, 30), rng.uniform(-20, 20, 30), rng.uniform(45, 55, 30)], axis=1)

@@ -84,7 +84,7 @@ def test_every_point_becomes_an_isotropic_gaussian_of_its_colour(tmp_path: Path)
     colours = RNG.integers(0, 256, size=(50, 3)).astype(np.uint8)
     dataset = write_dataset(tmp_path / "dataset", xyz, colours)
     inputs = Inputs({"undistort.dataset": dataset}, tmp_path)
-    summary = run(InitializeConfig(opacity=0.2), inputs, tmp_path, Quiet())
+    summary = run(InitializeConfig(opacity=0.2, dense=False), inputs, tmp_path, Quiet())
     gaussians = read_splat(tmp_path / "init.ply")
     assert summary["gaussians"] == len(gaussians) == 50
     assert gaussians.sh_degree == 3

@@ -206,7 +206,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         photo = torch.from_numpy(cv2.imread(str(path))[:, :, ::-1].copy()).float() / 255.0
         cv2.imwrite(str(path), (painted(photo, block) * 255.0).to(torch.uint8).numpy()[:, :, ::-1])
     inputs = Inputs({"undistort.dataset": folder / "dataset"}, folder)
-    initialize.run(InitializeConfig(), inputs, folder, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), inputs, folder, tiny_scene.Recorder())
     return folder
 
 

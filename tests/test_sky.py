@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.splat.sky_mask import agreed, find_skies, find_sky, up_of, votes_of
+from splatpipe.pipeline.splat.sky_mask import agreed, find_skies, find_sky, is_open, roofed, up_of, votes_of
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
@@ -100,6 +100,52 @@ def test_masked_thing_that_does_not_reach_the_top_or_hides_points_is_not_sky() -
     upper = np.zeros_like(person)
     upper[:100] = True
     assert not found(replace(tower, ignored=upper), skies.points_on((wall,))).any()
+
+
+ROOM = (skies.Block(-30.0, 30.0, 8.0, 30.0, 0.0, WHITE), skies.Block(-30.0, 30.0, 7.5, 1.9))  # over a wainscot
+
+
+def found_in_all(blocks: tuple[skies.Block, ...], points: np.ndarray) -> list[float]:
+    """The share of each of four photos that is taken for sky."""
+    cameras = [skies.look(heading, x=x) for heading, x in ((-6.0, -1.0), (-2.0, 0.0), (2.0, 0.5), (6.0, 1.0))]
+    photos = [skies.trace(camera, blocks)[0] for camera in cameras]
+    return [float(mask.unpacked().mean()) for mask in find_skies(cameras, lambda i: photos[i], points, skies.UP)]
+
+
+def test_white_wall_of_a_room_is_not_sky_where_other_photos_saw_its_ceiling() -> None:
+    floor = skies.points_on(ROOM)
+    floor = floor[floor[:, 1] < 8.0]
+    ceiling = np.random.default_rng(6).uniform([-9.0, 0.0, 7.5], [9.0, 8.0, 7.5], (150, 3))
+    assert min(found_in_all(ROOM, floor)) > 0.3  # as white as an overcast sky, and nothing else is known
+    assert max(found_in_all(ROOM, np.concatenate([floor, ceiling]))) == 0.0
+
+
+def test_sky_in_a_window_is_not_taken_where_its_lintel_is_above_the_picture() -> None:
+    window = (skies.Block(-9.0, -2.0, 8.0, 30.0), skies.Block(2.0, 9.0, 8.0, 30.0))
+    walls = skies.points_on(window)
+    lintel = np.random.default_rng(7).uniform([-2.0, 8.0, 8.5], [2.0, 8.0, 10.0], (60, 3))
+    assert min(found_in_all(window, walls)) > 0.05
+    assert max(found_in_all(window, np.concatenate([walls, lintel]))) == 0.0
+
+
+def test_branch_above_the_sky_and_wrong_points_in_it_take_none_away() -> None:
+    photo, truth = skies.trace(skies.look())
+    random = np.random.default_rng(8)
+    branch = random.uniform([-0.6, 6.0, 7.0], [0.8, 6.5, 8.0], (80, 3))
+    birds = random.uniform([-9.0, 5.0, 15.0], [9.0, 9.0, 30.0], (2, 3))
+    points = np.concatenate([skies.points_on(), branch, birds])
+    assert not roofed(photo.camera, truth, points, skies.UP).any()
+
+
+def test_few_bright_patches_in_a_large_capture_are_no_sky() -> None:
+    cameras = [skies.look(heading) for heading in np.linspace(0.0, 355.0, 72)]
+    empty = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
+    patch, upper = empty.copy(), empty.copy()
+    patch[:60, 100:220] = True
+    upper[:100] = True
+    indoors = [votes_of(camera, patch if i < 4 else empty, skies.UP) for i, camera in enumerate(cameras)]
+    outdoors = [votes_of(camera, upper if i < 8 else empty, skies.UP) for i, camera in enumerate(cameras)]
+    assert not is_open(indoors) and is_open(outdoors)
 
 
 def test_what_others_see_in_the_same_direction_decides() -> None:

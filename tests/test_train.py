@@ -52,7 +52,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     tiny_scene.write_dataset(folder / "dataset", masked="flight 1/photo_5.png")
     parts = {"undistort.dataset": folder / "dataset"}
-    initialize.run(InitializeConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
     return folder
 
 

@@ -56,7 +56,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("skies")
     skies.write_dataset(folder / "dataset")
     parts = {"undistort.dataset": folder / "dataset"}
-    initialize.run(InitializeConfig(), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
     start = read_splat(folder / "init.ply")
     start = start.select(torch.arange(0, len(start), 3))
     balloons = start.select(torch.arange(40))
@@ -235,7 +235,7 @@ def test_checkpoint_without_its_sky_is_told_and_the_training_starts_afresh(scene
 def test_capture_without_sky_trains_as_if_it_were_off(tmp_path: Path) -> None:
     skies.write_dataset(tmp_path / "dataset", pitch_deg=-60.0)
     parts = {"undistort.dataset": tmp_path / "dataset"}
-    initialize.run(InitializeConfig(), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())
     out, off = tmp_path / "model", tmp_path / "off"
     _, recorder = trained(tmp_path, out, QUICK.model_copy(update={"iterations": 5}))
     assert not recorder.notes

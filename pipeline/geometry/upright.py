@@ -197,9 +197,9 @@ def _plane_normal(vectors: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarr
 def _is_survey(
     centres: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"], forward: Float64[np.ndarray, " 3"]
 ) -> bool:
-    """Whether cameras that look one way spread along both sides of their pictures."""
-    right = np.cross(forward, up)
-    return float(np.std(centres @ up)) > GRID * float(np.std(centres @ right))
+    """Whether cameras that look one way spread along both sides of their pictures, and not where they look: a walk."""
+    along_up, along_right, ahead = (float(np.std(centres @ axis)) for axis in (up, np.cross(forward, up), forward))
+    return along_up > GRID * along_right and ahead < max(along_up, along_right)
 
 
 def _ground_normal(

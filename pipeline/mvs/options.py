@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
@@ -17,7 +17,6 @@ class InitializeConfig(StageConfig):
     """Opacity at the start. Published: 0.1, from which walls stay a fog whose depth lies behind its front."""
     max_angle: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
     """Cap on a Gaussian's size for outliers, as a share of its distance to the nearest camera."""
-    dense: Literal["off", "sweep"] = "off"
-    """`sweep` adds points where the sparse ones are thin, by a plane sweep between neighbouring photos."""
-    dense_points: PositiveInt = 50_000
-    """At most this many are added, evenly spread. Stay well below `train.max_gaussians`: a full start cannot grow."""
+    dense: bool = True
+    """Add points where the sparse ones are thin, by a plane sweep between neighbouring photos: half a CPU second a
+    photo. At most 50,000; with the sparse ones they fill half of the training's cap at most, so that it can grow."""

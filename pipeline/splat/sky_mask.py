@@ -27,9 +27,7 @@ CLEARLY_BLUE = 0.1  # blue over red, from which on it is no grey that shade or h
 LEAST_BLUE_LIGHT = 0.3  # of the blue of a sky, of 1
 LEAST_GREY_LIGHT = 0.75  # of the darkest channel of a grey one: clouds, haze, overexposed
 GREY_OUTSHINES = 0.7  # share of the rest of the picture: walls in the sun stand beside shade
-BLUE_OUTSHINES = (
-    0.4  # a deep blue sky is darker than that wall; far trees in haze and shadows are bluish and darker still
-)
+BLUE_OUTSHINES = 0.4  # a deep blue sky is darker than that wall; bluish haze and shadows are darker still
 HORIZON_MARGIN_DEG = 2.0  # below the horizon: error of the estimated up, dip of the horizon for a drone
 ZENITH_DEG = 85.0
 TOP_COSINE = 0.5  # between up and the way out of the picture over its top border: a corner up has two top borders
@@ -44,6 +42,13 @@ GROW_WINDOW = 7
 DIRECTION_ROWS = 64  # of the grid of directions, elevation by azimuth: cells of 2.8°
 LEAST_WITNESSES = 2  # other photos that look the same way, before their word counts
 LEAST_AGREEMENT = 0.15  # of what they see that way: buildings rightly hide much of one's sky from another
+ROOF_COLUMNS = 72  # of azimuth, 5° each, in which it is asked whether something is above a region
+ROOF_REACH_DEG = 5.0  # of azimuth around a point above: ceilings and lintels are smooth, their points far apart
+ROOF_MARGIN_DEG = 3.0  # from a region's top to such a point: the edge of a roof is no roof over the sky beside it
+ROOF_POINTS = 3  # so many make it sure: a wrong point, or a bird, is one
+MOST_ROOFED = 0.5  # of a region's pixels: a branch or a wire over the sky does not make it a wall
+OPEN_FROM_DEG = 5.0  # what looks higher than this sees over low walls and furniture
+LEAST_OPEN = 0.05  # of all that the photos see so high: under an open sky it is most, in a room a few patches
 
 
 @dataclass(frozen=True)
@@ -121,12 +126,61 @@ def find_skies(
 
     def search(index: int) -> tuple[SkyMask, Votes, bool]:
         seen = photo(index)
-        mask = find_sky(seen, seen.camera.in_view(points)[1], up) if seen.drawn is None else seen.drawn
-        return SkyMask.packed(mask), votes_of(seen.camera, mask, up), seen.drawn is not None
+        if seen.drawn is not None:
+            return SkyMask.packed(seen.drawn), votes_of(seen.camera, seen.drawn, up), True
+        mask = find_sky(seen, seen.camera.in_view(points)[1], up)
+        mask &= ~roofed(seen.camera, mask, points, up)
+        return SkyMask.packed(mask), votes_of(seen.camera, mask, up), False
 
     searched = list(ordered_map(search, range(len(cameras)), threads))
-    kept = agreed([votes for _, votes, _ in searched])
+    votes = [each for _, each, _ in searched]
+    kept = agreed(votes) if is_open(votes) else [False] * len(votes)
     return [mask if keep or drawn else mask.emptied() for (mask, _, drawn), keep in zip(searched, kept, strict=True)]
+
+
+def roofed(
+    camera: Camera, sky: Bool[np.ndarray, "h w"], points: Float64[np.ndarray, "m 3"], up: Float64[np.ndarray, " 3"]
+) -> Bool[np.ndarray, "h w"]:
+    """Regions of a sky with something above: a wall under its ceiling, a window under its lintel. Nothing is above sky.
+
+    The points need not be in the picture: what is above a wall is mostly seen in other photos.
+
+    Args:
+        camera: Of the photo.
+        sky: What looks like sky in it.
+        points: Triangulated points in the world.
+        up: Against gravity, as for ``find_sky``.
+    """
+    count, labels = cv2.connectedComponents(sky.astype(np.uint8), connectivity=4)
+    result = np.zeros_like(sky)
+    if count == 1:
+        return result
+    azimuth, height = azimuths_elevations_deg(directions(camera), up)
+    above = points - camera.centre()
+    around, over = azimuths_elevations_deg(above[above @ up > 0.0], up)
+    column = (azimuth * (ROOF_COLUMNS / 360.0)).astype(np.int64) % ROOF_COLUMNS
+    middles = (np.arange(ROOF_COLUMNS) + 0.5) * (360.0 / ROOF_COLUMNS)
+    reaches = np.abs((around[:, None] - middles + 180.0) % 360.0 - 180.0) < ROOF_REACH_DEG
+    for label in range(1, count):
+        region = labels == label
+        top = np.full(ROOF_COLUMNS, 90.0)
+        pixels = np.bincount(column[region], minlength=ROOF_COLUMNS)
+        for each in np.flatnonzero(pixels):
+            top[each] = height[region & (column == each)].max()
+        under = (reaches & (over[:, None] > top + ROOF_MARGIN_DEG)).sum(axis=0) >= ROOF_POINTS
+        if pixels[under].sum() > MOST_ROOFED * pixels.sum():
+            result |= region
+    return result
+
+
+def is_open(votes: Sequence[Votes]) -> bool:
+    """Whether enough of what a capture shows above the horizon is sky: outdoors nearly all is, in a room it is not.
+
+    A few bright patches among hundreds of photos are walls, windows and lamps.
+    """
+    lowest = math.ceil((OPEN_FROM_DEG / 180.0 + 0.5) * DIRECTION_ROWS) * 2 * DIRECTION_ROWS
+    seen = sum(int((vote.seen >= lowest).sum()) for vote in votes)
+    return sum(int((vote.sky >= lowest).sum()) for vote in votes) >= LEAST_OPEN * seen
 
 
 def up_of(
@@ -228,6 +282,16 @@ def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Int64[np.n
     columns = 2 * DIRECTION_ROWS
     row = np.minimum((height * DIRECTION_ROWS).astype(np.int64), DIRECTION_ROWS - 1)
     return np.asarray(row * columns + (azimuth * columns).astype(np.int64) % columns)
+
+
+def azimuths_elevations_deg(
+    rays: Float64[np.ndarray, "*n 3"], up: Float64[np.ndarray, " 3"]
+) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
+    """Azimuths, from 0 to 360° from ``horizontal_axes``, and angles over the horizon, of rays of any length but 0."""
+    east, north = horizontal_axes(up)
+    level = np.hypot(rays @ east, rays @ north)
+    azimuth = np.degrees(np.arctan2(rays @ north, rays @ east)) % 360.0
+    return np.asarray(azimuth), np.asarray(np.degrees(np.arctan2(rays @ up, level)))
 
 
 def horizontal_axes(up: Float64[np.ndarray, " 3"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +12,12 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
+from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.exposure import Exposure, exposures_json
 from splatpipe.pipeline.train.flatness import ends_at
@@ -26,6 +27,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
 from splatpipe.pipeline.train.planning import Scene, under_budgets
 from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.start import with_room
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
@@ -48,8 +50,10 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     dataset = inputs["undistort.dataset"]
     views = load_views(dataset)
     start = read_splat(inputs["initialize.splat"])
-    free = make_plan(config, views, load_split(inputs["split.views"]), len(start))
-    trained_on = views_of(free, views)
+    split = load_split(inputs["split.views"])
+    trained_on = [view for view in views if view.camera.name in set(split.train)]
+    config = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
+    free = make_plan(config, views, split, len(start))
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
 
     def make() -> Plan:
@@ -65,7 +69,10 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         def techniques() -> Techniques:
             return make_techniques(plan, sky, trained_on, dataset)
 
-        state = resume(out / CHECKPOINT, plan, techniques, report) or TrainState.begin(start, plan, techniques())
+        state = resume(out / CHECKPOINT, plan, techniques, report)
+        if state is None:
+            room = with_room(start, dataset, plan.schedule.density.cap)
+            state = TrainState.begin(room, plan, techniques())
         levels = plan.schedule.coarse_levels_to(ends_at(plan, state.history.flat_at))
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(trained_on, levels, plan.options.seed, first, out, size) as photos:
@@ -107,12 +114,6 @@ def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
     if state.history.flat_at:
         found["flat_at"] = state.history.flat_at
     return found | state.techniques.summary()
-
-
-def views_of(plan: Plan, views: Sequence[View]) -> list[View]:
-    """The views that the plan trains on."""
-    kept = set(plan.train_views)
-    return [view for view in views if view.camera.name in kept]
 
 
 def budgeted(plan: Plan) -> bool:

@@ -57,9 +57,10 @@ class TrainConfig(StageConfig):
     """Degree of the spherical harmonics that are trained."""
     loss: Literal["native", "kornia"] = "native"
     """Who computes the loss and its gradient: our kernels, or kornia's SSIM under torch, some 50 times slower."""
-    exposure: Literal["off", "affine"] = "off"
+    exposure: Literal["auto", "off", "affine"] = "auto"
     """What exposure and white balance did to each photo: not modelled, or as an affine map of its colours that is
-    trained along. The splat keeps the photos' mean appearance."""
+    trained along; the splat keeps the photos' mean appearance. Auto: `affine` where the photos show the same points
+    6 % apart or more."""
     antialias: bool = True
     """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
     background: Literal["black", "white", "random"] = "random"

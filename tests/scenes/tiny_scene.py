@@ -32,6 +32,7 @@ PLAIN: dict[str, object] = {
     "sky": "off",
     "prune_free_space": 0,
     "dropout": 0.0,
+    "exposure": "off",
 }
 
 

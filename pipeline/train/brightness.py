@@ -1,0 +1,114 @@
+"""How differently a capture's photos are exposed, told from how bright and how coloured they show the same points.
+
+The surface's colour and the photo's gain are separated as in Goldman, "Vignette and Exposure Calibration and
+Compensation" (PAMI 2010), without its vignetting: each observation is their product, and both are fitted in turns, the
+gains as medians, so that highlights and what moved have no say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks
+from splatpipe.pipeline.photos.images import reduced_view
+from splatpipe.pipeline.train.options import TrainConfig
+
+MEGAPIXELS = 0.3  # of a photo in which colours are looked up: a pixel is a mean of many, and noise is gone
+WINDOW_PX = 5  # of the mean around a point: the photos' points are off by a fraction of it
+DARKEST, BRIGHTEST = 8.0, 247.0  # of 255, of a channel that has not been clipped
+ROUNDS = 10  # of fitting; a gain moves by less than a thousandth in the last
+LEAST_SEEN = 20  # points of a photo that tell its gain
+DIFFERING = 0.06  # spread from which on exposures differ. Measured: 0.027 to 0.034 in three captures whose light or
+# exposure hardly changes (0.1 stops, known, are 0.034), 0.097 to 0.18 in five with automatic exposure
+
+
+def exposure_spread(views: Sequence[View], dataset: Path, threads: int) -> float:
+    """Root mean square of the photos' gains about their mean, over the channels: 0.1 is a tenth of the colours' values.
+
+    Args:
+        views: Photos.
+        dataset: That they are of, for its sparse points.
+        threads: That read photos.
+
+    Raises:
+        StageError: if a photo or the model is broken.
+    """
+    points, tracks = load_points_and_tracks(dataset)
+    look = partial(_colours, xyz=points.xyz, tracks=tracks)
+    seen = list(ordered_map(look, views, threads))
+    rows = np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in seen)])
+    logs = np.concatenate([np.zeros((0, 3)), *(logs for _, logs in seen)])
+    photo = np.repeat(np.arange(len(seen)), [len(rows) for rows, _ in seen])
+    gains = log_gains(photo, rows, logs, len(seen))
+    return float(np.sqrt(np.square(gains).mean())) if len(gains) else 0.0
+
+
+def decided_exposure(
+    config: TrainConfig, views: Sequence[View], dataset: Path, threads: int, report: Reporter
+) -> TrainConfig:
+    """The options with ``exposure`` decided, where that is `auto`: modelled where the photos' exposures differ.
+
+    Args:
+        config: The options.
+        views: To be trained on.
+        dataset: As for ``exposure_spread``.
+        threads: That read photos.
+        report: Told of what was found.
+    """
+    if config.exposure != "auto":
+        return config
+    spread = exposure_spread(views, dataset, threads)
+    differ = spread >= DIFFERING
+    if differ:
+        report.note(f"exposures differ by {spread:.0%}: they are modelled")
+    return config.model_copy(update={"exposure": "affine" if differ else "off"})
+
+
+def log_gains(
+    photo: Int64[np.ndarray, " n"], point: Int64[np.ndarray, " n"], logs: Float64[np.ndarray, "n 3"], photos: int
+) -> Float64[np.ndarray, "k 3"]:
+    """Logarithms of the photos' gains, their mean 0; only of photos that show enough points that others show, too.
+
+    Args:
+        photo: Which photo each observation is of.
+        point: Which point.
+        logs: Logarithms of the colours.
+        photos: How many there are.
+    """
+    _, number, count = np.unique(point, return_inverse=True, return_counts=True)
+    shared = count[number] > 1
+    photo, number, logs = photo[shared], number[shared], logs[shared]
+    rows = [np.flatnonzero(photo == each) for each in range(photos)]
+    rows = [own for own in rows if len(own) >= LEAST_SEEN]
+    gains, shown = np.zeros((len(rows), 3)), np.zeros_like(logs)  # ``shown``: the gain of each observation's photo
+    for _ in range(ROUNDS):
+        surface = np.stack([np.bincount(number, channel, len(count)) for channel in (logs - shown).T], axis=1)
+        apart = logs - surface[number] / count[number, None]
+        gains = np.array([np.median(apart[own], axis=0) for own in rows]).reshape(-1, 3)
+        gains -= gains.mean(axis=0) if len(rows) else 0.0
+        for own, gain in zip(rows, gains, strict=True):
+            shown[own] = gain
+    return gains
+
+
+def _colours(
+    view: View, xyz: Float64[np.ndarray, "m 3"], tracks: Mapping[str, Int64[np.ndarray, " _"]]
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """The points that a photo saw, where it is not clipped, and the logarithms of its colours there."""
+    camera, pixels, mask = reduced_view(view, MEGAPIXELS)
+    tracked = tracks[view.camera.name]
+    inside, places, _ = camera.in_view(xyz[tracked])
+    rows, (x, y) = tracked[inside], places.astype(np.int64).T
+    colour = cv2.blur(pixels, (WINDOW_PX, WINDOW_PX))[y, x].astype(np.float64)
+    counts = ((colour > DARKEST) & (colour < BRIGHTEST)).all(axis=1)
+    if mask is not None:
+        counts &= mask[y, x]
+    return rows[counts], np.log(colour[counts])
