@@ -58,6 +58,11 @@ def run(arguments: list[str], folder: Path, extra: Mapping[str, str]) -> subproc
     return subprocess.run(command, cwd=folder, env={**environ, **extra}, capture_output=True, text=True, check=False)
 
 
+def test_every_version_stands_for_the_sources_that_are_there() -> None:
+    told = record.complaint(ROOT)
+    assert not told, told
+
+
 def test_a_changed_answer_without_a_raised_version_is_noticed(copy: Path) -> None:
     replace(copy / "pipeline/splat/free_space.py", r"^CELLS = \d+", "CELLS = 99")
     noticed = complained_of(copy)

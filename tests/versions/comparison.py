@@ -17,6 +17,7 @@ from small_capture import CONFIG, write_capture
 from trees import Say, Tree, complete, git, take_commit, take_working
 
 HERE = Path(__file__).resolve().parent
+TOLD = 3  # files of other bits
 LOOKED_BACK = 20  # commits that changed the record; an engineer's branch has fewer
 
 
@@ -127,7 +128,8 @@ def _verdict(found: Mapping[str, Any], before: Mapping[str, str]) -> Verdict:
     if "failed" in found:
         bits = f"fails on what was left before: {found['failed']}"
     elif changed:
-        bits = f"other bits in {', '.join(changed)}"
+        more = f" and {len(changed) - TOLD} more files" if len(changed) > TOLD else ""
+        bits = f"other bits in {', '.join(changed[:TOLD])}{more}"
     else:
         bits = f"the same bits in all {len(names)} files"
     if reused:

@@ -11,12 +11,13 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.config import known, load_file, resolve
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.runner import Outcome, Runner
 from splatpipe.pipeline.engine.session import Request, open_session
@@ -29,7 +30,7 @@ from splatpipe.stages.options import LineConfig
 def main(job: Mapping[str, Any]) -> None:
     """Run the stages of a job, and those whose parts the earlier run lacks."""
     table = load_file(Path(job["earlier"]) / "config.toml")
-    config = resolve(LineConfig, [known(LineConfig, table)])
+    config = resolve(LineConfig, [_taken(known(LineConfig, table))])
     artifacts = _artifacts(Path(job["earlier"]))
     out = Path(job["out"])
     found = {}
@@ -45,6 +46,17 @@ def main(job: Mapping[str, Any]) -> None:
             if stage.name in job["stages"] or lacking:
                 found[stage.name] = _run(stage, runner, parts, artifacts)
     (out / "rerun.json").write_text(json.dumps(found), encoding="utf-8")
+
+
+def _taken(table: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a configuration is still taken; what is not has its default, and its stage another key."""
+    taken: dict[str, Any] = {}
+    for section, options in table.items():
+        for option, value in options.items():
+            with suppress(UsageError):
+                resolve(LineConfig, [{section: {option: value}}])
+                taken.setdefault(section, {})[option] = value
+    return taken
 
 
 def _unseen(_event: Event) -> None:
@@ -76,9 +88,9 @@ def _run(stage: Stage, runner: Runner, parts: dict[str, Part], artifacts: Mappin
     return {"reused": reused, "files": files}
 
 
-def _asked(inputs: Mapping[str, Any], parts: Iterable[str]) -> dict[str, list[str]]:
-    """What a key is made of and an artifact has to have, without their values: where it changed, nothing is reused."""
-    return {**{kind: sorted(inputs[kind]) for kind in ("config", "borrowed", "reads")}, "parts": sorted(parts)}
+def _asked(inputs: Mapping[str, Any], parts: Iterable[str]) -> dict[str, Any]:
+    """What a key is made of, but for what the parts that are read hold, and what an artifact has to have."""
+    return {**inputs, "reads": sorted(inputs["reads"]), "parts": sorted(parts)}
 
 
 if __name__ == "__main__":
