@@ -9,7 +9,7 @@ from splatpipe.pipeline.photos.dataset import load_views, split_views
 from splatpipe.pipeline.photos.options import SplitConfig
 
 
-def run(config: SplitConfig, inputs: Inputs, out: Path, _report: Reporter) -> Summary:
+def run(config: SplitConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write `split.json`: the names of both kinds, in order.
 
     Raises:
@@ -18,4 +18,5 @@ def run(config: SplitConfig, inputs: Inputs, out: Path, _report: Reporter) -> Su
     names = [view.camera.name for view in load_views(inputs["undistort.dataset"])]
     found = split_views(names, config.every, config.views)
     (out / "split.json").write_text(found.to_json(), encoding="utf-8")
+    report.progress(len(names), len(names), "holding out", "photos")
     return {"trained_on": len(found.train), "held_out": len(found.held_out)}
