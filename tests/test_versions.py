@@ -13,8 +13,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "versions"))
 import record
-from comparison import Comparison
 from sources import PACKAGE
+from stage_comparison import Comparison
 
 ROOT = Path(__file__).resolve().parents[1]
 MADE = ("*.so", "__pycache__", "dist", "node_modules", record.RECORD)

@@ -6,8 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from comparison import Comparison, Verdict
 from record import LINE_FILE, RECORD_FILE, differing, present, recorded, write
+from stage_comparison import Comparison, Verdict
 
 ROOT = Path(__file__).resolve().parents[2]
 
