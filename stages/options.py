@@ -20,9 +20,13 @@ from splatpipe.pipeline.web.options import ExportConfig
 class LineConfig(StageConfig):
     """Everything that changes the answer, a section a stage."""
 
+    renamed: ClassVar[Mapping[str, str]] = {
+        "evaluate.every": "split.every",
+        "evaluate.views": "split.views",
+        "train.spread_weight": "train.distortion_weight",
+    }
     gone: ClassVar[Mapping[str, str]] = {
-        "evaluate.every": "It is called split.every.",
-        "evaluate.views": "It is called split.views.",
+        **{old: f"It is called {new}." for old, new in renamed.items()},
         **{f"train.{name}": hint for name, hint in GONE_OF_TRAIN.items()},
         "initialize.dense_points": "The sweep adds 50,000 points at most.",
     }

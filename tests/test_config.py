@@ -1,5 +1,6 @@
 """Configuration: layers, presets, and what a wrong one is told."""
 
+import copy
 import tomllib
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from splatpipe.pipeline.engine.config import (
     dump,
+    known,
     load_file,
     load_preset,
     option_help,
@@ -126,6 +128,23 @@ def test_a_broken_file_is_refused(tmp_path: Path, content: bytes) -> None:
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="No such file"):
         load_file(tmp_path / "none.toml")
+
+
+def test_what_an_older_out_was_made_with_is_taken_as_far_as_it_goes() -> None:
+    """Options by their new names, those and values that are gone as their defaults."""
+    table = {
+        "evaluate": {"every": 5, "views": "a.jpg"},
+        "train": {"lr_sh": 0.1, "density": "mcmc", "dropout": "much", "iterations": 900, "spread_weight": 0.05},
+        "initialize": {"dense": "off", "opacity": 0.2},
+        "nothing": {"of": 1},
+    }
+    before = copy.deepcopy(table)
+    config = resolve(LineConfig, [known(LineConfig, table)])
+    assert (config.split.every, config.split.views) == (5, "a.jpg")
+    assert (config.train.iterations, config.train.distortion_weight) == (900, 0.05)
+    assert (config.train.density, config.train.dropout) == ("absolute", "auto")
+    assert (config.initialize.dense, config.initialize.opacity) == (True, 0.2)
+    assert table == before
 
 
 def test_an_unknown_preset_is_refused() -> None:

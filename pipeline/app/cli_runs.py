@@ -66,7 +66,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     if device == "cuda":
         raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
-        import splatpipe.pipeline.raster  # noqa: F401
+        import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)
     return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -59,13 +60,40 @@ def load_file(path: Path) -> Table:
 
 
 def known(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
-    """What of a table the model has: another version's OUT may name options that are gone."""
-    result: Table = {}
-    for name, value in table.items():
-        if name in model.model_fields:
-            section = model.model_fields[name].annotation
-            nested = isinstance(section, type) and issubclass(section, BaseModel) and isinstance(value, Mapping)
-            result[name] = known(section, value) if nested else value  # type: ignore[arg-type]
+    """What of an OUT's options this version takes, those with another name by it; one that is gone, or whose value is,
+    has its default.
+    """
+    taken: Table = copy.deepcopy(dict(table))
+    for old, new in getattr(model, "renamed", {}).items():
+        value = _removed(taken, old.split("."))
+        if value is not None:
+            taken = merge([_nested(new.split("."), value), taken])
+    try:
+        model.model_validate(taken)
+    except ValidationError as error:
+        for problem in error.errors():
+            if problem["loc"]:
+                _removed(taken, [str(key) for key in problem["loc"]])
+    return taken
+
+
+def _removed(table: Table, keys: Sequence[str]) -> JSON:
+    """Take out what lies at the end of a way into tables, which may go on beyond it; None where nothing is."""
+    for key in keys[:-1]:
+        if not isinstance(table.get(key), dict):
+            break
+        table = table[key]
+    else:
+        key = keys[-1]
+    return table.pop(key, None)
+
+
+def _nested(keys: Sequence[str], value: JSON) -> Table:
+    """``{"train": {"seed": 3}}`` of ``train``, ``seed`` and 3."""
+    table: JSON = value
+    for key in reversed(keys):
+        table = {key: table}
+    result: Table = table
     return result
 
 
@@ -86,11 +114,7 @@ def parse_set(assignment: str, model: type[BaseModel]) -> Table:
             f'Cannot understand --set "{assignment}".',
             hint="Write it as --set SECTION.OPTION=VALUE, e.g. train.iterations=7000.",
         )
-    table: JSON = raw.strip() if _takes_text(model, keys) else _parse_value(raw.strip())
-    for key in reversed(keys):
-        table = {key: table}
-    result: Table = table
-    return result
+    return _nested(keys, raw.strip() if _takes_text(model, keys) else _parse_value(raw.strip()))
 
 
 def _takes_text(model: type[BaseModel], keys: Sequence[str]) -> bool:

@@ -15,7 +15,6 @@ FILM_FROM_BUDGET_S = 600.0  # a shorter time budget has no time for a film
 _CONSTANT = "This is decided by constants now: leave it out."
 _NO_GAIN = "No gain was ever measured with this: leave it out."
 GONE = {
-    "spread_weight": "It is called train.distortion_weight.",
     **dict.fromkeys(
         (
             *("sh_every", "ssim_weight", "exposure_decay", "coarse_until", "sky_opacity_weight"),
