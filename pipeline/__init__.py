@@ -1,4 +1,4 @@
-"""splatpipe: the engine, the scene, the rasterizer and the command line."""
+"""splatpipe: the library in rooms, each on those below it, and the command line."""
 
 import contextlib
 import ctypes

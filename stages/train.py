@@ -1,4 +1,4 @@
-"""train: optimises the Gaussians against the photos; see ``loop``."""
+"""train: optimises the Gaussians against the photos; see ``pipeline.train.loop``."""
 
 from splatpipe.pipeline.train.loop import run
 

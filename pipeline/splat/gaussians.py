@@ -26,7 +26,7 @@ class Gaussians:
         log_scales: Natural logarithms of the standard deviations along the Gaussian's own axes, world units.
         quats: Rotations world from Gaussian (w, x, y, z), not necessarily of unit length.
         opacity_logits: Logits of the opacities.
-        sh: Spherical harmonics, k = (degree + 1)² coefficients of red, green and blue; see ``scene.sh``.
+        sh: Spherical harmonics, k = (degree + 1)² coefficients of red, green and blue; see ``splat.sh``.
     """
 
     means: Float[Tensor, "n 3"]

@@ -1,7 +1,7 @@
 """Gaussians that hang where photos look through, or right before a camera, are removed in training.
 
 The published trainer has only an opacity reset against them. That photos see sparse points through a place says more:
-`pipeline.scene.free_space` has the test, here with the photos trained on alone, so that no held-out one has a say.
+`splat.free_space` has the test, here with the photos trained on alone, so that no held-out one has a say.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 The idea of the distortion loss of Barron et al., "Mip-NeRF 360" (CVPR 2022), as Huang et al., "2D Gaussian Splatting
 for Geometrically Accurate Radiance Fields" (SIGGRAPH 2024) have it for splats, there by the squared distances of all
 pairs along a ray: that sum is the variance of its depths, which two more pictures give (Σ z α T and Σ z² α T). Here
-what is less than a pixel on the ground is free, and what is much more counts
-no more than that: past a roof's edge a pixel rightly sees two depths.
+what is less than a pixel on the ground is free, and what is much more counts no more than that: past a roof's edge a
+pixel rightly sees two depths.
 """
 
 from __future__ import annotations

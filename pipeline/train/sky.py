@@ -2,7 +2,7 @@
 
 A colour by direction alone behind the scene, and a loss on the opacity of rays into the sky, are those of Rematas et
 al., "Urban Radiance Fields", CVPR 2022; beside Gaussians, as an explicit map of directions, of Yan et al., "Street
-Gaussians", ECCV 2024. Here the sky is found without a network (``pipeline.scene.sky``), the map has cells of some
+Gaussians", ECCV 2024. Here the sky is found without a network (``splat.sky_mask``), the map has cells of some
 degrees and starts at what the photos show, and only pixels known to be sky train it: a wall that the Gaussians do not
 cover yet is not painted into the sky. Away from the sky a random colour takes its place: no wall can borrow the sky's.
 """
