@@ -41,7 +41,7 @@ FEATURES = Stage(
 )
 MATCHES = Stage(
     "matches",
-    version=1,
+    version=2,
     config=MatchesConfig,
     reads=("features.database", "ingest.photos", "ingest.positions"),
     parts={"database": "database.db", "pairs": "pairs.json"},

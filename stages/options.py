@@ -25,6 +25,11 @@ class LineConfig(StageConfig):
         "evaluate.views": "split.views",
         "train.spread_weight": "train.distortion_weight",
     }
+    replaced: ClassVar[Mapping[str, Mapping[str, str | bool]]] = {
+        "initialize.dense": {"off": False, "sweep": True},
+        "train.density": {"error": "absolute", "mcmc": "absolute"},
+        "train.exposure": {"bilateral": "affine"},
+    }
     gone: ClassVar[Mapping[str, str]] = {
         **{old: f"It is called {new}." for old, new in renamed.items()},
         **{f"train.{name}": hint for name, hint in GONE_OF_TRAIN.items()},

@@ -130,11 +130,10 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         load_file(tmp_path / "none.toml")
 
 
-def test_what_an_older_out_was_made_with_is_taken_as_far_as_it_goes() -> None:
-    """Options by their new names, those and values that are gone as their defaults."""
+def test_an_older_outs_options_are_taken_by_their_new_names_and_values() -> None:
     table = {
         "evaluate": {"every": 5, "views": "a.jpg"},
-        "train": {"lr_sh": 0.1, "density": "mcmc", "dropout": "much", "iterations": 900, "spread_weight": 0.05},
+        "train": {"lr_sh": 0.1, "density": "mcmc", "exposure": "bilateral", "iterations": 900, "spread_weight": 0.05},
         "initialize": {"dense": "off", "opacity": 0.2},
         "nothing": {"of": 1},
     }
@@ -142,9 +141,19 @@ def test_what_an_older_out_was_made_with_is_taken_as_far_as_it_goes() -> None:
     config = resolve(LineConfig, [known(LineConfig, table)])
     assert (config.split.every, config.split.views) == (5, "a.jpg")
     assert (config.train.iterations, config.train.distortion_weight) == (900, 0.05)
-    assert (config.train.density, config.train.dropout) == ("absolute", "auto")
-    assert (config.initialize.dense, config.initialize.opacity) == (True, 0.2)
+    assert (config.train.density, config.train.exposure) == ("absolute", "affine")
+    assert (config.initialize.dense, config.initialize.opacity) == (False, 0.2)
     assert table == before
+
+
+def test_a_value_that_is_gone_is_refused_with_the_one_to_write() -> None:
+    with pytest.raises(UsageError, match=r"initialize\.dense = 'sweep' is gone; write true"):
+        resolve(LineConfig, [{"initialize": {"dense": "sweep"}}])
+
+
+def test_a_wrong_value_in_an_out_is_refused_by_name() -> None:
+    with pytest.raises(UsageError, match=r"train\.iterations = '7000'"):
+        resolve(LineConfig, [known(LineConfig, {"train": {"iterations": "7000"}})])
 
 
 def test_an_unknown_preset_is_refused() -> None:

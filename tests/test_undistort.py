@@ -202,6 +202,7 @@ def test_what_is_written_carries_no_exif_and_keeps_its_name(tmp_path: Path) -> N
     exif = turned.getexif()
     exif[274] = 6
     turned.save(inputs.photos_dir / "a.JPG", format="JPEG", exif=exif)
+    corner_photos.list_anew(inputs)
     write_model(tmp_path / "model", source, names)
     run(inputs, tmp_path / "model", tmp_path / "out")
     formats = {}

@@ -128,7 +128,7 @@ def in_run(out: Path, plot_m: np.ndarray) -> np.ndarray:
 
 def test_the_demos_page_shows_what_our_rasterizer_renders(demo_run: Path, view: Opened) -> None:
     model = read_splat(part(demo_run, "train", "model"))
-    options, _ = as_trained(part(demo_run, "train", "plan"), model)
+    options, _ = as_trained(part(demo_run, "train", "rendering"), model)
     sky = read_panorama(part(demo_run, "train", "sky"))
     cameras = [shown.camera for shown in load_views(part(demo_run, "undistort", "dataset"))][::13]
     page = view(demo_run / "viewer.html", cameras[0].width, cameras[0].height)

@@ -267,6 +267,11 @@ def _parts(out: Path) -> dict[str, Path]:
     """
     found = {name: part.path for name, part in open_run_folder(out, LINE).lineage(EXPORT, TRAIN).items()}
     missing = [name for name in READ if name not in found]
+    if missing and "train.model" in found:
+        raise UsageError(
+            f"{out} was trained by an earlier splatpipe: {missing[0]} is not there.",
+            hint=f"Run it again with this one: splatpipe run PHOTOS {out}",
+        )
     if missing:
         raise UsageError(
             f"{out} has no trained splat: {missing[0]} is not there.",

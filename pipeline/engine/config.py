@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import json
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
@@ -60,32 +61,32 @@ def load_file(path: Path) -> Table:
 
 
 def known(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
-    """What of an OUT's options this version takes, those with another name by it; one that is gone, or whose value is,
-    has its default.
+    """An OUT's options as this version names them: what another version called otherwise by its new name and value.
+
+    Names that it does not have are passed over, as those of a newer version are. Wrong values stay, to be refused.
     """
     taken: Table = copy.deepcopy(dict(table))
     for old, new in getattr(model, "renamed", {}).items():
-        value = _removed(taken, old.split("."))
-        if value is not None:
-            taken = merge([_nested(new.split("."), value), taken])
-    try:
-        model.model_validate(taken)
-    except ValidationError as error:
-        for problem in error.errors():
-            if problem["loc"]:
-                _removed(taken, [str(key) for key in problem["loc"]])
-    return taken
+        section, option = old.split(".")
+        if option in taken.get(section, {}):
+            taken = merge([_nested(new.split("."), taken[section].pop(option)), taken])
+    for dotted, values in getattr(model, "replaced", {}).items():
+        section, option = dotted.split(".")
+        value = taken.get(section, {}).get(option)
+        if isinstance(value, str) and value in values:
+            taken[section][option] = values[value]
+    return _named(model, taken)
 
 
-def _removed(table: Table, keys: Sequence[str]) -> JSON:
-    """Take out what lies at the end of a way into tables, which may go on beyond it; None where nothing is."""
-    for key in keys[:-1]:
-        if not isinstance(table.get(key), dict):
-            break
-        table = table[key]
-    else:
-        key = keys[-1]
-    return table.pop(key, None)
+def _named(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
+    """What of a table the model has."""
+    result: Table = {}
+    for name, value in table.items():
+        if name in model.model_fields:
+            section = model.model_fields[name].annotation
+            nested = isinstance(section, type) and issubclass(section, BaseModel) and isinstance(value, Mapping)
+            result[name] = _named(section, value) if nested else value  # type: ignore[arg-type]
+    return result
 
 
 def _nested(keys: Sequence[str], value: JSON) -> Table:
@@ -152,12 +153,15 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
         return model.model_validate(merge(layers))
     except ValidationError as error:
         gone: Mapping[str, str] = getattr(model, "gone", {})
+        replaced: Mapping[str, Mapping[str, JSON]] = getattr(model, "replaced", {})
         by_hint: dict[str, list[str]] = {}
         problems = []
         for problem in error.errors():
             dotted = ".".join(str(key) for key in problem["loc"])
             if problem["type"] == "extra_forbidden" and dotted in gone:
                 by_hint.setdefault(gone[dotted], []).append(dotted)
+            elif isinstance(problem["input"], str) and problem["input"] in (now := replaced.get(dotted, {})):
+                problems.append(f"{dotted} = {problem['input']!r} is gone; write {json.dumps(now[problem['input']])}.")
             else:
                 problems.append(_describe(model, dotted, problem["type"], problem["msg"], problem["input"]))
         problems += [_gone(names, hint) for hint, names in by_hint.items()]

@@ -23,6 +23,7 @@ TOP_OF_ORIENTATION = {
 UPRIGHT_AND_TURNED = (1, 6)  # EXIF orientations that stand for the two ways of holding a camera
 ALIKE = 0.9  # length of the mean of unit vectors within some 25°
 STEADY = 0.997  # within some 4°: a gimbal, which points down better than the ground is level
+PARALLEL = 0.9995  # within some 2°: no hand holds a camera so while its owner walks
 SCATTERED = 0.5  # of vectors that rather cancel
 GRID = 0.3  # spread of the cameras along the picture's height over that along its width, from which on it is a survey
 LEAST_WIDTH = 0.2  # of the fan of the cameras' horizontal axes: narrower, it does not show the plane it lies in
@@ -99,7 +100,7 @@ def up_from_cameras(
         sign = float(np.sign(((axes.up - axes.forward) @ normal).sum())) or 1.0
         return Upright(sign * normal, "the horizontal edges of the pictures")
     alike_up, alike_forward = float(np.linalg.norm(mean_up)), float(np.linalg.norm(mean_forward))
-    if alike_forward > ALIKE and (alike_up < SCATTERED or _is_survey(centres, _unit(mean_up), _unit(mean_forward))):
+    if alike_forward > ALIKE and (alike_up < SCATTERED or _is_survey(centres, mean_up, mean_forward)):
         ground = _ground_normal(points, centres, -_unit(mean_forward))
         if ground is not None and alike_forward < STEADY:
             return Upright(ground, "the ground below cameras that look down")
@@ -195,11 +196,17 @@ def _plane_normal(vectors: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarr
 
 
 def _is_survey(
-    centres: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"], forward: Float64[np.ndarray, " 3"]
+    centres: Float64[np.ndarray, "n 3"], mean_up: Float64[np.ndarray, " 3"], mean_forward: Float64[np.ndarray, " 3"]
 ) -> bool:
-    """Whether cameras that look one way spread along both sides of their pictures, and not where they look: a walk."""
+    """Whether cameras that look one way spread along both sides of their pictures.
+
+    Those that rather spread where they look are of a walk, unless they are as alike as a gimbal alone keeps them: on a
+    mast, or hovering.
+    """
+    up, forward = _unit(mean_up), _unit(mean_forward)
     along_up, along_right, ahead = (float(np.std(centres @ axis)) for axis in (up, np.cross(forward, up), forward))
-    return along_up > GRID * along_right and ahead < max(along_up, along_right)
+    is_walk = ahead >= max(along_up, along_right) and float(np.linalg.norm(mean_forward)) < PARALLEL
+    return along_up > GRID * along_right and not is_walk
 
 
 def _ground_normal(

@@ -1,8 +1,10 @@
 """Photos of the corner of a textured room, with known cameras: for the stages up to undistort, in a second or two."""
 
+import hashlib
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
+from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, load_photo_list, save_photo_list
 
 WIDTH, HEIGHT, FOCAL, RADIAL = 480, 360, 420.0, -0.08
 ROOM_M = 3.0
@@ -92,6 +94,15 @@ def render(pose: np.ndarray, seed: int, lens: pycolmap.Camera | None = None) -> 
     return np.rint(image).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
 
 
+def list_anew(inputs: Inputs) -> None:
+    """Make `ingest`'s list one of the photos as they lie there now."""
+    part = inputs["ingest.photos"]
+    photos = load_photo_list(part).photos
+    digests = [hashlib.sha256((inputs.photos_dir / photo.name).read_bytes()).hexdigest() for photo in photos]
+    listed = (replace(photo, sha256=digest) for photo, digest in zip(photos, digests, strict=True))
+    save_photo_list(PhotoList(tuple(listed)), part)
+
+
 def write_capture(folder: Path, pictures: dict[str, np.ndarray], masks: dict[str, np.ndarray] | None = None) -> Inputs:
     """Write photos and the parts that `ingest` would leave for them.
 
@@ -106,13 +117,14 @@ def write_capture(folder: Path, pictures: dict[str, np.ndarray], masks: dict[str
     for name, picture in pictures.items():
         path = photos_dir / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1].tobytes())
+        data = cv2.imencode(".png", picture[:, :, ::-1])[1].tobytes()
+        path.write_bytes(data)
         mask = None
         if masks and name in masks:
             mask = f"mask{len(photos)}.png"
             (part / mask).write_bytes(cv2.imencode(".png", masks[name])[1].tobytes())
         height, width = picture.shape[:2]
-        photos.append(Photo(name, "0" * 64, width, height, 0, mask=mask))
+        photos.append(Photo(name, hashlib.sha256(data).hexdigest(), width, height, 0, mask=mask))
     save_photo_list(PhotoList(tuple(photos)), part)
     height, width = next(iter(pictures.values())).shape[:2]
     guess = 1.2 * max(width, height)

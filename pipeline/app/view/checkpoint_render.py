@@ -63,7 +63,9 @@ class Shown:
 
 def newest(opened: Contents) -> Source | None:
     """The furthest that a training has come; None before it can begin."""
-    if {"train.model", "train.rendering"} <= set(opened.parts):
+    if "train.model" in opened.parts:
+        if "train.rendering" not in opened.parts:  # of an earlier splatpipe: how it was rendered is not known
+            return None
         part = opened.parts["train.model"]
         rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
         return Source(part.path, "model", part.digest[:16], rendering, sky)
