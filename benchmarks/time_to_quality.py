@@ -34,14 +34,13 @@ from splatpipe.pipeline.photos.images import load_colour, load_mask
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import render_pixels
 from splatpipe.pipeline.render.view_measures import measure
-from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.start import with_room
+from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
@@ -99,16 +98,17 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     before = restart_peak()
     clocks, due, peak = Clocks(), arguments.every, 0
     views = load_views(dataset)
-    start = read_splat(dataset / "init.ply")
+    start = read_start(dataset / "init.ply")
     split = split_views([view.camera.name for view in views], config.split.every, arguments.held_out)
-    trained_on = [view for view in views if view.camera.name in set(split.train)]
+    kept = set(split.train)
+    trained_on = [view for view in views if view.camera.name in kept]
     options = decided_exposure(config.train, trained_on, dataset, arguments.threads, SilentReporter())
-    plan = make_plan(options, views, split, len(start))
+    room = start.within(options.max_gaussians)
+    plan = make_plan(options, views, split, len(room))
     levels = plan.schedule.coarse_levels_to(plan.options.iterations)
     with same_bits(arguments.threads):
         clocks.start()
         sky = begin_sky(options, trained_on, dataset, arguments.threads, SilentReporter())
-        room = with_room(start, dataset, plan.schedule.density.cap)
         state = TrainState.begin(room, plan, make_techniques(plan, sky, trained_on, dataset))
         with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
             for photo in photos:

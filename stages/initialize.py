@@ -17,6 +17,7 @@ from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_sp
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import write_splat
 from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.splat.sparse_count import sparse_comment
 
 Doubles = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
@@ -56,7 +57,8 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
         xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
         summary = {"points": int(chosen.size), "dense_points": len(more)}
     sizes = point_sizes(xyz, centres, config.max_angle, report)
-    write_splat(out / "init.ply", make_gaussians(xyz, rgb, sizes, config.opacity))
+    gaussians = make_gaussians(xyz, rgb, sizes, config.opacity)
+    write_splat(out / "init.ply", gaussians, [sparse_comment(chosen.size)])
     return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
 
 

@@ -6,6 +6,7 @@ import math
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import iteration, loop, planning
+from splatpipe.pipeline.train import iteration, loop, memory, planning
 from splatpipe.pipeline.train import plan as planning_of_schedule
 from splatpipe.pipeline.train.budget import (
     FEWEST,
@@ -40,6 +41,7 @@ from splatpipe.pipeline.train.memory import FIXED_BYTES, bytes_per_gaussian, res
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.plan import Plan, duration, make_plan
 from splatpipe.pipeline.train.schedule import resolve_schedule
+from splatpipe.pipeline.train.start import Start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import evaluate, initialize, train
@@ -138,9 +140,14 @@ def test_forecast_is_the_sum_over_the_iterations() -> None:
     assert forecast(SPEED, schedule, 8_000, 0.4) == pytest.approx(math.fsum(each), rel=0.01)
 
 
-def plan_for(seconds: float, photos: int = 30, initial: int = 8_000, size: float = 0.5, cap: int = 1_000_000) -> Choice:
+def task_of(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Task:
+    """8,000 sparse points."""
     config = tiny_scene.plain(time_budget_s=seconds, max_gaussians=cap)
-    return choose(Task(config, initial, photos, size, SPEED, 0.0, lambda _size: seconds))
+    return Task(config, 8_000, 0, photos, size, SPEED, 0.0, lambda _size: seconds)
+
+
+def plan_for(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Choice:
+    return choose(task_of(seconds, photos, size, cap))
 
 
 @pytest.mark.parametrize("seconds", [10.0, 30.0, 60.0, 300.0, 600.0, 3600.0])
@@ -165,7 +172,7 @@ def test_no_limit_is_passed_however_much_time_there_is() -> None:
 
 
 def test_too_little_time_plans_the_smallest_training_and_not_none() -> None:
-    choice = plan_for(0.01, initial=500_000, size=2.0)
+    choice = choose(replace(task_of(0.01, size=2.0), sparse=500_000))
     assert choice.options.iterations == FEWEST and choice.options.max_gaussians == FEWEST_GAUSSIANS
     assert choice.megapixels == SMALLEST_MEGAPIXELS
 
@@ -174,6 +181,16 @@ def test_every_photo_is_seen_often_enough_before_photos_grow() -> None:
     many = plan_for(120.0, photos=1_000)
     assert many.options.iterations >= 0.99 * VISITS * 1_000
     assert (many.megapixels or 0.5) < (plan_for(120.0, photos=10).megapixels or 0.5)
+
+
+@pytest.mark.parametrize("seconds", [5.0, 15.0, 60.0])
+def test_points_of_the_sweep_take_nothing_from_photos_and_iterations(seconds: float) -> None:
+    """They are what a plan drops first, so it need not have room for them: only the forecast counts those that stay."""
+    bare, swept = choose(task_of(seconds)), choose(replace(task_of(seconds), swept=50_000))
+    assert swept.megapixels == bare.megapixels
+    assert swept.options.iterations >= 0.9 * bare.options.iterations
+    assert swept.options.max_gaussians >= 0.8 * bare.options.max_gaussians
+    assert swept.forecast_s <= SCHEDULE_SHARE * seconds
 
 
 @pytest.fixture(scope="module")
@@ -321,6 +338,20 @@ def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused
     assert count < FEWEST_GAUSSIANS
 
 
+def test_memory_that_holds_the_sparse_points_takes_the_sweep_s_without_a_warning(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "resident_bytes", lambda: 0)
+    limit = FIXED_BYTES + 2000 * bytes_per_gaussian(plan.options)
+    limited = plan.of(plan.options.model_copy(update={"max_memory_bytes": limit}))
+    for sparse, told in ((1500, 0), (2500, 1)):
+        recorder = tiny_scene.Recorder()
+        capped = memory.within_memory(replace(limited, initial_gaussians=50_000), 0, sparse, recorder)
+        assert capped.options.max_gaussians == 2000
+        assert len(recorder.warnings) == told
+    assert "2,000 Gaussians, fewer than the 2,500 sparse points" in recorder.warnings[0]
+
+
 TRAIN_IN_LITTLE_MEMORY = """
 import json, sys
 from pathlib import Path
@@ -392,6 +423,6 @@ def test_a_budget_long_enough_for_a_film_keeps_time_for_it() -> None:
     for budget in (FILM_FROM_BUDGET_S - 1.0, FILM_FROM_BUDGET_S):
         config = TrainConfig(time_budget_s=budget)
         plan = make_plan(config, views, tiny_scene.split_of(views, 4), 100)
-        scene = planning.Scene(config, tiny_scene.true_model(), views, 3, Machine())
+        scene = planning.Scene(config, Start(tiny_scene.true_model(), 100), views, 3, Machine())
         left.append(planning._task(plan, scene, measured, 500.0).seconds(0.5))
     assert left[0] - left[1] == pytest.approx(planning.FILM_VIEWS * 2.0 * 0.5)

@@ -18,6 +18,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.mvs.sweep import sweep
 from splatpipe.pipeline.photos.dataset import load_points, load_views
 from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train.start import read_start
 from splatpipe.stages.initialize import run
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -175,6 +176,7 @@ def test_sparse_gaussians_stay_and_the_summary_counts_both(
     assert off["gaussians"] == summary["points"] == 300
     assert summary["gaussians"] == len(after) == 300 + summary["dense_points"]
     assert (after.means[:300] == before.means).all()
+    assert [read_start(path).sparse for path in (tmp_path / "off/init.ply", tmp_path / "sweep.ply")] == [300, 300]
 
 
 def test_off_reads_no_photo_and_no_setting(room: Path, started: tuple[dict, bytes], tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import techniques
+from splatpipe.pipeline.train import brightness, techniques
 from splatpipe.pipeline.train.brightness import DIFFERING, decided_exposure, exposure_spread, log_gains
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.options import TrainConfig
@@ -67,6 +67,20 @@ def test_exposures_are_modelled_where_they_differ_unless_told_otherwise(scene: P
         found = decided_exposure(TrainConfig(exposure=asked), load_views(dataset), dataset, 1, recorder)
         assert found.exposure == told
         assert [note[:9] for note in recorder.notes] == (["exposures"] if told == "affine" else [])
+
+
+def test_a_written_plan_has_decided_and_no_photo_is_asked_again(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
+    inputs = Inputs(parts | tiny_scene.split_part(scene / "dataset"), scene, machine=Machine("cpu", 1))
+    config = tiny_scene.plain(iterations=5, exposure="auto")
+    train.run(config, inputs, tmp_path, tiny_scene.Recorder())
+    before = (tmp_path / "model.ply").read_bytes()
+    monkeypatch.setattr(brightness, "exposure_spread", None)  # measuring again would fail the test
+    train.run(config, inputs, tmp_path, tiny_scene.Recorder())
+    assert (tmp_path / "model.ply").read_bytes() == before
+    assert json.loads((tmp_path / "exposures.json").read_text())["model"] == "affine"
 
 
 def test_spread_of_photos_that_were_exposed_differently_is_measured(scene: Path, tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import Points
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.ply import read_splat, read_splat_header
 from splatpipe.pipeline.splat.sh import dc_to_rgb
+from splatpipe.pipeline.splat.sparse_count import sparse_comment
 from splatpipe.stages.initialize import choose_points, point_sizes, run
 
 RNG = np.random.default_rng(7)
@@ -94,6 +95,20 @@ def test_every_point_becomes_an_isotropic_gaussian_of_its_colour(tmp_path: Path)
     assert (gaussians.log_scales == gaussians.log_scales[:, :1]).all()
     torch.testing.assert_close(torch.sigmoid(gaussians.opacity_logits), torch.full((50,), 0.2))
     assert math.isclose(float(gaussians.quats.norm(dim=1).mean()), 1.0)
+
+
+def test_the_file_tells_how_many_are_of_sparse_points_whatever_was_left_out(tmp_path: Path) -> None:
+    xyz = RNG.normal(size=(50, 3))
+    xyz[7] = np.nan
+    dataset = write_dataset(tmp_path / "dataset", xyz, np.zeros((50, 3), np.uint8))
+    for limit, left in ((1000, 49), (20, 20)):
+        run(
+            InitializeConfig(max_gaussians=limit, dense=False),
+            Inputs({"undistort.dataset": dataset}, tmp_path),
+            tmp_path,
+            Quiet(),
+        )
+        assert read_splat_header(tmp_path / "init.ply").comments == (sparse_comment(left),)
 
 
 def test_model_without_points_says_what_to_do(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from scipy.optimize import nnls
 from splatpipe.pipeline.train.densify import room_at
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
+from splatpipe.pipeline.train.start import started
 
 # Of these, up to COARSEST_MEGAPIXELS, none was compared by held-out quality: they are judgement, the reasons theirs.
 SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
@@ -29,7 +30,7 @@ LONGEST = 30_000  # iterations, as published: beyond them little is learnt
 FEWEST = 300  # iterations, however short the time: fewer do not leave the initial blur
 VISITS = 10  # iterations a photo at least: one seen less often leaves floaters before its camera
 
-FIRST_GROWTH = 1.5  # times the initial Gaussians that every plan has room for, before it takes larger photos
+FIRST_GROWTH = 1.5  # times the Gaussians of sparse points that every plan has room for, before it takes larger photos
 FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer; the plan thins the initial ones down to it at most
 COARSEST_MEGAPIXELS = 0.05  # photos are halved at the start of a training no further than to this
 
@@ -120,7 +121,8 @@ class Task:
 
     Attributes:
         config: The options; its ``max_gaussians`` is the most that may be planned.
-        initial: Gaussians at the start.
+        sparse: Gaussians of sparse points at the start, which every plan keeps where it can.
+        swept: Gaussians of the sweep, which only fill what room a cap leaves.
         photos: To train on.
         megapixels: Their mean size in the dataset.
         speed: Of this machine on this scene.
@@ -129,7 +131,8 @@ class Task:
     """
 
     config: TrainConfig
-    initial: int
+    sparse: int
+    swept: int
     photos: int
     megapixels: float
     speed: Speed
@@ -143,9 +146,8 @@ class Task:
     def takes(self, options: TrainConfig, megapixels: float) -> float:
         """Forecast of a training, its photos' decoding (once a size) included, seconds."""
         decoding = self.prepare_s * (1 + options.coarse_levels)
-        return decoding + AGEING * forecast(
-            self.speed, resolve_schedule(options, self.photos), self.initial, megapixels
-        )
+        initial = started(self.sparse, self.swept, options.max_gaussians)
+        return decoding + AGEING * forecast(self.speed, resolve_schedule(options, self.photos), initial, megapixels)
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ def choose(task: Task) -> Choice:
     the cap grows; what is over goes into iterations, up to ``LONGEST``.
     """
     most = task.config.max_gaussians
-    first = min(most, max(FEWEST_GAUSSIANS, int(FIRST_GROWTH * task.initial)))
+    first = min(most, max(FEWEST_GAUSSIANS, int(FIRST_GROWTH * task.sparse)))
     size, cap = SMALLEST_MEGAPIXELS, first
     for size in reversed(sizes(task.megapixels)):
         if _fits(task, size, first, wanted_iterations(task, size)):

@@ -16,7 +16,7 @@ from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
+from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
 from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.exposure import Exposure, exposures_json
@@ -27,7 +27,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
 from splatpipe.pipeline.train.planning import Scene, under_budgets
 from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.start import with_room
+from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
@@ -49,15 +49,16 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     check_device(inputs.machine)
     dataset = inputs["undistort.dataset"]
     views = load_views(dataset)
-    start = read_splat(inputs["initialize.splat"])
+    start = read_start(inputs["initialize.splat"])
     split = load_split(inputs["split.views"])
-    trained_on = [view for view in views if view.camera.name in set(split.train)]
-    config = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
-    free = make_plan(config, views, split, len(start))
+    kept = set(split.train)
+    trained_on = [view for view in views if view.camera.name in kept]
+    free = make_plan(config, views, split, len(start.gaussians))
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
 
     def make() -> Plan:
-        return under_budgets(free, replace(scene, sky=sky), iterate, report)
+        decided = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
+        return under_budgets(free.of(decided), replace(scene, config=decided, sky=sky), iterate, report)
 
     with same_bits(inputs.machine.threads):
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
@@ -71,8 +72,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
 
         state = resume(out / CHECKPOINT, plan, techniques, report)
         if state is None:
-            room = with_room(start, dataset, plan.schedule.density.cap)
-            state = TrainState.begin(room, plan, techniques())
+            state = TrainState.begin(start.within(plan.options.max_gaussians), plan, techniques())
         levels = plan.schedule.coarse_levels_to(ends_at(plan, state.history.flat_at))
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(trained_on, levels, plan.options.seed, first, out, size) as photos:

@@ -41,13 +41,14 @@ def bytes_per_gaussian(options: TrainConfig) -> int:
     return int(state * (1.0 + PEAK_SHARE))
 
 
-def within_memory(plan: Plan, largest_pixels: int, report: Reporter) -> Plan:
+def within_memory(plan: Plan, largest_pixels: int, sparse: int, report: Reporter) -> Plan:
     """The plan with a cap on Gaussians that keeps the process within ``max_memory_bytes``.
 
     Args:
         plan: Without it.
         largest_pixels: Of a training photo.
-        report: Is told where the initial Gaussians have to be thinned.
+        sparse: Gaussians of sparse points at the start; the sweep's go before they do, and nobody misses those.
+        report: Is told where those of sparse points have to be thinned.
 
     Raises:
         MachineError: if not even the fewest fit beside what the process has already.
@@ -56,16 +57,16 @@ def within_memory(plan: Plan, largest_pixels: int, report: Reporter) -> Plan:
     limit, taken = plan.options.max_memory_bytes, -(-resident_bytes() // RESIDENT_STEP) * RESIDENT_STEP
     room = limit - taken - FIXED_BYTES - PIXEL_BYTES * largest_pixels
     most = room // bytes_per_gaussian(plan.options)
-    if most < min(FEWEST_GAUSSIANS, plan.initial_gaussians):
+    if most < min(FEWEST_GAUSSIANS, sparse):
         least = limit - room + FEWEST_GAUSSIANS * bytes_per_gaussian(plan.options)
         raise MachineError(
             f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB of them already, "
             f"and photos of {largest_pixels / 1e6:.1f} megapixels need room, too.",
             hint=f"Give --max-memory at least {least / 1e6 + 1:.0f}M, or lower undistort.max_megapixels.",
         )
-    if most < plan.initial_gaussians:
+    if most < sparse:
         report.warning(
-            f"{limit / 1e9:.2f} GB hold {most:,} Gaussians, fewer than the {plan.initial_gaussians:,} sparse points: "
+            f"{limit / 1e9:.2f} GB hold {most:,} Gaussians, fewer than the {sparse:,} sparse points: "
             "every part of the scene is thinned evenly.",
             hint="Give more with --max-memory for a finer model.",
         )

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.budget import (
     FEWEST_GAUSSIANS,
     FIRST_GROWTH,
@@ -22,6 +21,7 @@ from splatpipe.pipeline.train.memory import within_memory
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.plan import Plan, mean_megapixels
 from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.start import Start, started
 
 MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
 MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
@@ -45,7 +45,7 @@ class Scene:
     """
 
     config: TrainConfig
-    start: Gaussians
+    start: Start
     trained_on: Sequence[View]
     held_out: int
     machine: Machine
@@ -53,7 +53,7 @@ class Scene:
 
 
 def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
-    """Fit a plan to the budgets of its options; the same plan where there are none.
+    """Fit a plan to the budgets of its options, and its initial Gaussians to the cap.
 
     Args:
         plan: With resolved schedules.
@@ -66,10 +66,11 @@ def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Pla
     """
     if plan.options.max_memory_bytes:
         largest = max(view.camera.width * view.camera.height for view in scene.trained_on)
-        plan = within_memory(plan, largest, report)
+        plan = within_memory(plan, largest, scene.start.sparse, report)
     if plan.options.time_budget_s:
         plan = within_time(plan, scene, step, report)
-    return plan
+    start = scene.start
+    return replace(plan, initial_gaussians=started(start.sparse, start.swept, plan.options.max_gaussians))
 
 
 def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
@@ -82,7 +83,9 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
         min(MEASURE_SECONDS, MEASURE_SHARE * budget),
         max(LEAST_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
     )
-    measured = measure(pilot(plan, scene.config), scene.start, scene.trained_on, step, effort, scene.sky)
+    trial = pilot(plan, scene)
+    start = scene.start.within(trial.options.max_gaussians)
+    measured = measure(trial, start, scene.trained_on, step, effort, scene.sky)
     left = budget - (time.monotonic() - began)
     choice = choose(_task(plan, scene, measured, left))
     if choice.seconds <= LEAST_SHARE * budget:
@@ -101,16 +104,17 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
     )
 
 
-def pilot(plan: Plan, config: TrainConfig) -> Plan:
+def pilot(plan: Plan, scene: Scene) -> Plan:
     """The plan of a short training with a cap near which the budget's may lie, to be measured at.
 
     Args:
         plan: Without a budget.
-        config: The options, not resolved.
+        scene: What is trained.
     """
-    wanted = max(FIRST_GROWTH * plan.initial_gaussians, PILOT_GROWTH_A_SECOND * config.time_budget_s, FEWEST_GAUSSIANS)
+    budget = scene.config.time_budget_s
+    wanted = max(FIRST_GROWTH * scene.start.sparse, PILOT_GROWTH_A_SECOND * budget, FEWEST_GAUSSIANS)
     short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
-    return plan.of(config.model_copy(update=short))
+    return plan.of(scene.config.model_copy(update=short))
 
 
 def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
@@ -126,7 +130,8 @@ def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
 
     return Task(
         config=options,
-        initial=plan.initial_gaussians,
+        sparse=scene.start.sparse,
+        swept=scene.start.swept,
         photos=len(cameras),
         megapixels=mean_megapixels(cameras),
         speed=measured.speed,

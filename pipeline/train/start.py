@@ -2,30 +2,71 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from splatpipe.pipeline.photos.dataset import load_points
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import read_splat, read_splat_header
+from splatpipe.pipeline.splat.sparse_count import sparse_count
 
 START_SHARE = 0.5  # of the cap, that the start may fill with points of the sweep: the rest is for where detail is
 
 
-def with_room(start: Gaussians, dataset: Path, cap: int) -> Gaussians:
-    """The start with as many of the sweep's Gaussians as leave room to grow, taken evenly; all the sparse points' stay.
+@dataclass(frozen=True)
+class Start:
+    """The initial Gaussians.
+
+    Attributes:
+        gaussians: Those of the sparse points first, then the sweep's.
+        sparse: How many are of sparse points.
+    """
+
+    gaussians: Gaussians
+    sparse: int
+
+    @property
+    def swept(self) -> int:
+        """How many are of the sweep."""
+        return len(self.gaussians) - self.sparse
+
+    def within(self, cap: int) -> Gaussians:
+        """Those that training starts with: taken evenly from the sweep's, and from the sparse points' beyond the cap.
+
+        Args:
+            cap: Most Gaussians of the training.
+        """
+        count = started(self.sparse, self.swept, cap)
+        if count == len(self.gaussians):
+            return self.gaussians
+        sparse = min(self.sparse, count)
+        swept = count - sparse
+        rows = [_evenly(self.sparse, sparse), self.sparse + _evenly(self.swept, swept)]
+        return self.gaussians.select(torch.cat(rows))
+
+
+def _evenly(rows: int, count: int) -> torch.Tensor:
+    return torch.arange(count) * rows // max(count, 1)
+
+
+def started(sparse: int, swept: int, cap: int) -> int:
+    """How many Gaussians training starts with: the sweep's leave room to grow, and go before any sparse point does.
 
     Args:
-        start: Those of the sparse points first, as `initialize` leaves them.
-        dataset: The sparse points'.
+        sparse: Gaussians of sparse points.
+        swept: Gaussians of the sweep.
         cap: Most Gaussians of the training.
+    """
+    room = max(0, int(START_SHARE * cap) - sparse)
+    return min(cap, sparse + min(swept, room))
+
+
+def read_start(path: Path) -> Start:
+    """Read what `initialize` left.
 
     Raises:
-        StageError: if the dataset is broken.
+        SplatpipeError: if it is no splat.
     """
-    sparse = min(len(load_points(dataset)), len(start))
-    dense = len(start) - sparse
-    room = max(0, int(START_SHARE * cap) - sparse)
-    if dense <= room:
-        return start
-    return start.select(torch.cat([torch.arange(sparse), sparse + torch.arange(room) * dense // max(room, 1)]))
+    gaussians = read_splat(path)
+    return Start(gaussians, sparse_count(read_splat_header(path).comments, len(gaussians)))

@@ -64,14 +64,11 @@ class TrainState:
         """The state before the first iteration.
 
         Args:
-            start: The Gaussians to start with; evenly thinned where there are more than the cap allows.
+            start: The Gaussians to start with, as ``Start.within`` the plan's cap.
             plan: The training's.
             techniques: The plan's, nothing of them trained.
         """
-        options = plan.options
-        if len(start) > options.max_gaussians:
-            start = start.select(torch.arange(options.max_gaussians) * len(start) // options.max_gaussians)
-        columns = coefficient_count(options.sh_degree)
+        columns = coefficient_count(plan.options.sh_degree)
         sh = torch.zeros(len(start), columns, 3)
         shared = min(columns, start.sh.shape[1])
         sh[:, :shared] = start.sh[:, :shared]
