@@ -35,7 +35,7 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     folder.mkdir(parents=True, exist_ok=True)
     if not chosen:
         report.warning(
-            "No photo was held out, so nothing is measured.",
+            "No photo was held out, so no likeness is measured; floaters are looked for in training photos.",
             hint="Set split.every or split.views to hold some out.",
         )
     stems = flat_stems([view.camera.name for view in chosen])

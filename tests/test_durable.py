@@ -1,5 +1,6 @@
 """Files are replaced whole or not at all."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import IO
 
 import pytest
 
-from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
+from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, write_durably
 
 KILLED = """
 import os, signal
@@ -55,3 +56,25 @@ def test_what_a_killed_process_was_writing_can_be_told_from_all_else_and_removed
     assert len(list(tmp_path.iterdir())) == 2
     remove_unfinished(tmp_path)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
+    killed, other = (tmp_path / f".report.html.{process}.new" for process in (12, 123))
+    for aside in (killed, other):
+        aside.write_text("half")
+    remove_unfinished(tmp_path, "report.html", 12)
+    assert list(tmp_path.iterdir()) == [other]
+
+
+def test_copy_has_the_times_and_permissions_and_a_failed_one_changes_nothing(tmp_path: Path) -> None:
+    source, path = tmp_path / "artifact.ply", tmp_path / "splat.ply"
+    source.write_bytes(b"new")
+    source.chmod(0o640)
+    os.utime(source, ns=(10**18, 10**18 + 7))
+    path.write_bytes(b"older")
+    with pytest.raises(OSError, match="No such file"):
+        copy_durably(tmp_path / "gone", path)
+    assert path.read_bytes() == b"older" and sorted(tmp_path.iterdir()) == [source, path]
+    copy_durably(source, path)
+    assert path.read_bytes() == b"new" and sorted(tmp_path.iterdir()) == [source, path]
+    assert (path.stat().st_mtime_ns, path.stat().st_mode & 0o777) == (10**18 + 7, 0o640)

@@ -67,6 +67,16 @@ def test_a_run_leaves_its_deliverable_and_a_second_one_runs_nothing(numbers: Pat
     assert [event.kind for event in events] == ["run_started", *["stage_reused"] * 4, "run_finished"]
 
 
+def test_what_a_killed_run_was_delivering_is_cleared_away(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out))
+    (out / "telling.txt").unlink()
+    (out / ".telling.txt.99.new").write_text("3 1")
+    (out / ".report.html.99.new").write_text("another process writes it")
+    walk(request_of(numbers, out))
+    assert (out / "telling.txt").read_text() == "3 1 False 21"
+    assert [path.name for path in out.glob(".*.new")] == [".report.html.99.new"]
+
+
 def test_what_begins_is_told_however_soon_it_follows() -> None:
     told: list[str] = []
     reporter = EventReporter("count", lambda event: told.append(f"{event.data['what']} {event.data['done']}"))

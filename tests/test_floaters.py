@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +119,7 @@ def test_without_sparse_points_the_figures_are_not_known(tmp_path: Path) -> None
     tiny_scene.write_model(tmp_path / "sparse/0", cameras(), np.empty((0, 3)), np.empty((0, 3), np.uint8))
     figures = measure_floaters(wall(), cameras(), HELD_OUT, tmp_path, OPTIONS)
     assert figures == {
-        "veil": {"mean": None, "worst": None, "worst_photo": None, "photos": 0, "points": 0},
+        "veil": {"held_out": True, "mean": None, "worst": None, "worst_photo": None, "photos": 0, "points": 0},
         "free_space_opacity": None,
         "free_space_gaussians": None,
         "free_space_rendered": None,
@@ -155,9 +156,32 @@ def test_light_that_a_veil_stops_is_what_its_gaussian_says(dataset: Path) -> Non
     camera, sigma_px = cameras()[1], 0.6 * 130.0 / 2.0
     veil = blob(camera.centre()[None] + (0.0, 0.0, 2.0), 0.6, 0.3)
     xyz = np.array([[x, y, WALL] for x in (-0.8, 0.1, 1.3) for y in (-0.6, 0.4)])
-    stopped = light_stopped(Gaussians.concat([wall(), veil]), camera, xyz)
+    stopped = light_stopped(Gaussians.concat([wall(), veil]), camera, xyz, OPTIONS)
     pixels = np.floor(camera.project(xyz)) + 0.5
     squares = ((pixels - [72.0, 54.0]) ** 2).sum(axis=1) / (sigma_px**2 + 0.3)
     np.testing.assert_allclose(stopped, 0.3 * np.exp(-0.5 * squares), rtol=1e-4)
     beside = blob(camera.centre()[None] + (0.0, 0.0, 0.95 * WALL), 0.6, 0.3)
-    assert not light_stopped(Gaussians.concat([wall(), beside]), camera, xyz).any()  # is the surface itself
+    assert not light_stopped(Gaussians.concat([wall(), beside]), camera, xyz, OPTIONS).any()  # is the surface itself
+
+
+def test_veil_is_of_what_the_near_plane_lets_into_pictures(dataset: Path) -> None:
+    """Half a unit before a held-out camera: a plane beyond hides it from every picture, and from training."""
+    floater = blob(cameras()[3].centre()[None] + (0.0, 0.0, 0.5), 0.1, 0.98)
+    model = Gaussians.concat([wall(), floater])
+    near, far = (
+        measure_floaters(model, cameras(), HELD_OUT, dataset, replace(OPTIONS, near=plane))["veil"]
+        for plane in (0.01, 1.0)
+    )
+    assert near["worst"] > VEIL
+    assert far["worst"] == 0.0 and far["points"] == near["points"]
+
+
+def test_where_no_photo_is_held_out_training_photos_are_asked(dataset: Path) -> None:
+    floater = blob(cameras()[3].centre()[None] + (0.0, 0.0, 0.5), 0.1, 0.98)
+    model = Gaussians.concat([wall(), floater])
+    of_one, of_all = (measure_floaters(model, cameras(), names, dataset, OPTIONS)["veil"] for names in (HELD_OUT, ()))
+    assert (of_one["held_out"], of_all["held_out"], of_all["photos"]) == (True, False, 4)
+    assert (of_all["worst"], of_all["worst_photo"]) == (of_one["worst"], "photo_3.png")
+    assert (
+        of_one["mean"] / 4 <= of_all["mean"] < of_one["mean"] / 2
+    )  # it hangs before one of four, and at another's edge

@@ -8,7 +8,7 @@ import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat import free_space as module
-from splatpipe.pipeline.splat.free_space import FreeSpace, free_space, free_space_views, near_or_free, share_of_opacity
+from splatpipe.pipeline.splat.free_space import FreeSpace, free_space, near_or_free, share_of_opacity
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 WALL = 10.0  # depth; every camera looks along z, so that a cell of 20 pixels is half a unit wide there
@@ -54,6 +54,12 @@ def gaussians_at(places: list[tuple[float, float, float]], size: float = 0.01) -
     return found
 
 
+def free_space_views(gaussians: Gaussians, space: FreeSpace) -> torch.Tensor:
+    """Photos that see through each Gaussian; all of them where it is right before a camera."""
+    counts = range(1, len(space.photos) + 1)
+    return sum((near_or_free(gaussians, space, views).long() for views in counts), torch.zeros(len(gaussians)).long())
+
+
 def with_opacity(gaussians: Gaussians, opacity: float) -> Gaussians:
     return replace(gaussians, opacity_logits=torch.full((len(gaussians),), float(np.log(opacity / (1.0 - opacity)))))
 
@@ -90,8 +96,8 @@ def test_right_before_a_camera_one_photo_is_enough() -> None:
     # Two units are a fifth of the wall's depth; so near, the others' pictures do not reach.
     space = space_of(CAMERAS, wall())
     places = [(-1.0, 0.0, 1.0), (-1.0, 0.0, -1.0), (-1.5, 0.0, 0.5)]
-    assert free_space_views(gaussians_at(places), space).tolist() == [1, 0, 0]
-    assert near_or_free(gaussians_at(places), space).tolist() == [True, False, False]
+    assert near_or_free(gaussians_at(places), space, views=1).tolist() == [True, False, False]
+    assert near_or_free(gaussians_at(places), space, views=2).tolist() == [True, False, False]  # one sees through it
 
 
 def test_a_photo_with_something_close_does_not_call_that_a_floater() -> None:

@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import Points
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header
-from splatpipe.pipeline.splat.sh import dc_to_rgb
+from splatpipe.pipeline.splat.sh import C0
 from splatpipe.pipeline.splat.sparse_count import sparse_comment
 from splatpipe.stages.initialize import choose_points, point_sizes, run
 
@@ -90,7 +90,7 @@ def test_every_point_becomes_an_isotropic_gaussian_of_its_colour(tmp_path: Path)
     assert summary["gaussians"] == len(gaussians) == 50
     assert gaussians.sh_degree == 3
     np.testing.assert_allclose(gaussians.means.numpy(), xyz, rtol=1e-6)
-    np.testing.assert_allclose(dc_to_rgb(gaussians.sh[:, 0]).numpy() * 255.0, colours, atol=1e-3)
+    np.testing.assert_allclose((C0 * gaussians.sh[:, 0] + 0.5).numpy() * 255.0, colours, atol=1e-3)
     assert not gaussians.sh[:, 1:].any()
     assert (gaussians.log_scales == gaussians.log_scales[:, :1]).all()
     torch.testing.assert_close(torch.sigmoid(gaussians.opacity_logits), torch.full((50,), 0.2))

@@ -9,9 +9,9 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.sfm.agreement import compare, epipolar_errors
+from splatpipe.pipeline.sfm.cuts import find_cut
 from splatpipe.pipeline.sfm.judging import contradicting, judge
 from splatpipe.pipeline.sfm.outside import disagreement
-from splatpipe.pipeline.sfm.splits import find_split
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from view_graph import FOCAL, Ring, make_ring, model_of, moved, turn_up, with_matches
@@ -64,8 +64,8 @@ def test_the_photos_of_a_ghost_are_named(ring: Ring) -> None:
     ghost = (9, 10, 11, 12)
     poses = moved(ring, ghost, np.zeros(3), turn_up(30.0), 1.0)
     agreement = compare(model_of(ring, poses), ring.verified)
-    split = find_split(agreement, contradicting(agreement))
-    assert split.group == ghost and split.ratio > 1.0
+    cut = find_cut(agreement, contradicting(agreement))
+    assert cut.group == ghost and cut.ratio > 1.0
     found = judge(model_of(ring, poses), ring.verified, TRUSTED)
     assert found.level == "bad" and "4 photos (009.jpg, 010.jpg, …) disagree" in found.reasons[0].text
 

@@ -219,7 +219,7 @@ def test_nothing_to_see_is_the_background() -> None:
         result = outcome.render
         torch.testing.assert_close(result.colour, torch.tensor([0.2, 0.4, 0.6]).expand_as(result.colour))
         assert not result.visible.any()
-        for picture in (result.alpha, result.depth_sum, result.expected_depth, result.median_depth, result.radii):
+        for picture in (result.alpha, result.depth_sum, result.median_depth, result.radii):
             assert (picture == 0).all()
         assert all((gradient == 0).all() for gradient in outcome.gradients.values())
 
@@ -323,7 +323,7 @@ def test_a_render_without_depth_is_the_same_but_for_the_depth() -> None:
     expected = torch.autograd.grad(full.colour.sum() + full.alpha.sum(), scene.means)[0]
     for backend in ("native", "reference"):
         lean = render(scene, camera, RenderOptions(3, depth=False), backend=backend)  # type: ignore[arg-type]
-        for depth in (lean.depth_sum, lean.depth_square_sum, lean.median_depth, lean.expected_depth):
+        for depth in (lean.depth_sum, lean.depth_square_sum, lean.median_depth):
             assert depth.shape == full.alpha.shape
             assert (depth == 0).all()
         assert not lean.depth_sum.requires_grad

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 from playwright.sync_api import Browser
 
-from splatpipe.pipeline.app.renders import Shot, Wanted, render_run
+from splatpipe.pipeline.app.renders import RenderTask, Wanted, render_run
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Inputs
@@ -212,7 +212,7 @@ def test_keyframes_of_the_world_are_found_in_the_models_frame(tmp_path: Path) ->
     camera = tiny_scene.cameras()[0]
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")
     scene = open_scene(tiny_parts(tmp_path, dataset), 1)
-    names, (found,) = Shot(scene, world, Wanted(stills=True), read_keyframes(path), (320, 180)).stills()
+    names, (found,) = RenderTask(scene, world, Wanted(stills=True), read_keyframes(path), (320, 180)).stills()
     assert len(names) == 1 and found.width == 320
     np.testing.assert_allclose(world.apply(found.centre()[None])[0], [300, -80, 30], atol=1e-9)
     target, above = world.inverse().apply(np.array([[312.0, -86.0, 21.0], [312.0, -86.0, 22.0]]))

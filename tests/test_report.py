@@ -337,6 +337,12 @@ def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
         ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=22.0), "doubt", "a fair likeness"),
         ("evaluate.metrics", lambda told: told.update(per_view=[]), "doubt", "No photo was held out"),
         ("evaluate.metrics", lambda told: told["floaters"]["veil"].update(mean=0.2), "doubt", "20.0 % of the light"),
+        (
+            "evaluate.metrics",
+            lambda told: told["floaters"]["veil"].update(mean=0.0, held_out=False),
+            "good",
+            "of the training",
+        ),
         ("georef.accuracy", lambda told: told["tables"]["check"].update(rmse_up_m=0.5), "doubt", "50.0 cm in height"),
         ("georef.accuracy", lambda told: told["tables"].update(check=None), "doubt", "no check point proves it"),
         (

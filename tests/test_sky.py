@@ -1,6 +1,7 @@
 """Sky found without weights: where it is, and nowhere else."""
 
 import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,6 +136,19 @@ def test_branch_above_the_sky_and_wrong_points_in_it_take_none_away() -> None:
     birds = random.uniform([-9.0, 5.0, 15.0], [9.0, 9.0, 30.0], (2, 3))
     points = np.concatenate([skies.points_on(), branch, birds])
     assert not roofed(photo.camera, truth, points, skies.UP).any()
+
+
+def test_points_above_take_memory_by_their_number_alone() -> None:
+    """Not by that of the columns of azimuth: a dense model has a million above, and each thread its own."""
+    photo, truth = skies.trace(skies.look())
+    points = np.random.default_rng(9).uniform([-30.0, 4.0, -30.0], [30.0, 30.0, 30.0], (100_000, 3))
+    tracemalloc.start()
+    try:
+        assert roofed(photo.camera, truth, points, skies.UP).any()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 30e6  # some twenty numbers a point, and the pixels
 
 
 def test_few_bright_patches_in_a_large_capture_are_no_sky() -> None:

@@ -118,7 +118,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class RenderTask:
     """A scene, where it lies, and what is wanted of it.
 
     Attributes:
@@ -201,22 +201,22 @@ def render_run(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
     try:
         with same_bits(threads):
             similarity = load_frame(parts["georef.frame"]).world_from_model
-            shot = Shot(open_scene(parts, threads), similarity, wanted, keyframes, size)
-            told = _shoot(shot, what, target, EventReporter("render", console))
+            task = RenderTask(open_scene(parts, threads), similarity, wanted, keyframes, size)
+            told = _render(task, what, target, EventReporter("render", console))
     finally:
         console.close()
     console(Event("stage_finished", "render", {"seconds": time.monotonic() - began, "summary": told}))
     return told
 
 
-def _shoot(shot: Shot, what: What, target: Path, report: Reporter) -> dict[str, Any]:
-    pictures = Pictures(shot.scene, what, shot.world_from_model.rotation, shot.world_from_model.scale)
-    if not shot.wanted.stills:
-        cameras = shot.film()
+def _render(task: RenderTask, what: What, target: Path, report: Reporter) -> dict[str, Any]:
+    pictures = Pictures(task.scene, what, task.world_from_model.rotation, task.world_from_model.scale)
+    if not task.wanted.stills:
+        cameras = task.film()
         pictures = replace(pictures, depths=depth_range(pictures, cameras))
-        write_film(FilmFile(target, shot.wanted.fps), cameras, pictures.pixels, report)
+        write_film(FilmFile(target, task.wanted.fps), cameras, pictures.pixels, report)
     else:
-        names, cameras = shot.stills()
+        names, cameras = task.stills()
         pictures = replace(pictures, depths=depth_range(pictures, cameras))
         for done, (name, camera) in enumerate(zip(names, cameras, strict=True), start=1):
             write_still(target / name, pictures, camera)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,17 +21,34 @@ def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None
     Raises:
         OSError: if the disk is full or not writable; what was at ``path`` is still there.
     """
-    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
+    with _beside(path) as aside:
         with aside.open("wb") as file:
             if isinstance(content, str):
                 file.write(content.encode())
             else:
                 content(file)
-            file.flush()
-            os.fsync(file.fileno())
         if path.exists():
             shutil.copymode(path, aside)
+
+
+def copy_durably(source: Path, path: Path) -> None:
+    """Let a copy of a file, with its times and permissions, take ``path``'s place at once, or not at all.
+
+    Raises:
+        OSError: if it cannot be read, or the disk is full or not writable; what was at ``path`` is still there.
+    """
+    with _beside(path) as aside:
+        shutil.copy2(source, aside)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A file's name to fill beside ``path``, whose place it then takes."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        yield aside
+        with aside.open("rb") as file:
+            os.fsync(file.fileno())
         aside.replace(path)
     except BaseException:
         aside.unlink(missing_ok=True)
@@ -37,14 +56,15 @@ def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None
     sync_folder(path.parent)
 
 
-def remove_unfinished(folder: Path, name: str = "*") -> None:
+def remove_unfinished(folder: Path, name: str = "*", process: int | None = None) -> None:
     """Remove what killed processes left of files that they were writing.
 
     Args:
-        folder: Where; nobody else writes these files there now.
-        name: Of the file, or a glob pattern.
+        folder: Where.
+        name: Of the file; of any by default.
+        process: Number of the one that was killed; None where nobody else writes these files there now.
     """
-    for aside in folder.glob(f".{name}.*.new"):
+    for aside in folder.glob(f".{glob.escape(name) if name != '*' else name}.{process or '*'}.new"):
         aside.unlink(missing_ok=True)
 
 

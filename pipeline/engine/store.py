@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.digests import FileEntry, canonical, digest, part_digest, tree_entries
-from splatpipe.pipeline.engine.durable import remove_unfinished, sync_folder, write_durably
+from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, sync_folder, write_durably
 from splatpipe.pipeline.engine.errors import MachineError, StageError, UsageError
 from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
@@ -253,9 +253,8 @@ def _copy_if_changed(source: Path, target: Path) -> None:
     if is_copy(source, target):
         return
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.new")
-    shutil.copy2(source, temporary)
-    temporary.replace(target)
+    remove_unfinished(target.parent, target.name)  # of a killed run: only who holds the lock delivers
+    copy_durably(source, target)
 
 
 def _folder_name(stage: str, key: str) -> str:

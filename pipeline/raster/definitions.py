@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -97,12 +96,6 @@ class Render:
     median_depth: Float[Tensor, "h w"]
     visible: Bool[Tensor, " n"]
     radii: Float[Tensor, " n"]
-
-    @property
-    def expected_depth(self) -> Float[Tensor, "h w"]:
-        """Mean depth of what is seen, depth_sum / alpha; 0 where nothing is."""
-        seen = self.alpha > 0.0
-        return torch.where(seen, self.depth_sum / torch.where(seen, self.alpha, 1.0), 0.0)
 
 
 def check(gaussians: Gaussians, camera: Camera, options: RenderOptions, means2d_probe: Tensor | None) -> None:

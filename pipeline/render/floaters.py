@@ -59,7 +59,7 @@ def measure_floaters(
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
     apart = disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
     return {
-        "veil": measure_veil(gaussians, cameras, (points.xyz, seen), held_out),
+        "veil": measure_veil(gaussians, cameras, (points.xyz, seen), held_out, options),
         "free_space_opacity": _rounded(share_of_opacity(gaussians, chosen)) if space.known else None,
         "free_space_gaussians": int(chosen.sum()) if space.known else None,
         "free_space_rendered": _rounded(light[0] / light[1]) if space.known and light[1] > 0.0 else None,

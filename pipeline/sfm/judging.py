@@ -19,7 +19,7 @@ from jaxtyping import Bool
 
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.sfm.agreement import Agreement, compare
-from splatpipe.pipeline.sfm.splits import Split, find_split
+from splatpipe.pipeline.sfm.cuts import Cut, find_cut
 from splatpipe.pipeline.sfm.verified import Verified
 
 Level = Literal["good", "doubt", "bad"]
@@ -38,7 +38,7 @@ CONTRADICTED_DOUBT, CONTRADICTED_BAD = 0.04, 0.10  # of the pairs among placed p
 STRONG_BAD = 0.02  # the same, of pairs with more matches than half of those that hold
 FEW_PAIRS = 3  # contradicting pairs that may be chance
 LEAST_MATCHES = 15  # of a pair to contradict; COLMAP's own bound of a pair
-SPLIT_DOUBT, SPLIT_BAD = 0.5, 1.0  # matches that contradict between two groups of cameras, to those that agree
+CUT_DOUBT, CUT_BAD = 0.5, 1.0  # matches that contradict between two groups of cameras, to those that agree
 
 
 @dataclass(frozen=True)
@@ -212,22 +212,22 @@ def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: V
     holding = agreement.matches[agreement.placed & ~contradicts]
     usual = float(np.median(holding)) if len(holding) else 0.0
     strong = int((contradicts & (agreement.matches >= usual)).sum())
-    split = find_split(agreement, contradicts)
+    cut = find_cut(agreement, contradicts)
     bad = count >= CONTRADICTED_BAD * pairs or (strong >= FEW_PAIRS and strong >= STRONG_BAD * pairs)
-    if not bad and split.ratio < SPLIT_DOUBT and count < CONTRADICTED_DOUBT * pairs:
+    if not bad and cut.ratio < CUT_DOUBT and count < CONTRADICTED_DOUBT * pairs:
         return []
     text = f"{count} of {pairs} pairs of photos contradict the cameras that were found"
-    if split.ratio >= SPLIT_BAD:
-        text += f": {_who(split, verified)} disagree with the others, so the model is bent or has something twice."
+    if cut.ratio >= CUT_BAD:
+        text += f": {_who(cut, verified)} disagree with the others, so the model is bent or has something twice."
     else:
         text += ": the model may be bent, or things in it look alike."
     hint = "Look at sparse.glb for things that stand there twice. Add photos that close the way round, or try"
     hint += " --set sparse.mapper=global and --set matches.pairing=exhaustive."
-    return [Reason("bad" if bad or split.ratio >= SPLIT_BAD else "doubt", text, hint, "bent")]
+    return [Reason("bad" if bad or cut.ratio >= CUT_BAD else "doubt", text, hint, "bent")]
 
 
-def _who(split: Split, verified: Verified) -> str:
-    names = [verified.names[number] for number in split.group]
+def _who(cut: Cut, verified: Verified) -> str:
+    names = [verified.names[number] for number in cut.group]
     if len(names) <= 2:
         return " and ".join(names)
     return f"{len(names)} photos ({names[0]}, {names[1]}, …)"

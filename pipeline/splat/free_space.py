@@ -99,23 +99,14 @@ def free_space(
     return FreeSpace(tuple(bounds), xyz[photos >= SUPPORT_TRACK])
 
 
-def free_space_views(gaussians: Gaussians, space: FreeSpace) -> Int64[Tensor, " n"]:
-    """In how many photos each Gaussian hangs in front of all that is observed there; 0 beside a well-observed point.
-
-    Args:
-        gaussians: In the frame of the cameras; one that is not finite is in front of nothing.
-        space: Of ``free_space``.
-    """
-    return torch.from_numpy(_judge(gaussians, space)[0])
-
-
 def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = VIEWS) -> Bool[Tensor, " n"]:
     """Which Gaussians are floaters: in free space, or right before a camera.
 
     Args:
-        gaussians: In the frame of the cameras.
+        gaussians: In the frame of the cameras; one that is not finite is in front of nothing.
         space: Of ``free_space``.
-        views: Photos that have to see through one.
+        views: Photos in which one has to hang in front of all that is observed there; beside a well-observed point none
+            counts.
     """
     through, near = _judge(gaussians, space)
     return torch.from_numpy((through >= views) | near)

@@ -196,11 +196,6 @@ def rgb_to_dc(rgb: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
     return (rgb - _OFFSET) / C0
 
 
-def dc_to_rgb(dc: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
-    """Colour (not clamped) that the constant band alone shows."""
-    return dc * C0 + _OFFSET
-
-
 def _sample_directions(count: int = 64) -> Float[Tensor, "n 3"]:
     """A Fibonacci lattice on the sphere: even enough for every band up to degree 3 to be well conditioned."""
     index = torch.arange(count, dtype=torch.float64)

@@ -159,15 +159,19 @@ def roofed(
     above = points - camera.centre()
     around, over = azimuths_elevations_deg(above[above @ up > 0.0], up)
     column = (azimuth * (ROOF_COLUMNS / 360.0)).astype(np.int64) % ROOF_COLUMNS
-    middles = (np.arange(ROOF_COLUMNS) + 0.5) * (360.0 / ROOF_COLUMNS)
-    reaches = np.abs((around[:, None] - middles + 180.0) % 360.0 - 180.0) < ROOF_REACH_DEG
+    roofs = np.full(ROOF_COLUMNS, -np.inf)  # of the lowest of the ROOF_POINTS highest points around
+    for each in np.unique(column[sky]):  # one by one: a table of points by columns is hundreds of megabytes
+        middle = (each + 0.5) * (360.0 / ROOF_COLUMNS)
+        reached = over[np.abs((around - middle + 180.0) % 360.0 - 180.0) < ROOF_REACH_DEG]
+        if len(reached) >= ROOF_POINTS:
+            roofs[each] = np.partition(reached, -ROOF_POINTS)[-ROOF_POINTS]
     for label in range(1, count):
         region = labels == label
         top = np.full(ROOF_COLUMNS, 90.0)
         pixels = np.bincount(column[region], minlength=ROOF_COLUMNS)
         for each in np.flatnonzero(pixels):
             top[each] = height[region & (column == each)].max()
-        under = (reaches & (over[:, None] > top + ROOF_MARGIN_DEG)).sum(axis=0) >= ROOF_POINTS
+        under = roofs > top + ROOF_MARGIN_DEG
         if pixels[under].sum() > MOST_ROOFED * pixels.sum():
             result |= region
     return result

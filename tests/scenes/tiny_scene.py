@@ -16,7 +16,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import Split, View, load_views, split_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import dc_to_rgb, rgb_to_dc
+from splatpipe.pipeline.splat.sh import C0, rgb_to_dc
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 
@@ -166,6 +166,6 @@ def write_dataset(folder: Path, masked: str = "", views: list[Camera] | None = N
             cv2.imwrite(str(mask_path), mask)
         cv2.imwrite(str(path), photo[:, :, ::-1])
     noise = np.random.default_rng(3).normal(scale=POINT_NOISE, size=(len(truth), 3))
-    rgb = (dc_to_rgb(truth.sh[:, 0]).clamp(0.0, 1.0) * 255.0).to(torch.uint8).numpy()
+    rgb = ((C0 * truth.sh[:, 0] + 0.5).clamp(0.0, 1.0) * 255.0).to(torch.uint8).numpy()
     write_model(folder / "sparse/0", views, truth.means.numpy().astype(np.float64) + noise, rgb)
     return folder

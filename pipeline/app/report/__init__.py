@@ -77,25 +77,28 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
 
     try:
         with log.open("a", encoding="utf-8") as said:
-            code = _run(command, said, over)
+            code = _run(command, said, over, out)
     except OSError as error:
         raise MachineError(f"The report could not be written: {error.strerror}.") from error
-    finally:
-        remove_unfinished(out, REPORT_FILE)
     if _stamp(path) == before or (code != 0 and until_s is None):
         raise MachineError("The report could not be written.", hint=f"{log} ends with the reason.")
     return path
 
 
-def _run(command: Sequence[str], said: IO[str], over: Callable[[], bool]) -> int:
-    """Run a process to its end, or until its time is over; its exit code. Whatever interrupts the wait ends it, too."""
+def _run(command: Sequence[str], said: IO[str], over: Callable[[], bool], out: Path) -> int:
+    """Run a process to its end, or until its time is over; its exit code. Whatever interrupts the wait ends it, too.
+
+    What it leaves unfinished in OUT is removed; another process may write a report there beside it.
+    """
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
     try:
         while process.poll() is None and not over():
             time.sleep(POLL_S)
     finally:
         process.kill()
-    return process.wait()
+        code = process.wait()
+        remove_unfinished(out, REPORT_FILE, process.pid)
+    return code
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

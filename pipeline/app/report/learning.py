@@ -121,8 +121,9 @@ def _row(view: Mapping[str, Any], measures: Sequence[tuple[str, str, int]]) -> d
 
 def _floaters(floaters: Mapping[str, Any]) -> list[tuple[str, str]]:
     depth, veil = floaters.get("depth_disagreement") or {}, floaters.get("veil") or {}
+    before = "held-out" if veil.get("held_out", True) else "training"
     return [
-        ("Veil before held-out photos", f"{share(veil.get('mean'), 2)} of the light of the points that they see"),
+        (f"Veil before {before} photos", f"{share(veil.get('mean'), 2)} of the light of the points that they see"),
         ("Opacity in the air", f"{share(floaters.get('free_space_opacity'), 3)} of all"),
         ("Share of the views", f"{share(floaters.get('free_space_rendered'), 3)} of what they show hangs in the air"),
         ("Depths of neighbouring views", f"differ by {share(depth.get('median'), 2)} (median)"),

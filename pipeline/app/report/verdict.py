@@ -248,12 +248,13 @@ def _likeness(measures: Mapping[str, Any]) -> float:
 
 
 def _floaters(holdings: Holdings) -> Finding | None:
-    """By the held-out photos alone: what the training photos see through is cleared in training, by its own rule."""
+    """By the held-out photos, if any: what the training photos see through is cleared in training, by its own rule."""
     veil = holdings.read("evaluate.metrics").get("floaters", {}).get("veil", {})
     if veil.get("mean") is None:
         return None
     level: Level = "good" if veil["mean"] <= VEIL else "doubt"
     what = "Hardly anything hangs" if level == "good" else "Something hangs"
-    text = f"{what} in the air before {plural(veil['photos'], 'photo')} that training never saw: it stops"
+    which = "that training never saw" if veil.get("held_out", True) else "of the training, since none was held out"
+    text = f"{what} in the air before {plural(veil['photos'], 'photo')} {which}: it stops"
     text += f" {share(veil['mean'], 1)} of the light of the points that they see"
     return Finding(level, "Floaters", f"{text}, at the worst {share(veil['worst'], 1)} ({veil['worst_photo']}).")
