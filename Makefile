@@ -49,7 +49,8 @@ test: .venv/.tested
 # The tests of the kernels take each instruction set that this CPU has; all the others take the best. Here a training and
 # the whole line take the others, too.
 test-isa: .venv/.tested
-	@for isa in $$($(BIN)/python -c 'from splatpipe.pipeline.raster import isa_names; print(*isa_names()[1:])'); do \
+	@isas=$$($(BIN)/python -c 'from splatpipe.pipeline.raster.isa import isa_names; print(*isa_names()[1:])') || exit 1; \
+	for isa in $$isas; do \
 	  echo "== training on $$isa" && SPLATPIPE_ISA=$$isa $(BIN)/python -m pytest -q tests/test_train.py || exit 1; done
 	@echo "== the line on baseline"
 	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/test_line.py -k test_a_run_leaves_what_is_promised
