@@ -1,0 +1,30 @@
+// What the kernels stand on: CUDA, or with SPLAT_ON_CPU the harness of tests/harness, which runs the same sources on a CPU
+// with threads in adversarial orders.
+//
+// Rules that keep both true: blocks are one-dimensional, of kThreads threads; shared memory is declared by SPLAT_SHARED,
+// never cleared by itself; kernels are launched by SPLAT_LAUNCH; warp operations name the whole warp.
+#pragma once
+
+#include <stdint.h>
+
+#if SPLAT_ON_CPU
+#include "cuda_on_cpu.h"
+#else
+#include <cuda_runtime.h>
+#define SPLAT_SHARED(Type, name) __shared__ Type name
+#define SPLAT_LAUNCH(kernel, blocks, stream, ...) \
+    kernel<<<static_cast<unsigned>(blocks), splat::cuda::kThreads, 0, static_cast<cudaStream_t>(stream)>>>(__VA_ARGS__)
+#endif
+
+namespace splat {
+namespace cuda {
+
+constexpr int kThreads = 256;  // of every block
+constexpr int kWarp = 32;
+constexpr int kWarps = kThreads / kWarp;
+constexpr unsigned kWholeWarp = 0xffffffffu;
+
+inline int64_t divide_up(int64_t a, int64_t b) { return (a + b - 1) / b; }
+
+}  // namespace cuda
+}  // namespace splat
