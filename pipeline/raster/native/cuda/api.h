@@ -1,9 +1,9 @@
 /* The CUDA backend as plain C: raw pointers into device memory, sizes, and the caller's stream.
  *
  * No torch, no C++ and no CUDA header in here, so that one binary serves every version of torch. Nothing is allocated
- * and nothing waits for the device: the caller asks for sizes, brings the memory, and calls. Everything runs in order on
- * the stream; pointers are to device memory and structures to the host's. Arrays are contiguous rows of float32 unless
- * they say otherwise. The formulas and their constants are those of raster.h and splat_math.h.
+ * and nothing waits for the device: the caller asks for sizes, brings the memory, and calls. Everything runs in order
+ * on the stream; pointers are to device memory and structures to the host's. Arrays are contiguous rows of float32
+ * unless they say otherwise. The formulas and their constants are those of raster.h and splat_math.h.
  *
  * Each call returns 0, a negative SPLAT_... code for an argument that makes no sense, or a positive cudaError_t. */
 #ifndef SPLAT_CUDA_API_H
@@ -29,8 +29,9 @@ typedef void* SplatStream; /* cudaStream_t; null is the default one */
 
 /* What there is. */
 typedef struct {
-    int32_t architecture;    /* 10 * major + minor of the device */
-    int32_t driver, runtime; /* CUDA versions, 1000 * major + 10 * minor: what the driver knows, what this was built with */
+    int32_t architecture; /* 10 * major + minor of the device */
+    int32_t driver,
+        runtime; /* CUDA versions, 1000 * major + 10 * minor: what the driver knows, what this was built with */
     int32_t multiprocessors;
     int64_t memory_bytes;
     char name[256];
@@ -88,18 +89,18 @@ typedef struct {
 
 /* Adam's step fused with the backward pass of the projection. */
 typedef struct {
-    SplatRows values;        /* stepped in place: the rows that were rendered, but for opacity_logits' gain */
+    SplatRows values;         /* stepped in place: the rows that were rendered, but for opacity_logits' gain */
     SplatRows means, squares; /* moments, laid out alike */
-    float rates[5];          /* of means, log_scales, quats, opacity_logits and sh's constant band; bias-corrected here */
-    float rate_sh_rest;      /* of sh's other bands */
+    float rates[5];     /* of means, log_scales, quats, opacity_logits and sh's constant band; bias-corrected here */
+    float rate_sh_rest; /* of sh's other bands */
     double beta1, beta2, epsilon;
-    int64_t step;            /* counted from 1 */
-    int32_t sparse;          /* only visible rows are stepped; else all */
+    int64_t step;   /* counted from 1 */
+    int32_t sparse; /* only visible rows are stepped; else all */
     int32_t reserved;
     float log_scale_min, log_scale_max; /* log_scales are clamped to these after the step */
-    const float* logit_gain; /* (n) d(rendered logit) / d(logit), null for 1 */
-    const float* logits;     /* (n) as they were rendered, null for values.opacity_logits */
-    int64_t* skipped;        /* one number, added to: visible rows left out for gradients that are not finite */
+    const float* logit_gain;            /* (n) d(rendered logit) / d(logit), null for 1 */
+    const float* logits;                /* (n) as they were rendered, null for values.opacity_logits */
+    int64_t* skipped; /* one number, added to: visible rows left out for gradients that are not finite */
 } SplatStep;
 
 /* Rows of several tensors stepped together, for what is trained beside the Gaussians. */
@@ -139,16 +140,18 @@ SPLAT_API int32_t splat_project_backward(const SplatShot* shot, const SplatRows*
 SPLAT_API int32_t splat_step(const SplatShot* shot, const SplatFrame* frame, const SplatStep* step, float* means2d,
                              SplatStream stream);
 
-/* Loss: (1 - w) L1 + w (1 - SSIM) of (h, w, 3) pictures, masked where `mask` (h, w) uint8 is zero, null for nowhere. Its
- * gradient by the render, and its value to one double. */
+/* Loss: (1 - w) L1 + w (1 - SSIM) of (h, w, 3) pictures, masked where `mask` (h, w) uint8 is zero, null for nowhere.
+ * Its gradient by the render, and its value to one double. */
 SPLAT_API int64_t splat_loss_bytes(int32_t width, int32_t height);
 SPLAT_API int32_t splat_photo_loss(const float* render, const float* photo, const uint8_t* mask, int32_t width,
                                    int32_t height, double ssim_weight, float* gradient, double* value, void* memory,
                                    int64_t bytes, SplatStream stream);
 
-/* Colours of `pixels` pixels through a (3, 4) affine map, and back: by the picture and, to map_gradient (3, 4), by it. */
+/* Colours of `pixels` pixels through a (3, 4) affine map, and back: by the picture and, to map_gradient (3, 4), by it.
+ */
 SPLAT_API int64_t splat_affine_bytes(int64_t pixels);
-SPLAT_API int32_t splat_affine_colour(const float* map, const float* in, int64_t pixels, float* out, SplatStream stream);
+SPLAT_API int32_t splat_affine_colour(const float* map, const float* in, int64_t pixels, float* out,
+                                      SplatStream stream);
 SPLAT_API int32_t splat_affine_colour_backward(const float* map, const float* in, const float* upstream, int64_t pixels,
                                                float* gradient, float* map_gradient, void* memory, int64_t bytes,
                                                SplatStream stream);

@@ -1,8 +1,8 @@
-// What the kernels stand on: CUDA, or with SPLAT_ON_CPU the harness of tests/harness, which runs the same sources on a CPU
-// with threads in adversarial orders.
+// What the kernels stand on: CUDA, or with SPLAT_ON_CPU the harness of tests/harness, which runs the same sources on a
+// CPU with threads in adversarial orders.
 //
-// Rules that keep both true: blocks are one-dimensional, of kThreads threads; shared memory is declared by SPLAT_SHARED,
-// never cleared by itself; kernels are launched by SPLAT_LAUNCH; warp operations name the whole warp.
+// Rules that keep both true: blocks are one-dimensional, of kThreads threads; shared memory is declared by
+// SPLAT_SHARED, never cleared by itself; kernels are launched by SPLAT_LAUNCH; warp operations name the whole warp.
 #pragma once
 
 #include <stdint.h>

@@ -1,10 +1,10 @@
 // A frame on the device: what its kernels share, and where it lies in the caller's memory.
 //
 // The order of work is the CPU's (raster_cpu.cpp): project every Gaussian; sort the visible ones by depth, stably; give
-// each tile its list by a stable sort of the pairs, in order of depth, by tile; blend; and back. Pairs are worked off in
-// chunks of consecutive tiles, none of more than `capacity` pairs: the first `passes` of them by the whole device, and
-// what a view has more than was foreseen by one block in one more launch. So the host never waits for a count. A phase of
-// the work is a device function over virtual blocks, which a kernel of any number of blocks, one too, can run:
+// each tile its list by a stable sort of the pairs, in order of depth, by tile; blend; and back. Pairs are worked off
+// in chunks of consecutive tiles, none of more than `capacity` pairs: the first `passes` of them by the whole device,
+// and what a view has more than was foreseen by one block in one more launch. So the host never waits for a count. A
+// phase of the work is a device function over virtual blocks, which a kernel of any number of blocks, one too, can run:
 //
 //     for (int64_t block = blockIdx.x; block < blocks; block += gridDim.x) ...
 //
@@ -27,11 +27,11 @@ struct alignas(16) Record {
 };
 static_assert(sizeof(Record) == 48, "three vectors of four");
 
-constexpr int kSortItems = 16;                        // a thread's keys in a pass of the radix sort
-constexpr int kSortBlock = kThreads * kSortItems;     // a virtual block's
+constexpr int kSortItems = 16;                     // a thread's keys in a pass of the radix sort
+constexpr int kSortBlock = kThreads * kSortItems;  // a virtual block's
 constexpr int kDigitBits = 8, kDigits = 1 << kDigitBits;
-constexpr int64_t kChunkTiles = 1 << 16;              // a chunk has no more tiles: keys of pairs are 16 bits
-constexpr int kScanBlock = kThreads;                  // ranks a virtual block counts pairs of
+constexpr int64_t kChunkTiles = 1 << 16;  // a chunk has no more tiles: keys of pairs are 16 bits
+constexpr int kScanBlock = kThreads;      // ranks a virtual block counts pairs of
 
 // Device memory; starts with SplatFrameFacts, which the host may read.
 struct Header {
@@ -44,19 +44,19 @@ struct Header {
 // Pointers into the frame's memory. n Gaussians, t tiles, c pairs of capacity.
 struct FrameMemory {
     Header* header;
-    Record* records;        // (n), meaningful where visible
-    uint32_t* rows;         // (n): first tile row << 16 | number of tile rows; 0 rows where not visible
-    uint32_t* keys[2];      // (n): bits of the depth or kCulled; two for the sort
-    int32_t* order[2];      // (n): ranks to Gaussians, from near to far, in order[0] once sorted
-    uint32_t* offsets;      // (n) by rank: the first pair in the chunk; keys[1]'s memory, free after the sort
-    uint32_t* block_sums;   // (ceil(n / kScanBlock) + 1)
-    uint32_t* digit_table;  // (kDigits, sort blocks of max(n, c)), digits first
-    uint32_t* digit_sums;   // (kDigits)
-    int32_t* tile_counts;   // (t + 1): differences along a tile row, then pairs
-    int64_t* tile_begin;    // (t + 1): pairs of the view before the tile
-    int32_t* chunk_begin;   // (t + 1): first tile of each chunk, and t at the end
-    float* transmittance;   // (t, 256): behind everything; a tile's pixels by threads, see blend.cu
-    int32_t* pixel_end;     // (t, 256): how many of the tile's pairs the pixel looked at before it ended
+    Record* records;           // (n), meaningful where visible
+    uint32_t* rows;            // (n): first tile row << 16 | number of tile rows; 0 rows where not visible
+    uint32_t* keys[2];         // (n): bits of the depth or kCulled; two for the sort
+    int32_t* order[2];         // (n): ranks to Gaussians, from near to far, in order[0] once sorted
+    uint32_t* offsets;         // (n) by rank: the first pair in the chunk; keys[1]'s memory, free after the sort
+    uint32_t* block_sums;      // (ceil(n / kScanBlock) + 1)
+    uint32_t* digit_table;     // (kDigits, sort blocks of max(n, c)), digits first
+    uint32_t* digit_sums;      // (kDigits)
+    int32_t* tile_counts;      // (t + 1): differences along a tile row, then pairs
+    int64_t* tile_begin;       // (t + 1): pairs of the view before the tile
+    int32_t* chunk_begin;      // (t + 1): first tile of each chunk, and t at the end
+    float* transmittance;      // (t, 256): behind everything; a tile's pixels by threads, see blend.cu
+    int32_t* pixel_end;        // (t, 256): how many of the tile's pairs the pixel looked at before it ended
     uint16_t* pair_keys[2];    // (c): tile less the chunk's first
     uint32_t* pair_values[2];  // (c): a pair's place before the sort, which is its slot; sorted in [0]
     uint32_t* owners;          // (c): by slot, the Gaussian
