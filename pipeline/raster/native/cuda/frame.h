@@ -52,7 +52,7 @@ struct FrameMemory {
     uint32_t* block_sums;      // (ceil(n / kScanBlock) + 1)
     uint32_t* digit_table;     // (kDigits, sort blocks of max(n, c)), digits first
     uint32_t* digit_sums;      // (kDigits)
-    int32_t* tile_counts;      // (t + 1): differences along a tile row, then pairs
+    int32_t* tile_counts;      // (t + 1): differences, +1 at a span's first tile and -1 behind its last; then pairs
     int64_t* tile_begin;       // (t + 1): pairs of the view before the tile
     int32_t* chunk_begin;      // (t + 1): first tile of each chunk, and t at the end
     float* transmittance;      // (t, 256): behind everything; a tile's pixels by threads, see blend.cu
@@ -76,7 +76,7 @@ struct Job {
     BackMemory back;
     int64_t capacity;
     int tiles;
-    int slot_floats;  // kDepthSlotFloats where depths have a gradient, else kSlotFloats
+    int slot_floats;  // kDepthSlotFloats where the shot has depths, else kSlotFloats
     int magnitudes;
     Pictures pictures;
     PictureGradients gradients;
@@ -104,6 +104,13 @@ class Carver {
 // The layouts; they return their sizes. In frame.cu.
 int64_t lay_out(void* memory, int64_t count, int64_t tiles, int64_t capacity, FrameMemory* at);
 int64_t lay_out(void* memory, int64_t count, int64_t capacity, int slot_floats, BackMemory* at);
+
+// Checks what the caller brought and makes a job of it: all but pictures, their gradients, radii and visible. `back`:
+// whether the backward pass's memory is wanted. Returns a code of api.h. In frame.cu.
+int32_t prepare(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame, bool back, Job* job);
+
+// Blocks for `work` virtual ones that may as well take turns: enough to fill the device, at least one. In frame.cu.
+int64_t blocks_for(int64_t work);
 
 }  // namespace cuda
 }  // namespace splat
