@@ -14,7 +14,7 @@
 #include "adam_step.h"
 #include "affine_colour.h"
 #include "colour.h"
-#include "loss.h"
+#include "loss_math.h"
 #include "photo_loss.h"
 
 namespace nb = nanobind;

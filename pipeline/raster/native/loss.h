@@ -23,7 +23,6 @@ struct LossJob {
 
 constexpr int kLossTileRows = 128;
 constexpr int kLossTileCols = 256;
-constexpr int kLossMinSide = 6;                // half the window must be reflected within the image
 constexpr std::size_t kLossScratch = 116'000;  // floats a tile works in
 
 // Pixels [row0, row1) x [col0, col1) of the image.

@@ -1,12 +1,11 @@
 // A tile of the photometric loss and its gradient. Compiled once per ISA: internal linkage, no std templates.
+// The formulas are loss_math.h's.
 //
-// With u = render + photo - 1 and v = render - photo, the four windowed means of u, v, u^2, v^2 give SSIM, and 1 - SSIM
-// without cancellation where render and photo agree. Its gradient is the transposed blur (B^T) of three maps:
-//   d/d render = B^T(a) + 2 u B^T(b_u) + 2 v B^T(b_v).
 // A tile is worked off in bands of rows; each blur goes down the columns first, for a band at once with the sums in
 // registers, then along the rows. RGB stays interleaved: a row's taps are 3 floats apart.
 
 #include "loss.h"
+#include "loss_math.h"
 #include "simd.h"
 
 namespace splat::SPLAT_ISA_NAMESPACE {
@@ -17,15 +16,12 @@ constexpr int kRegisterRows = 8;
 #else
 constexpr int kRegisterRows = 4;
 #endif
-constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kChannels = 3;
-constexpr int kBorder = kRadius + 1;  // pixels whose mirror images a window reaches
+constexpr int kRadius = kLossRadius, kTaps = kLossTaps, kBorder = kLossBorder, kChannels = 3;
 constexpr int kBand = 8;
 constexpr int kRing = 32;   // rows of maps kept: a band, those of the next one, and the window's reach on both sides
 constexpr int kAlign = 16;  // floats in a cache line
 constexpr int kMapStride = ((kLossTileCols + 2 * kRadius) * kChannels + kAlign - 1) / kAlign * kAlign;
 constexpr int kMeanStride = ((kLossTileCols + 4 * kRadius) * kChannels + kAlign - 1) / kAlign * kAlign;
-constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-constexpr float kEpsilon = 1e-12f;  // as in kornia's denominator
 
 static_assert(kBand % kRegisterRows == 0, "a band is whole register blocks");
 static_assert(kMeanStride * kBand * 4 + kMapStride * (kRing * 3 + 3) <= int(kLossScratch), "scratch");
@@ -33,22 +29,9 @@ static_assert(kMeanStride * kBand * 4 + kMapStride * (kRing * 3 + 3) <= int(kLos
 SPLAT_INLINE int least(int a, int b) { return a < b ? a : b; }
 SPLAT_INLINE int most(int a, int b) { return a > b ? a : b; }
 
-// The row (or column) that reflection about the border's pixel centre shows at i; far outside, any valid one.
-SPLAT_INLINE int reflect(int i, int n) {
-    const int mirrored = i < 0 ? -i : (i >= n ? 2 * (n - 1) - i : i);
-    return most(0, least(n - 1, mirrored));
-}
-
 // What pixel i of n receives from pixel i + k - 5 in the transposed blur, k = 0..10.
 void transposed_taps(const float* taps, int i, int n, float* out) {
-    for (int k = 0; k < kTaps; ++k) {
-        const int from = i + k - kRadius;
-        const int left = i + from, right = 2 * (n - 1) - i - from;  // distances to i's mirror images
-        out[k] = from < 0 || from >= n ? 0.0f : taps[k < kRadius ? kRadius - k : k - kRadius];
-        if (from < 0 || from >= n) continue;
-        if (i > 0 && left <= kRadius) out[k] += taps[left];
-        if (i < n - 1 && right <= kRadius) out[k] += taps[right];
-    }
+    for (int k = 0; k < kTaps; ++k) out[k] = transposed_tap(taps, i, i + k - kRadius, n);
 }
 
 // The window's weights, each in every lane: in registers for the length of a loop, whatever it stores.
@@ -193,28 +176,15 @@ SPLAT_INLINE void similarity_row(const float* const* means, const float* taps, c
     const Window window = window_of(taps);
     for (int at = 0; at < n; at += kLanes) {
         const int j = least(at, n - kLanes);
-        const Floats mu_shifted = blur_along(means[0] + j, window), mv = blur_along(means[2] + j, window);
-        const Floats mu = mu_shifted + 1.0f, mv2 = mv * mv;
-        const Floats var_u =
-            blur_along(means[1] + j, window) - mu_shifted * mu_shifted;  // 2 (sxx + syy) = var_u + var_v
-        const Floats var_v = blur_along(means[3] + j, window) - mv2;     // 4 sxy = var_u - var_v
-        const Floats luminance_down = 0.5f * (mu * mu + mv2) + kC1;
-        const Floats contrast_down = 0.5f * (var_u + var_v) + kC2, contrast_up = contrast_down - var_v;
-        const Floats inverse = 1.0f / (luminance_down * contrast_down + kEpsilon);
-        const Floats f = (luminance_down * var_v + contrast_up * mv2 + kEpsilon) * inverse;
-        const Floats by_luminance = (var_v - f * contrast_down) * inverse;
-        const Floats common = 0.5f * f * luminance_down;
-        Floats by_u2 = (0.5f * mv2 - common) * inverse;
-        Floats by_v2 = (luminance_down - 0.5f * mv2 - common) * inverse;
-        Floats by_means = mu * by_luminance - 2.0f * mu_shifted * by_u2 +
-                          mv * (by_luminance + 2.0f * (contrast_up * inverse - by_v2));
+        Floats by_means, by_u2, by_v2;
+        Floats dissimilarity = dissimilarity_of(blur_along(means[0] + j, window), blur_along(means[1] + j, window),
+                                                blur_along(means[2] + j, window), blur_along(means[3] + j, window),
+                                                &by_means, &by_u2, &by_v2);
         if (counts) {
             const Floats count = load(counts + j);
-            by_means *= count, by_u2 *= count, by_v2 *= count;
-            store(out + j, f * count);
-        } else {
-            store(out + j, f);
+            by_means *= count, by_u2 *= count, by_v2 *= count, dissimilarity *= count;
         }
+        store(out + j, dissimilarity);
         store(maps[0] + j, by_means), store(maps[1] + j, by_u2), store(maps[2] + j, by_v2);
     }
 }
@@ -226,7 +196,7 @@ void reflect_row(float* row, const Span& span, int width) {
         const int from = side ? width : first, to = side ? span.col1 + kRadius : 0;
         for (int col = from; col < to; ++col)
             for (int c = 0; c < kChannels; ++c)
-                row[(col - first) * kChannels + c] = row[(reflect(col, width) - first) * kChannels + c];
+                row[(col - first) * kChannels + c] = row[(reflected(col, width) - first) * kChannels + c];
     }
 }
 
@@ -237,7 +207,7 @@ double similarity_band(const LossJob& job, const Span& span, const Scratch& s, i
     for (int block = 0; block < kBand; block += kRegisterRows) {
         const float *x[kRegisterRows + kTaps - 1], *y[kRegisterRows + kTaps - 1];
         for (int i = 0; i < kRegisterRows + kTaps - 1; ++i) {
-            const std::ptrdiff_t from = reflect(row + block + i - kRadius, job.height);
+            const std::ptrdiff_t from = reflected(row + block + i - kRadius, job.height);
             const std::ptrdiff_t offset = (from * job.width + first) * kChannels;
             x[i] = job.render + offset, y[i] = job.photo + offset;
         }

@@ -1,26 +1,15 @@
 #include "photo_loss.h"
 
-#include <cmath>
 #include <cstddef>
 #include <memory>
 #include <vector>
 
 #include "loss.h"
+#include "loss_math.h"
 #include "threads.h"
 
 namespace splat {
 namespace {
-
-constexpr double kWindowSigma = 1.5;  // pixels
-
-void set_taps(float* taps) {
-    double weights[6], sum = 0.0;
-    for (int d = 0; d < 6; ++d) {
-        weights[d] = std::exp(-0.5 * d * d / (kWindowSigma * kWindowSigma));
-        sum += d ? 2.0 * weights[d] : weights[d];
-    }
-    for (int d = 0; d < 6; ++d) taps[d] = static_cast<float>(weights[d] / sum);
-}
 
 float* thread_scratch() {
     constexpr std::size_t kAlignment = 64;
@@ -77,7 +66,7 @@ double photo_loss(const LossImages& images, double ssim_weight) {
     LossJob job{};
     job.render = images.render, job.photo = images.photo, job.mask = images.mask, job.gradient = images.gradient;
     job.height = images.height, job.width = images.width;
-    set_taps(job.taps);
+    set_loss_taps(job.taps);
     std::int64_t counting = std::int64_t{job.height} * job.width;
     std::unique_ptr<float[]> replaced;
     if (job.mask) {
