@@ -1,0 +1,161 @@
+"""The C interface of the CUDA kernels, `native/cuda/api.h`, for ctypes. What the fields mean is said there."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, c_char, c_double, c_float, c_int32, c_int64, c_uint64, c_void_p
+from typing import Any
+
+ABI = 1
+"""Of the interface that is mirrored here, SPLAT_CUDA_ABI."""
+NO_KERNEL = -3
+"""SPLAT_NO_KERNEL: for this device in this binary."""
+ADAM_TENSORS = 8
+"""Tensors that one call of ``splat_adam`` takes."""
+
+
+class SplatDevice(ctypes.Structure):
+    _fields_ = (
+        ("architecture", c_int32),
+        ("driver", c_int32),
+        ("runtime", c_int32),
+        ("multiprocessors", c_int32),
+        ("memory_bytes", c_int64),
+        ("name", c_char * 256),
+    )
+
+
+class SplatShot(ctypes.Structure):
+    _fields_ = (
+        ("cam_from_world", c_double * 12),
+        ("fx", c_double),
+        ("fy", c_double),
+        ("cx", c_double),
+        ("cy", c_double),
+        ("near_z", c_double),
+        ("depth_origin", c_double),
+        ("background", c_double * 3),
+        ("width", c_int32),
+        ("height", c_int32),
+        ("sh_degree", c_int32),
+        ("sh_count", c_int32),
+        ("antialias", c_int32),
+        ("depths", c_int32),
+        ("magnitudes", c_int32),
+        ("reserved", c_int32),
+    )
+
+
+class SplatRows(ctypes.Structure):
+    _fields_ = tuple((name, c_void_p) for name in ("means", "log_scales", "quats", "opacity_logits", "sh"))
+
+
+class SplatPictures(ctypes.Structure):
+    _fields_ = tuple((name, c_void_p) for name in ("colour", "alpha", "depth_sum", "depth_square_sum", "median_depth"))
+
+
+class SplatPictureGradients(ctypes.Structure):
+    _fields_ = tuple((name, c_void_p) for name in ("colour", "alpha", "depth_sum", "depth_square_sum"))
+
+
+class SplatFrame(ctypes.Structure):
+    _fields_ = (
+        ("memory", c_void_p),
+        ("bytes", c_int64),
+        ("back", c_void_p),
+        ("back_bytes", c_int64),
+        ("count", c_int64),
+        ("capacity", c_int64),
+        ("passes", c_int32),
+        ("reserved", c_int32),
+    )
+
+
+class SplatFrameFacts(ctypes.Structure):
+    _fields_ = (("pairs", c_int64), ("visible", c_int64), ("chunks", c_int64))
+
+
+class SplatStep(ctypes.Structure):
+    _fields_ = (
+        ("values", SplatRows),
+        ("means", SplatRows),
+        ("squares", SplatRows),
+        ("rates", c_float * 5),
+        ("rate_sh_rest", c_float),
+        ("beta1", c_double),
+        ("beta2", c_double),
+        ("epsilon", c_double),
+        ("step", c_int64),
+        ("sparse", c_int32),
+        ("reserved", c_int32),
+        ("log_scale_min", c_float),
+        ("log_scale_max", c_float),
+        ("logit_gain", c_void_p),
+        ("logits", c_void_p),
+        ("skipped", c_void_p),
+    )
+
+
+class SplatAdam(ctypes.Structure):
+    _fields_ = (
+        ("tensors", c_int32),
+        ("widths", c_int32 * ADAM_TENSORS),
+        ("values", c_void_p * ADAM_TENSORS),
+        ("gradients", c_void_p * ADAM_TENSORS),
+        ("means", c_void_p * ADAM_TENSORS),
+        ("squares", c_void_p * ADAM_TENSORS),
+        ("rates", c_void_p * ADAM_TENSORS),
+        ("rows", c_int64),
+        ("visible", c_void_p),
+        ("beta1", c_double),
+        ("beta2", c_double),
+        ("epsilon", c_double),
+        ("step", c_int64),
+        ("skipped", c_void_p),
+    )
+
+
+STRUCTURES = (
+    SplatDevice,
+    SplatShot,
+    SplatRows,
+    SplatPictures,
+    SplatPictureGradients,
+    SplatFrame,
+    SplatFrameFacts,
+    SplatStep,
+    SplatAdam,
+)
+
+_SHOT, _ROWS, _FRAME = POINTER(SplatShot), POINTER(SplatRows), POINTER(SplatFrame)
+_RENDER = (_SHOT, _ROWS, _FRAME)
+_DRAW = (c_uint64, c_uint64, c_uint64)
+
+SIZES: dict[str, tuple[Any, ...]] = {
+    "splat_frame_bytes": (_SHOT, c_int64, c_int64),
+    "splat_back_bytes": (_SHOT, c_int64, c_int64),
+    "splat_loss_bytes": (c_int32, c_int32),
+    "splat_affine_bytes": (c_int64,),
+}
+"""Arguments of the functions that return a number of bytes."""
+CALLS: dict[str, tuple[Any, ...]] = {
+    "splat_device": (c_int32, POINTER(SplatDevice)),
+    "splat_forward": (*_RENDER, POINTER(SplatPictures), c_void_p, c_void_p, c_void_p),
+    "splat_blend_backward": (*_RENDER, POINTER(SplatPictureGradients), c_void_p),
+    "splat_project_backward": (*_RENDER, _ROWS, c_void_p, c_void_p),
+    "splat_step": (_SHOT, _FRAME, POINTER(SplatStep), c_void_p, c_void_p),
+    "splat_photo_loss": (
+        *(c_void_p, c_void_p, c_void_p, c_int32, c_int32, c_double),
+        *(c_void_p, c_void_p, c_void_p, c_int64, c_void_p),
+    ),
+    "splat_affine_colour": (c_void_p, c_void_p, c_int64, c_void_p, c_void_p),
+    "splat_affine_colour_backward": (
+        *(c_void_p, c_void_p, c_void_p, c_int64),
+        *(c_void_p, c_void_p, c_void_p, c_int64, c_void_p),
+    ),
+    "splat_adam": (POINTER(SplatAdam), c_void_p),
+    "splat_uniform": (*_DRAW, c_int64, c_void_p, c_void_p),
+    "splat_split_offsets": (*_DRAW, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p),
+    "splat_morton": (c_void_p, c_int64, POINTER(c_float), POINTER(c_float), c_void_p, c_void_p),
+}
+"""Arguments of the functions that return a code: 0, or what is wrong."""

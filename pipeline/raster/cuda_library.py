@@ -1,0 +1,244 @@
+"""The CUDA kernels' shared library: loading and calling it, and why it cannot be used here.
+
+Light: torch is imported only where it is asked whether it knows the device, too.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from ctypes import c_char_p, c_int32, c_int64
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.raster.cuda_api import ABI, CALLS, NO_KERNEL, SIZES, SplatDevice
+
+LIBRARY = Path(__file__).parent / "libsplat_cuda.so"
+NO_DEVICE = 100  # cudaErrorNoDevice, and the driver's code for it
+DRIVERS = {11: "450.80.02", 12: "525.60.13", 13: "580.65.06"}
+"""The first Linux driver for a major version of CUDA; its minor versions need no newer one (CUDA Compatibility, NVIDIA,
+"Minor version compatibility")."""
+
+
+@dataclass(frozen=True)
+class CudaDevice:
+    """A device as the library sees it.
+
+    Attributes:
+        name: E.g. "NVIDIA H200".
+        architecture: 10 · major + minor of its compute capability.
+        driver: CUDA version that the driver knows, 1000 · major + 10 · minor; 0 without a driver.
+        runtime: That the library was built with.
+        memory_bytes: In all.
+    """
+
+    name: str
+    architecture: int
+    driver: int
+    runtime: int
+    memory_bytes: int
+
+    def described(self) -> str:
+        """For manifests: what may change the last bits, and a report of a problem."""
+        versions = f"driver CUDA {version_text(self.driver)}, kernels CUDA {version_text(self.runtime)}"
+        return f"cuda sm_{self.architecture} {self.name}, {versions}"
+
+
+class CudaLibrary:
+    """The loaded library.
+
+    Args:
+        path: Of the shared object.
+
+    Raises:
+        MachineError: if it is not there, cannot be loaded, or has another interface than this program.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not path.exists():
+            raise MachineError(f"There are no CUDA kernels at {path}.", _BUILT_WITHOUT.hint)
+        try:
+            self._functions = ctypes.CDLL(str(path))
+            abi = self._functions.splat_abi()
+            if abi != ABI:
+                raise MachineError(f"The CUDA kernels' interface is version {abi}, not {ABI}.", _REINSTALL)
+            self._functions.splat_error.argtypes, self._functions.splat_error.restype = (c_int32,), c_char_p
+            for functions, result in ((SIZES, c_int64), (CALLS, c_int32)):
+                for name, arguments in functions.items():
+                    function = getattr(self._functions, name)
+                    function.argtypes, function.restype = arguments, result
+        except (OSError, AttributeError) as error:
+            raise MachineError(f"The CUDA kernels cannot be loaded: {error}.", _REINSTALL) from error
+
+    def size(self, name: str, *arguments: object) -> int:
+        """Bytes of memory, by one of ``SIZES``.
+
+        Raises:
+            ValueError: if an argument makes no sense.
+        """
+        result = int(getattr(self._functions, name)(*arguments))
+        if result < 0:
+            raise ValueError(f"{name}: {self.error(result)}")
+        return result
+
+    def call(self, name: str, *arguments: object) -> None:
+        """One of ``CALLS``.
+
+        Raises:
+            ValueError: if an argument makes no sense.
+            MachineError: if the device fails.
+        """
+        code = int(getattr(self._functions, name)(*arguments))
+        if code < 0:
+            raise ValueError(f"{name}: {self.error(code)}")
+        if code > 0:
+            raise MachineError(
+                f"The graphics card failed in {name}: {self.error(code)}.",
+                hint="Run the command again: it goes on from its last checkpoint. --device cpu does without the card.",
+            )
+
+    def error(self, code: int) -> str:
+        """What a code means."""
+        text: bytes = self._functions.splat_error(code)
+        return text.decode(errors="replace")
+
+    def device(self, index: int) -> tuple[int, CudaDevice]:
+        """A device, and the code that asking for it returned; the versions hold where that is an error, too."""
+        found = SplatDevice()
+        code = int(self._functions.splat_device(index, ctypes.byref(found)))
+        name = found.name.decode(errors="replace")
+        return code, CudaDevice(name, found.architecture, found.driver, found.runtime, found.memory_bytes)
+
+
+@functools.cache
+def load(path: Path = LIBRARY) -> CudaLibrary:
+    """The library, loaded once; errors as of ``CudaLibrary``."""
+    return CudaLibrary(path)
+
+
+@dataclass(frozen=True)
+class NoCuda:
+    """Why CUDA cannot be used here.
+
+    Attributes:
+        reason: A sentence.
+        hint: What to do about it.
+    """
+
+    reason: str
+    hint: str
+
+
+@dataclass(frozen=True)
+class Installed:
+    """What decides whether CUDA can be used here.
+
+    Attributes:
+        driver: CUDA version that the system's driver knows, 1000 · major + 10 · minor; 0 without a driver.
+        driver_code: What the driver said when it was asked to start; 0 if it did.
+        has_library: Whether this program came with CUDA kernels.
+        library: What the library says of device 0, and the code with it; None where it was not asked.
+        torch_cuda: CUDA version that torch was built with, "" without; None where it was not asked.
+        torch_works: Whether torch can use the device.
+    """
+
+    driver: int
+    driver_code: int = 0
+    has_library: bool = True
+    library: tuple[int, CudaDevice] | None = None
+    torch_cuda: str | None = None
+    torch_works: bool = True
+
+
+_REINSTALL = "Install splatpipe again: its parts are of different versions."
+_NO_DRIVER = NoCuda("There is no NVIDIA driver.", "With an NVIDIA graphics card, install its driver.")
+_NO_DEVICE = NoCuda(
+    "There is no NVIDIA graphics card that CUDA sees.",
+    "If there is one, nvidia-smi shows whether its driver runs; CUDA_VISIBLE_DEVICES and containers can hide it.",
+)
+_BUILT_WITHOUT = NoCuda(
+    "This splatpipe was built without CUDA kernels.",
+    "Install a build that has them, or build it where nvcc (CUDA 12 or 13) is installed.",
+)
+_TORCH_CPU = NoCuda(
+    "The installed torch is a build for the CPU.",
+    "Install one with CUDA in its place: https://pytorch.org/get-started tells the command.",
+)
+
+
+def reason_of(installed: Installed) -> NoCuda | None:
+    """The first thing that is in the way of using CUDA, or None if nothing is."""
+    if installed.driver == 0:
+        return _NO_DRIVER
+    if installed.driver_code == NO_DEVICE:
+        return _NO_DEVICE
+    if installed.driver_code:
+        return NoCuda(f"The NVIDIA driver does not start (its error {installed.driver_code}).", _NO_DEVICE.hint)
+    if not installed.has_library:
+        return _BUILT_WITHOUT
+    if installed.library is not None:
+        code, device = installed.library
+        if installed.driver // 1000 < device.runtime // 1000:
+            return _too_old(installed.driver, device.runtime // 1000, "the CUDA kernels were")
+        if code == NO_KERNEL:
+            return NoCuda(
+                f"The CUDA kernels were not built for {device.name} (sm_{device.architecture}).",
+                "They are built for cards from sm_75 (Turing, 2018) on, and by `make run` for the card it finds: "
+                "build them here.",
+            )
+        if code:
+            return NoCuda(f"The NVIDIA card does not answer (error {code}).", _NO_DEVICE.hint)
+    if installed.torch_cuda == "":
+        return _TORCH_CPU
+    if installed.torch_cuda is not None and not installed.torch_works:
+        major = int(installed.torch_cuda.split(".")[0])
+        if installed.driver // 1000 < major:
+            return _too_old(installed.driver, major, "the installed torch was")
+        return NoCuda("torch does not find the NVIDIA card.", "python -c 'import torch; torch.cuda.init()' says why.")
+    return None
+
+
+def why_not() -> NoCuda | None:
+    """Why CUDA cannot be used here; None if it can. Asks the cheap things first, and torch last."""
+    code, driver = _driver()
+    installed = Installed(driver, code, LIBRARY.exists())
+    if reason := reason_of(installed):
+        return reason
+    try:
+        library = load().device(0)
+    except MachineError as error:
+        return NoCuda(error.message, error.hint)
+    installed = Installed(driver, code, True, library)
+    if reason := reason_of(installed):
+        return reason
+    import torch
+
+    built_with = torch.version.cuda or ""
+    works = bool(built_with) and torch.cuda.is_available()
+    return reason_of(Installed(driver, code, True, library, built_with, works))
+
+
+def version_text(version: int) -> str:
+    """1000 · major + 10 · minor as "major.minor"."""
+    return f"{version // 1000}.{version % 1000 // 10}"
+
+
+def _too_old(driver: int, major: int, built: str) -> NoCuda:
+    needed = DRIVERS.get(major)
+    newer = f"{needed} or newer" if needed else f"one for CUDA {major}"
+    return NoCuda(
+        f"The NVIDIA driver is too old: it knows CUDA {version_text(driver)}, and {built} built with CUDA {major}.",
+        f"Install a newer NVIDIA driver: {newer}.",
+    )
+
+
+def _driver() -> tuple[int, int]:
+    """What the system's driver says when it starts, and the CUDA version that it knows (0 without a driver)."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+        version = c_int32()
+        driver.cuDriverGetVersion(ctypes.byref(version))
+        return int(driver.cuInit(0)), version.value
+    except (OSError, AttributeError):
+        return 0, 0

@@ -1,0 +1,134 @@
+"""The CUDA library's mirror for ctypes, how it is loaded, and what is told where it cannot be used."""
+
+import ctypes
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.raster import cuda_api, cuda_library
+from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, Installed, reason_of
+
+NATIVE = Path(__file__).parent.parent / "pipeline" / "raster" / "native" / "cuda"
+API = (NATIVE / "api.h").read_text()
+H200 = CudaDevice("NVIDIA H200", 90, 13000, 13000, 150_000_000_000)
+GOOD = Installed(13000, library=(0, H200), torch_cuda="12.8")
+
+
+def build(source: str, out: Path, *flags: str) -> None:
+    subprocess.run(
+        ["g++", "-std=c++17", "-x", "c++", "-", f"-I{NATIVE}", "-o", str(out), *flags],
+        input=source,
+        text=True,
+        check=True,
+    )
+
+
+def fields_of(structure: type[ctypes.Structure]) -> dict[str, tuple[int, int]]:
+    """Offset and size of each field, as ctypes lays them out."""
+    return {name: (getattr(structure, name).offset, getattr(structure, name).size) for name, *_ in structure._fields_}
+
+
+def test_structures_are_those_of_the_header(tmp_path):
+    names = set(re.findall(r"^} (Splat\w+);", API, re.MULTILINE))
+    assert names == {structure.__name__ for structure in cuda_api.STRUCTURES}
+    lines = ['std::printf("{\\n");']
+    for structure in cuda_api.STRUCTURES:
+        name = structure.__name__
+        lines.append(f'std::printf("\\"{name}\\": [%zu, {{", sizeof({name}));')
+        for field in fields_of(structure):
+            size = f"sizeof((({name}*)nullptr)->{field})"
+            lines.append(f'std::printf("\\"{field}\\": (%zu, %zu), ", offsetof({name}, {field}), {size});')
+        lines.append('std::printf("}],\\n");')
+    lines.append('std::printf("}\\n");')
+    includes = '#include "api.h"\n#include <cstddef>\n#include <cstdio>\n'
+    build(f"{includes}int main() {{ {' '.join(lines)} }}", tmp_path / "sizes")
+    printed = subprocess.run([tmp_path / "sizes"], capture_output=True, text=True, check=True).stdout
+    expected = eval(printed)
+    for structure in cuda_api.STRUCTURES:
+        assert [ctypes.sizeof(structure), fields_of(structure)] == expected[structure.__name__], structure.__name__
+
+
+def test_functions_and_constants_are_those_of_the_header():
+    declared = {}
+    for returns, name, arguments in re.findall(r"SPLAT_API ([\w ]+\*?) ?(splat_\w+)\(([^)]*)\);", API):
+        declared[name] = (returns.strip(), 0 if arguments == "void" else len(arguments.split(",")))
+    mirrored = {name: ("int64_t", len(arguments)) for name, arguments in cuda_api.SIZES.items()}
+    mirrored |= {name: ("int32_t", len(arguments)) for name, arguments in cuda_api.CALLS.items()}
+    assert declared == mirrored | {"splat_abi": ("int32_t", 0), "splat_error": ("const char*", 1)}
+    assert int(re.search(r"#define SPLAT_CUDA_ABI (\d+)", API)[1]) == cuda_api.ABI
+    assert int(re.search(r"#define SPLAT_ADAM_TENSORS (\d+)", API)[1]) == cuda_api.ADAM_TENSORS
+    assert int(re.search(r"SPLAT_NO_KERNEL = (-?\d+)", API)[1]) == cuda_api.NO_KERNEL
+
+
+def test_a_library_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(MachineError, match="no CUDA kernels at"):
+        CudaLibrary(tmp_path / "libsplat_cuda.so")
+
+
+def test_a_library_of_another_interface_is_refused(tmp_path):
+    build('extern "C" int splat_abi() { return 99; }', tmp_path / "other.so", "-shared", "-fPIC")
+    with pytest.raises(MachineError, match="version 99, not"):
+        CudaLibrary(tmp_path / "other.so")
+    (tmp_path / "broken.so").write_bytes(b"\x7fELF and no more")
+    with pytest.raises(MachineError, match="cannot be loaded"):
+        CudaLibrary(tmp_path / "broken.so")
+    build('extern "C" int splat_abi() { return ' + f"{cuda_api.ABI}; }}", tmp_path / "half.so", "-shared", "-fPIC")
+    with pytest.raises(MachineError, match=r"cannot be loaded: .*splat_error"):
+        CudaLibrary(tmp_path / "half.so")
+
+
+def test_nothing_is_in_the_way_of_a_good_installation():
+    assert reason_of(GOOD) is None
+    newer = replace(GOOD, library=(0, replace(H200, driver=13000, runtime=13020)))
+    assert reason_of(newer) is None  # minor versions of CUDA 13 run on its first driver
+
+
+@pytest.mark.parametrize(
+    ("installed", "reason", "hint"),
+    [
+        (Installed(0), "no NVIDIA driver", "install its driver"),
+        (Installed(12080, driver_code=100), "no NVIDIA graphics card", "nvidia-smi"),
+        (Installed(12080, driver_code=803), "driver does not start .*803", "nvidia-smi"),
+        (Installed(13000, has_library=False), "built without CUDA kernels", "nvcc"),
+        (replace(GOOD, driver=12080), "too old: it knows CUDA 12.8, and the CUDA kernels .* CUDA 13", "580.65.06"),
+        (replace(GOOD, library=(-3, replace(H200, architecture=61))), r"not built for NVIDIA H200 \(sm_61\)", "sm_75"),
+        (replace(GOOD, library=(999, H200)), "does not answer", "nvidia-smi"),
+        (replace(GOOD, torch_cuda="", torch_works=False), "torch is a build for the CPU", "pytorch.org"),
+        (
+            replace(
+                GOOD, driver=12080, library=(0, replace(H200, runtime=12080)), torch_cuda="13.0", torch_works=False
+            ),
+            "too old: it knows CUDA 12.8, and the installed torch .* CUDA 13",
+            "580.65.06",
+        ),
+        (replace(GOOD, torch_works=False), "torch does not find", "torch.cuda.init"),
+    ],
+)
+def test_each_reason_is_told_with_what_to_do(installed, reason, hint):
+    found = reason_of(installed)
+    assert found is not None
+    assert re.search(reason, found.reason), found.reason
+    assert re.search(hint, found.hint), found.hint
+
+
+def test_asking_for_the_reason_imports_no_torch_where_there_is_no_device():
+    code = """
+import sys
+from splatpipe.pipeline.raster import cuda_library
+assert "torch" not in sys.modules
+found = cuda_library.why_not()
+assert "torch" not in sys.modules or cuda_library._driver() != (0, 0)
+print(found)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(("NoCuda(reason=", "None"))
+
+
+def test_a_device_is_described_with_what_may_change_its_bits():
+    assert H200.described() == "cuda sm_90 NVIDIA H200, driver CUDA 13.0, kernels CUDA 13.0"
+    assert cuda_library.version_text(12080) == "12.8"
