@@ -1,0 +1,116 @@
+"""Builds the CUDA kernels' sources for the CPU, on top of ``cuda_on_cpu.h``; what was built once is kept by content."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+HARNESS = Path(__file__).parent
+NATIVE = HARNESS.parents[1] / "pipeline" / "raster" / "native"
+KEPT = Path(tempfile.gettempdir()) / f"splatpipe-cuda-on-cpu-{os.getuid()}"
+
+FORWARD, REVERSE, SHUFFLED = range(3)
+"""Orders of threads and blocks, for ``harness_order``."""
+
+FLAGS = ("-std=c++17", "-O2", "-g0", "-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-DSPLAT_ON_CPU=1")
+WARNINGS = ("-Wall", "-Wextra", "-Wno-unknown-pragmas", "-Wno-unused-parameter", "-Wno-psabi")
+_HEADERS = (".h", ".cuh")
+
+
+def kernel_sources() -> list[Path]:
+    """All of the backend's sources."""
+    return sorted((NATIVE / "cuda").glob("*.cu"))
+
+
+def build_on_cpu(
+    sources: Iterable[Path] | None = None,
+    name: str = "splat_cuda",
+    changed: Mapping[Path, str] | None = None,
+    flags: Iterable[str] = (),
+) -> Path:
+    """Compile sources and link them with the harness.
+
+    Args:
+        sources: CUDA sources; None: the backend's own.
+        name: Of the library.
+        changed: Other text for sources or headers in ``NATIVE``, by their paths there.
+        flags: For the compiler, after the usual ones.
+
+    Returns:
+        The shared library, ``lib<name>_on_cpu.so``.
+
+    Raises:
+        AssertionError: with what the compiler said, if it does not compile.
+    """
+    chosen = kernel_sources() if sources is None else list(sources)
+    changed = dict(changed or {})
+    native = NATIVE if not changed else _copy_with(changed)
+    chosen = [native / path.relative_to(NATIVE) if path.is_relative_to(NATIVE) else path for path in chosen]
+    options = (*FLAGS, *WARNINGS, *flags)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        objects = list(pool.map(lambda path: _compile(path, native, options), [HARNESS / "cuda_on_cpu.cpp", *chosen]))
+    library = KEPT / _digest(path.name for path in objects) / f"lib{name}_on_cpu.so"
+    if not library.exists():
+        _write(library, ["-shared", *map(str, objects)])
+    return library
+
+
+def load(library: Path) -> ctypes.CDLL:
+    """The library, with the harness's own functions declared."""
+    loaded = ctypes.CDLL(str(library))
+    loaded.harness_order.argtypes = [ctypes.c_int, ctypes.c_uint64]
+    loaded.harness_order.restype = None
+    loaded.harness_multiprocessors.argtypes = [ctypes.c_int]
+    loaded.harness_multiprocessors.restype = None
+    loaded.harness_fault.argtypes = [ctypes.c_int]
+    loaded.harness_fault.restype = None
+    loaded.harness_message.restype = ctypes.c_char_p
+    loaded.harness_launches.restype = ctypes.c_int64
+    loaded.harness_switches.restype = ctypes.c_int64
+    return loaded
+
+
+def _digest(texts: Iterable[str]) -> str:
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:32]
+
+
+def _copy_with(changed: Mapping[Path, str]) -> Path:
+    """A copy of the native sources in which some files have other text."""
+    files = [path for path in sorted(NATIVE.rglob("*")) if path.suffix in (*_HEADERS, ".cu")]
+    texts = {path: changed.get(path, path.read_text()) for path in files}
+    assert changed.keys() <= texts.keys(), "no such source"
+    root = KEPT / "sources" / _digest(texts.values())
+    for path, text in texts.items():
+        to = root / path.relative_to(NATIVE)
+        if not to.exists():
+            to.parent.mkdir(parents=True, exist_ok=True)
+            beside = to.with_name(f"{to.name}.{os.getpid()}")
+            beside.write_text(text)
+            beside.replace(to)
+    return root
+
+
+def _compile(source: Path, native: Path, options: tuple[str, ...]) -> Path:
+    """The object of a source, which depends on it, on all headers and on the options."""
+    headers = [path for root in (native, HARNESS) for path in sorted(root.rglob("*")) if path.suffix in _HEADERS]
+    digest = _digest([source.name, *options, *(path.read_text() for path in (*headers, source))])
+    built = KEPT / "objects" / f"{source.stem}-{digest}.o"
+    if not built.exists():
+        language = ("-x", "c++") if source.suffix == ".cu" else ()
+        _write(built, [*options, f"-I{HARNESS}", f"-I{native / 'cuda'}", "-c", *language, str(source)])
+    return built
+
+
+def _write(path: Path, arguments: list[str]) -> None:
+    """Run the compiler; others may build the same, so the file comes into being at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.{os.getpid()}")
+    done = subprocess.run(["c++", *arguments, "-o", str(beside)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{path.name}:\n{done.stderr}"
+    beside.replace(path)
