@@ -55,7 +55,7 @@ struct FrameMemory {
     int32_t* tile_counts;      // (t + 1): differences, +1 at a span's first tile and -1 behind its last; then pairs
     int64_t* tile_begin;       // (t + 1): pairs of the view before the tile
     int32_t* chunk_begin;      // (t + 1): first tile of each chunk, and t at the end
-    float* transmittance;      // (t, 256): behind everything; a tile's pixels by threads, see blend.cu
+    float* transmittance;      // (t, 256): behind everything; a tile's pixels by threads, see blend.cuh
     int32_t* pixel_end;        // (t, 256): how many of the tile's pairs the pixel looked at before it ended
     uint16_t* pair_keys[2];    // (c): tile less the chunk's first
     uint32_t* pair_values[2];  // (c): a pair's place before the sort, which is its slot; sorted in [0]
