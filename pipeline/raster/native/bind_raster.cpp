@@ -5,6 +5,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <array>
 #include <limits>
 #include <memory>
@@ -12,6 +13,7 @@
 #include <tuple>
 
 #include "raster_cpu.h"
+#include "view.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -73,39 +75,20 @@ splat::Parameters parameters_of(const ParameterArrays<const float>& arrays) {
             checked(sh, n, sh.shape(1), "sh")};
 }
 
-void put_camera(const CameraTuple& camera, splat::View* view) {
+splat::View view_of(const CameraTuple& camera, const OptionsTuple& options, size_t sh_count) {
     const auto& [pose, size, intrinsics] = camera;
-    const auto [fx, fy, cx, cy] = intrinsics;
-    if (size[0] < 1 || size[1] < 1 || size[0] > 65536 || size[1] > 65536) throw nb::value_error("size");
-    view->width = size[0], view->height = size[1];
-    view->tiles_x = (view->width + splat::kTile - 1) / splat::kTile;
-    view->tiles_y = (view->height + splat::kTile - 1) / splat::kTile;
-    view->fx = static_cast<float>(fx), view->fy = static_cast<float>(fy);
-    view->cx = static_cast<float>(cx), view->cy = static_cast<float>(cy);
-    for (int row = 0; row < 3; ++row) {
-        double centre = 0.0;
-        for (int column = 0; column < 3; ++column) {
-            view->rotation[3 * row + column] = static_cast<float>(pose(row, column));
-            centre -= pose(column, row) * pose(column, 3);
-        }
-        view->translation[row] = static_cast<float>(pose(row, 3));
-        view->centre[row] = static_cast<float>(centre);
-    }
-    const double margin_x = splat::kFrustumMargin * 0.5 * size[0], margin_y = splat::kFrustumMargin * 0.5 * size[1];
-    view->ratio_min[0] = static_cast<float>(-(cx + margin_x) / fx);
-    view->ratio_max[0] = static_cast<float>((size[0] - cx + margin_x) / fx);
-    view->ratio_min[1] = static_cast<float>(-(cy + margin_y) / fy);
-    view->ratio_max[1] = static_cast<float>((size[1] - cy + margin_y) / fy);
-}
-
-void put_options(const OptionsTuple& options, size_t sh_count, splat::View* view) {
     const auto& [degree, antialias, near_z, depth_origin, background] = options;
-    if (degree < 0 || degree > 3 || sh_count > 16 || static_cast<size_t>((degree + 1) * (degree + 1)) > sh_count)
-        throw nb::value_error("sh_degree");
-    view->sh_degree = degree, view->sh_count = static_cast<int>(sh_count);
-    view->antialias = antialias, view->near_z = static_cast<float>(near_z);
-    view->depth_origin = static_cast<float>(depth_origin);
-    for (int c = 0; c < 3; ++c) view->background[c] = static_cast<float>(background[c]);
+    SplatShot shot{};
+    for (int i = 0; i < 12; ++i) shot.cam_from_world[i] = pose(i / 4, i % 4);
+    shot.fx = intrinsics[0], shot.fy = intrinsics[1], shot.cx = intrinsics[2], shot.cy = intrinsics[3];
+    shot.near_z = near_z, shot.depth_origin = depth_origin;
+    for (int c = 0; c < 3; ++c) shot.background[c] = background[c];
+    shot.width = size[0], shot.height = size[1];
+    shot.sh_degree = degree, shot.antialias = antialias;
+    shot.sh_count = static_cast<int32_t>(std::min<size_t>(sh_count, splat::kMaxShCount + 1));
+    splat::View view{};
+    if (const char* wrong = splat::find_view(shot, &view)) throw nb::value_error(wrong);
+    return view;
 }
 
 // A render and what its backward pass needs.
@@ -114,8 +97,7 @@ class Frame {
     void forward(const ParameterArrays<const float>& arrays, const CameraTuple& camera, const OptionsTuple& options,
                  const OutputArrays& outputs) {
         const splat::Parameters in = parameters_of(arrays);
-        put_camera(camera, &view_);
-        put_options(options, std::get<4>(arrays).shape(1), &view_);
+        view_ = view_of(camera, options, std::get<4>(arrays).shape(1));
         const size_t n = in.count, h = view_.height, w = view_.width;
         const auto& [colour, alpha, depths, radii, visible] = outputs;
         splat::Pictures out{};

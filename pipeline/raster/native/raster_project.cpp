@@ -5,7 +5,6 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kMaxSh = 16;                                                 // coefficients a channel
 constexpr int kMaxShFloats = (kMaxSh * 3 + kLanes - 1) / kLanes * kLanes;  // a Gaussian, to whole vectors
 
 // The rows of a vector of Gaussians: pointers to the first, into the caller's arrays or, at the ragged end, to padded
@@ -50,71 +49,17 @@ SPLAT_INLINE Lanes load_lanes(const Rows& rows) {
 
 // Coefficients that count, (k, rgb) vectors.
 SPLAT_INLINE void load_sh(const View& view, const Rows& rows, Floats* sh) {
-    load_columns(rows.sh, view.sh_count * 3, (view.sh_degree + 1) * (view.sh_degree + 1) * 3, sh);
+    load_columns(rows.sh, view.sh_count * 3, sh_basis_size(view.sh_degree) * 3, sh);
 }
-
-SPLAT_INLINE Vec3 direction(const View& view, const Vec3& mean, Floats* inv_length) {
-    const Vec3 towards = mean - fill3(view.centre);
-    *inv_length = fill(1.0f) / sqrt(dot(towards, towards));
-    return *inv_length * towards;
-}
-
-SPLAT_INLINE Vec3 coefficient(const Floats* sh, int k) { return {sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}; }
-
-// The colour before it is clamped, and the basis it was made with.
-SPLAT_INLINE Vec3 colour_of(const View& view, const Floats* sh, const Vec3& dir, Floats* basis) {
-    sh_basis(view.sh_degree, dir, basis);
-    const int count = (view.sh_degree + 1) * (view.sh_degree + 1);
-    Vec3 colour = {fill(0.5f), fill(0.5f), fill(0.5f)};
-    for (int k = 0; k < count; ++k) colour = colour + basis[k] * coefficient(sh, k);
-    return colour;
-}
-
-SPLAT_INLINE Mask within(Floats x, float limit) { return both(at_most(x, fill(limit)), at_most(fill(-limit), x)); }
 
 // Splat's fields as vectors, in the order of the struct, then the first and last tile rows.
 constexpr int kFields = 18;
 
-SPLAT_INLINE Mask make_splats(const View& view, const Projection& p, const Vec3& colour, float (*fields)[kLanes],
-                              float* radii) {
-    const Floats x = fill(view.fx) * p.point.x * p.inv_z + fill(view.cx);
-    const Floats y = fill(view.fy) * p.point.y * p.inv_z + fill(view.cy);
-    const Floats k = fill(kHalfLog2E), reach = p.log2_opacity - fill(kLog2AlphaMin), zero = fill(0.0f);
-    const Floats a = sqrt(k * p.yy / p.det), slope = p.xy / p.yy, c = sqrt(k / p.yy), inv_k = fill(1.0f / kHalfLog2E);
-    const Floats spread = sqrt(max(reach, zero) / k);  // Mahalanobis distance at which alpha = 1/255
-    const Floats half_x = spread * sqrt(p.xx), half_y = spread * sqrt(p.yy), half = fill(0.5f);
-    Mask visible = both(p.usable, both(within(x, kMaxScreenPx), within(y, kMaxScreenPx)));
-    visible = both(
-        visible, both(within(colour.x, kMaxColour), both(within(colour.y, kMaxColour), within(colour.z, kMaxColour))));
-    visible = both(visible, both(at_most(half, x + half_x), at_most(x - half_x, fill(view.width - 0.5f))));
-    visible = both(visible, both(at_most(half, y + half_y), at_most(y - half_y, fill(view.height - 0.5f))));
-    const Floats row0 = max(ceil(y - half_y - half), zero),
-                 row1 = min(floor(y + half_y - half), fill(view.height - 1.0f));
-    const Mask no_row = less(row1, row0);
-    const Floats tile = fill(1.0f / kTile);
-    const Floats values[kFields] = {x,
-                                    y,
-                                    a,
-                                    -a * slope,
-                                    c,
-                                    p.log2_opacity,
-                                    max(colour.x, zero),
-                                    max(colour.y, zero),
-                                    max(colour.z, zero),
-                                    p.point.z,
-                                    slope,
-                                    fill(1.0f) / a,
-                                    reach,
-                                    spread * p.xy / sqrt(p.xx),
-                                    inv_k * a * (p.zx - slope * p.zy),
-                                    inv_k * c * p.zy,
-                                    select(no_row, fill(1.0f), floor(row0 * tile)),
-                                    select(no_row, zero, floor(row1 * tile))};
+SPLAT_INLINE void put_fields(const SplatLanes& s, float (*fields)[kLanes]) {
+    const Floats values[kFields] = {s.x,        s.y,        s.a,        s.b,       s.c,         s.log2_opacity,
+                                    s.colour.x, s.colour.y, s.colour.z, s.depth,   s.slope,     s.inv_a,
+                                    s.reach,    s.rows_dy,  s.depth_u,  s.depth_v, s.first_row, s.last_row};
     for (int i = 0; i < kFields; ++i) store(fields[i], values[i]);
-    const Floats mean_variance = half * (p.xx + p.yy), half_difference = half * (p.xx - p.yy);
-    const Floats largest = mean_variance + sqrt(half_difference * half_difference + p.xy * p.xy);
-    store(radii, only(visible, fill(kRadiusSigmas) * sqrt(largest)));
-    return visible;
 }
 
 void project(const View& view, const Parameters& in, int64_t begin, int64_t end, const FrameData& frame, float* radii,
@@ -130,8 +75,10 @@ void project(const View& view, const Parameters& in, int64_t begin, int64_t end,
         if (seen) {
             Floats inv_length, basis[kMaxSh], sh[kMaxShFloats];
             load_sh(view, rows, sh);
-            const Vec3 colour = colour_of(view, sh, direction(view, lanes.mean, &inv_length), basis);
-            seen = bits(make_splats(view, p, colour, fields, radius));
+            const Vec3 dir = direction(view, lanes.mean, &inv_length);
+            const SplatLanes splats = make_splats(view, p, colour_of(view.sh_degree, sh, dir, basis));
+            put_fields(splats, fields), store(radius, splats.radius);
+            seen = bits(splats.visible);
         }
         for (int lane = 0; lane < valid; ++lane) {
             const int64_t i = first + lane;
@@ -153,26 +100,6 @@ void project(const View& view, const Parameters& in, int64_t begin, int64_t end,
     }
 }
 
-SPLAT_INLINE float root(float x) { return __builtin_sqrtf(x > 0.0f ? x : 0.0f); }
-SPLAT_INLINE float least(float a, float b) { return a < b ? a : b; }
-SPLAT_INLINE float most(float a, float b) { return a > b ? a : b; }
-
-// The chord of the ellipse between rows dy_first and dy_last reaches furthest right where dy is nearest to the
-// ellipse's own rightmost point, for the ellipse is convex; and to the left alike.
-SPLAT_INLINE Span find_span(const View& view, const Splat& s, int row, float half_y) {
-    const int last_y = row * kTile + kTile < view.height ? row * kTile + kTile : view.height;
-    const float dy_first = most(row * kTile + 0.5f - s.y, -half_y), dy_last = least(last_y - 0.5f - s.y, half_y);
-    const float dy_right = least(most(s.rows_dy, dy_first), dy_last), v_right = s.c * dy_right;
-    const float dy_left = least(most(-s.rows_dy, dy_first), dy_last), v_left = s.c * dy_left;
-    const float right = s.x + s.slope * dy_right + s.inv_a * root(s.reach - v_right * v_right) - 0.5f;
-    const float left = s.x + s.slope * dy_left - s.inv_a * root(s.reach - v_left * v_left) - 0.5f;
-    const float first_px = most(__builtin_ceilf(left), 0.0f);
-    const float last_px = least(__builtin_floorf(right), static_cast<float>(view.width - 1));
-    if (!(dy_first <= dy_last && first_px <= last_px)) return {0, 0};
-    return {static_cast<uint16_t>(static_cast<int>(first_px) / kTile),
-            static_cast<uint16_t>(static_cast<int>(last_px) / kTile + 1)};
-}
-
 int64_t find_spans(const View& view, int64_t begin, int64_t end, const FrameData& frame, int64_t first_span) {
     int64_t tiles = 0;
     Span* span = frame.spans + first_span;
@@ -182,7 +109,7 @@ int64_t find_spans(const View& view, int64_t begin, int64_t end, const FrameData
         touched.slots = static_cast<int32_t>(tiles);
         if (touched.rows == 0) continue;
         const Splat& s = frame.splats[i];
-        const float half_y = root(s.reach) / s.c;
+        const float half_y = half_height(s);
         for (int row = touched.first_row; row < touched.first_row + touched.rows; ++row, ++span) {
             *span = find_span(view, s, row, half_y);
             tiles += span->last - span->first;
@@ -200,22 +127,12 @@ SPLAT_INLINE void sum_slots(const FrameData& frame, int64_t i, float (*sums)[kLa
     for (int f = 0; f < kFloats; ++f) sums[f][lane] = sum[f];
 }
 
-// dL/d(SH) from dL/d(colour), in place of the coefficients; returns dL/d(mean) through the direction.
-SPLAT_INLINE Vec3 colour_backward(const View& view, const Vec3& mean, Vec3 dcolour, Floats* sh) {
-    Floats inv_length, basis[kMaxSh], weights[kMaxSh];
-    const Vec3 dir = direction(view, mean, &inv_length);
-    const Vec3 colour = colour_of(view, sh, dir, basis);
-    const Floats zero = fill(0.0f);  // no gradient where the colour was clamped
-    dcolour = {only(less(zero, colour.x), dcolour.x), only(less(zero, colour.y), dcolour.y),
-               only(less(zero, colour.z), dcolour.z)};
-    const int count = (view.sh_degree + 1) * (view.sh_degree + 1);
-    for (int k = 0; k < count; ++k) {
-        weights[k] = dot(dcolour, coefficient(sh, k));
+// dL/d(SH), in place of the coefficients.
+SPLAT_INLINE void put_sh_gradient(const View& view, const Floats* basis, const Vec3& dcolour, Floats* sh) {
+    const int count = sh_basis_size(view.sh_degree);
+    for (int k = 0; k < count; ++k)
         sh[3 * k] = basis[k] * dcolour.x, sh[3 * k + 1] = basis[k] * dcolour.y, sh[3 * k + 2] = basis[k] * dcolour.z;
-    }
-    for (int f = 3 * count; f < 3 * view.sh_count; ++f) sh[f] = zero;
-    const Vec3 ddir = sh_direction_gradient(view.sh_degree, dir, weights);
-    return inv_length * (ddir - dot(dir, ddir) * dir);
+    for (int f = 3 * count; f < 3 * view.sh_count; ++f) sh[f] = fill(0.0f);
 }
 
 SPLAT_INLINE void zero(float* out, int64_t count) {
@@ -299,7 +216,10 @@ SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, in
                                  kDepth ? load(sums[kSlotFloats + 1]) : fill(0.0f)};
         const Projection p = project_lanes(view, lanes);
         LanesGradient d = project_lanes_backward<kDepth>(view, p, g, out.magnitudes);
-        d.mean = d.mean + colour_backward(view, lanes.mean, g.colour, sh);
+        Vec3 dcolour = g.colour;
+        Floats basis[kMaxSh];
+        d.mean = d.mean + colour_backward(view, view.sh_degree, lanes.mean, sh, &dcolour, basis);
+        put_sh_gradient(view, basis, dcolour, sh);
         const Mask seen = less(fill(0.0f), load(touched));
         const ParameterGradients here = rows_from(out, sh_row, first);
         const ParameterGradients stack = {ragged.means, ragged.log_scales, ragged.quats,  ragged.opacity_logits,

@@ -11,6 +11,8 @@
 
 #define SPLAT_INLINE static inline __attribute__((always_inline))
 #define SPLAT_METHOD inline __attribute__((always_inline))
+#define SPLAT_UNROLL
+#define SPLAT_TABLE constexpr
 
 namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
@@ -387,6 +389,10 @@ SPLAT_INLINE Floats log2(Floats x) {
     p = fma(p, s2, fill(2.885390082f));
     return fma(p, s, __builtin_convertvector(exponent, Floats));
 }
+
+// Of one float.
+SPLAT_INLINE float fused(float a, float b, float c) { return a * b + c; }
+SPLAT_INLINE float root(float x) { return __builtin_sqrtf(x > 0.0f ? x : 0.0f); }
 
 }  // namespace
 }  // namespace SPLAT_ISA_NAMESPACE

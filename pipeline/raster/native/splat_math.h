@@ -1,11 +1,16 @@
-// The mathematics of one Gaussian's projection and its derivative, a Gaussian a lane. For kernel files.
+// The mathematics of one Gaussian's projection, its colour, and their derivatives, a Gaussian a lane. For kernel files:
+// of the CPU, where lanes are vectors, and of CUDA, where a lane is a float.
 //
 // Σ' = B Bᵀ + 0.3 I with the 2 x 3 matrix B = J W R S: its rows are all that is kept, and det(B Bᵀ) = |row0 x row1|²
 // (Cauchy-Binet) does not cancel.
 #pragma once
 
 #include "raster.h"
+#if defined(__CUDACC__) || SPLAT_ON_CPU
+#include "lane.h"
+#else
 #include "simd.h"
+#endif
 
 namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
@@ -118,9 +123,9 @@ SPLAT_INLINE Projection project_lanes(const View& view, const Lanes& in) {
 // The basis of splat/sh.py at unit directions, degree 0..3. With slopes: its derivatives by x, y, z.
 constexpr float kSh0 = 0.28209479177387814f;
 constexpr float kSh1 = 0.4886025119029199f;
-constexpr float kSh2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};
-constexpr float kSh3[5] = {0.5900435899266435f, 2.890611442640554f, 0.4570457994644658f, 0.3731763325901154f,
-                           1.445305721320277f};
+SPLAT_TABLE float kSh2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};
+SPLAT_TABLE float kSh3[5] = {0.5900435899266435f, 2.890611442640554f, 0.4570457994644658f, 0.3731763325901154f,
+                             1.445305721320277f};
 
 SPLAT_INLINE void sh_basis(int degree, const Vec3& d, Floats* basis) {
     const Floats x = d.x, y = d.y, z = d.z;
@@ -270,6 +275,120 @@ SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projec
     out.mean = (dratio_x * p.inv_z) * w0 + (dratio_y * p.inv_z) * w1 + dz * w2;
     if (magnitudes) out.mean2d_x = inv_k * a * in.size_x, out.mean2d_y = inv_k * in.size_y;
     return out;
+}
+
+constexpr int kMaxSh = 16;  // coefficients a channel
+
+SPLAT_INLINE int sh_basis_size(int degree) { return (degree + 1) * (degree + 1); }
+
+SPLAT_INLINE Vec3 direction(const View& view, const Vec3& mean, Floats* inv_length) {
+    const Vec3 towards = mean - fill3(view.centre);
+    *inv_length = fill(1.0f) / sqrt(dot(towards, towards));
+    return *inv_length * towards;
+}
+
+SPLAT_INLINE Vec3 coefficient(const Floats* sh, int k) { return {sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}; }
+
+// The colour before it is clamped, and the basis it was made with.
+SPLAT_INLINE Vec3 colour_of(int degree, const Floats* sh, const Vec3& dir, Floats* basis) {
+    sh_basis(degree, dir, basis);
+    const int count = sh_basis_size(degree);
+    Vec3 colour = {fill(0.5f), fill(0.5f), fill(0.5f)};
+    SPLAT_UNROLL
+    for (int k = 0; k < count; ++k) colour = colour + basis[k] * coefficient(sh, k);
+    return colour;
+}
+
+// dL/d(mean) through the direction from dL/d(colour), which becomes zero where the colour was clamped; dL/d(SH) is then
+// the outer product of the basis and that.
+SPLAT_INLINE Vec3 colour_backward(const View& view, int degree, const Vec3& mean, const Floats* sh, Vec3* dcolour,
+                                  Floats* basis) {
+    Floats inv_length, weights[kMaxSh];
+    const Vec3 dir = direction(view, mean, &inv_length);
+    const Vec3 colour = colour_of(degree, sh, dir, basis);
+    const Floats zero = fill(0.0f);
+    *dcolour = {only(less(zero, colour.x), dcolour->x), only(less(zero, colour.y), dcolour->y),
+                only(less(zero, colour.z), dcolour->z)};
+    const int count = sh_basis_size(degree);
+    SPLAT_UNROLL
+    for (int k = 0; k < count; ++k) weights[k] = dot(*dcolour, coefficient(sh, k));
+    const Vec3 ddir = sh_direction_gradient(degree, dir, weights);
+    return inv_length * (ddir - dot(dir, ddir) * dir);
+}
+
+// What a splat is on the screen: Splat's fields in the order of the struct, and what else the projection tells.
+struct SplatLanes {
+    Floats x, y, a, b, c, log2_opacity;
+    Vec3 colour;
+    Floats depth, slope, inv_a, reach, rows_dy, depth_u, depth_v;
+    Floats first_row, last_row;  // of tiles; 1 and 0 where its ellipse passes between the pixels' centres
+    Floats radius;
+    Mask visible;
+};
+
+SPLAT_INLINE Mask within(Floats x, float limit) { return both(at_most(x, fill(limit)), at_most(fill(-limit), x)); }
+
+SPLAT_INLINE SplatLanes make_splats(const View& view, const Projection& p, const Vec3& colour) {
+    const Floats x = fill(view.fx) * p.point.x * p.inv_z + fill(view.cx);
+    const Floats y = fill(view.fy) * p.point.y * p.inv_z + fill(view.cy);
+    const Floats k = fill(kHalfLog2E), reach = p.log2_opacity - fill(kLog2AlphaMin), zero = fill(0.0f);
+    const Floats a = sqrt(k * p.yy / p.det), slope = p.xy / p.yy, c = sqrt(k / p.yy), inv_k = fill(1.0f / kHalfLog2E);
+    const Floats spread = sqrt(max(reach, zero) / k);  // Mahalanobis distance at which alpha = 1/255
+    const Floats half_x = spread * sqrt(p.xx), half_y = spread * sqrt(p.yy), half = fill(0.5f);
+    Mask visible = both(p.usable, both(within(x, kMaxScreenPx), within(y, kMaxScreenPx)));
+    visible = both(
+        visible, both(within(colour.x, kMaxColour), both(within(colour.y, kMaxColour), within(colour.z, kMaxColour))));
+    visible = both(visible, both(at_most(half, x + half_x), at_most(x - half_x, fill(view.width - 0.5f))));
+    visible = both(visible, both(at_most(half, y + half_y), at_most(y - half_y, fill(view.height - 0.5f))));
+    const Floats row0 = max(ceil(y - half_y - half), zero),
+                 row1 = min(floor(y + half_y - half), fill(view.height - 1.0f));
+    const Mask no_row = less(row1, row0);
+    const Floats tile = fill(1.0f / kTile);
+    const Floats mean_variance = half * (p.xx + p.yy), half_difference = half * (p.xx - p.yy);
+    const Floats largest = mean_variance + sqrt(half_difference * half_difference + p.xy * p.xy);
+    return {x,
+            y,
+            a,
+            -a * slope,
+            c,
+            p.log2_opacity,
+            {max(colour.x, zero), max(colour.y, zero), max(colour.z, zero)},
+            p.point.z,
+            slope,
+            fill(1.0f) / a,
+            reach,
+            spread * p.xy / sqrt(p.xx),
+            inv_k * a * (p.zx - slope * p.zy),
+            inv_k * c * p.zy,
+            select(no_row, fill(1.0f), floor(row0 * tile)),
+            select(no_row, zero, floor(row1 * tile)),
+            only(visible, fill(kRadiusSigmas) * sqrt(largest)),
+            visible};
+}
+
+SPLAT_INLINE float least(float a, float b) { return a < b ? a : b; }
+SPLAT_INLINE float most(float a, float b) { return a > b ? a : b; }
+
+// From the centre to the last row of the ellipse, pixels.
+SPLAT_INLINE float half_height(const Splat& s) { return root(s.reach) / s.c; }
+
+// The tiles that a splat touches in a tile row. The chord of the ellipse between rows dy_first and dy_last reaches
+// furthest right where dy is nearest to the ellipse's own rightmost point, for the ellipse is convex; and to the left
+// alike.
+SPLAT_INLINE Span find_span(const View& view, const Splat& s, int row, float half_y) {
+    const int last_y = row * kTile + kTile < view.height ? row * kTile + kTile : view.height;
+    const float dy_first = most(row * kTile + 0.5f - s.y, -half_y), dy_last = least(last_y - 0.5f - s.y, half_y);
+    const float dy_right = least(most(s.rows_dy, dy_first), dy_last), v_right = s.c * dy_right;
+    const float dy_left = least(most(-s.rows_dy, dy_first), dy_last), v_left = s.c * dy_left;
+    const float chord_right = root(fused(-v_right, v_right, s.reach)),
+                chord_left = root(fused(-v_left, v_left, s.reach));
+    const float right = fused(s.inv_a, chord_right, fused(s.slope, dy_right, s.x)) - 0.5f;
+    const float left = fused(-s.inv_a, chord_left, fused(s.slope, dy_left, s.x)) - 0.5f;
+    const float first_px = most(__builtin_ceilf(left), 0.0f);
+    const float last_px = least(__builtin_floorf(right), static_cast<float>(view.width - 1));
+    if (!(dy_first <= dy_last && first_px <= last_px)) return {0, 0};
+    return {static_cast<uint16_t>(static_cast<int>(first_px) / kTile),
+            static_cast<uint16_t>(static_cast<int>(last_px) / kTile + 1)};
 }
 
 }  // namespace

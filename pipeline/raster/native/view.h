@@ -1,0 +1,46 @@
+// From a shot, as callers on any device describe it, to the view in the kernels' precision. Not for kernel files.
+#pragma once
+
+#include "cuda/api.h"
+#include "raster.h"
+
+namespace splat {
+
+constexpr int kMaxPixels = 65536;  // along a side: tiles are counted in 16 bits
+constexpr int kMaxShDegree = 3;
+constexpr int kMaxShCount = (kMaxShDegree + 1) * (kMaxShDegree + 1);
+
+// Null, or the name of what makes no sense.
+inline const char* find_view(const SplatShot& shot, View* view) {
+    if (shot.width < 1 || shot.height < 1 || shot.width > kMaxPixels || shot.height > kMaxPixels) return "size";
+    const int degree = shot.sh_degree;
+    if (degree < 0 || degree > kMaxShDegree || shot.sh_count > kMaxShCount ||
+        (degree + 1) * (degree + 1) > shot.sh_count)
+        return "sh_degree";
+    view->width = shot.width, view->height = shot.height;
+    view->tiles_x = (shot.width + kTile - 1) / kTile, view->tiles_y = (shot.height + kTile - 1) / kTile;
+    view->fx = static_cast<float>(shot.fx), view->fy = static_cast<float>(shot.fy);
+    view->cx = static_cast<float>(shot.cx), view->cy = static_cast<float>(shot.cy);
+    const double* pose = shot.cam_from_world;
+    for (int row = 0; row < 3; ++row) {
+        double centre = 0.0;
+        for (int column = 0; column < 3; ++column) {
+            view->rotation[3 * row + column] = static_cast<float>(pose[4 * row + column]);
+            centre -= pose[4 * column + row] * pose[4 * column + 3];
+        }
+        view->translation[row] = static_cast<float>(pose[4 * row + 3]);
+        view->centre[row] = static_cast<float>(centre);
+    }
+    const double margin_x = kFrustumMargin * 0.5 * shot.width, margin_y = kFrustumMargin * 0.5 * shot.height;
+    view->ratio_min[0] = static_cast<float>(-(shot.cx + margin_x) / shot.fx);
+    view->ratio_max[0] = static_cast<float>((shot.width - shot.cx + margin_x) / shot.fx);
+    view->ratio_min[1] = static_cast<float>(-(shot.cy + margin_y) / shot.fy);
+    view->ratio_max[1] = static_cast<float>((shot.height - shot.cy + margin_y) / shot.fy);
+    view->near_z = static_cast<float>(shot.near_z), view->depth_origin = static_cast<float>(shot.depth_origin);
+    for (int c = 0; c < 3; ++c) view->background[c] = static_cast<float>(shot.background[c]);
+    view->sh_degree = degree, view->sh_count = shot.sh_count;
+    view->antialias = shot.antialias != 0;
+    return nullptr;
+}
+
+}  // namespace splat
