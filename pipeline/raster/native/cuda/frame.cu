@@ -1,0 +1,342 @@
+// A frame's forward pass and the way back to the screen: memory, kernels and what the host launches.
+#include "../view.h"
+#include "bin.cuh"
+#include "blend.cuh"
+#include "blend_back.cuh"
+#include "frame.h"
+#include "project.cuh"
+#include "sort.cuh"
+
+namespace splat {
+namespace cuda {
+namespace {
+
+constexpr int64_t kMaxPairs = (int64_t{1} << 31) - kSortBlock;  // of a chunk: they are counted in 32 bits with a sign
+constexpr int kDepthPasses = 32 / kDigitBits, kTilePasses = 16 / kDigitBits;
+static_assert(kDepthPasses % 2 == 0 && kTilePasses % 2 == 0, "what is sorted ends where it began");
+constexpr int64_t kTurns = 8;  // blocks a multiprocessor of work that is done in turns: what it holds at once
+
+// Passes of the sorts. (Members of a kernel's argument are chosen, not indexed: it would be copied for that.)
+__device__ inline SortPass<uint32_t, int32_t> depth_pass(const Job& job, int pass) {
+    const FrameMemory& at = job.at;
+    const bool odd = pass % 2, first = pass == 0;
+    return {odd ? at.keys[1] : at.keys[0],
+            odd ? at.keys[0] : at.keys[1],
+            first ? nullptr
+            : odd ? at.order[1]
+                  : at.order[0],
+            odd ? at.order[0] : at.order[1],
+            first ? job.model.count : at.header->visible,
+            pass * kDigitBits,
+            at.digit_table,
+            at.digit_sums,
+            first ? &at.header->visible : nullptr};
+}
+
+__device__ inline SortPass<uint16_t, uint32_t> tile_pass(const Job& job, int pass) {
+    const FrameMemory& at = job.at;
+    const bool odd = pass % 2, first = pass == 0;
+    return {odd ? at.pair_keys[1] : at.pair_keys[0],
+            odd ? at.pair_keys[0] : at.pair_keys[1],
+            first ? nullptr
+            : odd ? at.pair_values[1]
+                  : at.pair_values[0],
+            odd ? at.pair_values[0] : at.pair_values[1],
+            at.header->sorted,
+            pass * kDigitBits,
+            at.digit_table,
+            at.digit_sums,
+            nullptr};
+}
+
+__global__ void __launch_bounds__(kThreads) project_kernel(Job job) { project_phase(job); }
+
+__global__ void __launch_bounds__(kThreads) count_depths(Job job, int pass) { count_digits(depth_pass(job, pass)); }
+__global__ void __launch_bounds__(kThreads) scan_depths(Job job, int pass) { scan_digits(depth_pass(job, pass)); }
+__global__ void __launch_bounds__(kThreads, 2) scatter_depths(Job job, int pass) {
+    scatter_digits(depth_pass(job, pass));
+}
+
+__global__ void __launch_bounds__(kThreads) plan_kernel(Job job) { plan_phase(job); }
+
+__device__ inline bool is_chunk(const Job& job, int chunk) { return chunk < job.at.header->facts.chunks; }
+
+// The kernels of a chunk do nothing where it does not exist, and those that bin it nothing on the way back where the
+// lists of the forward pass are still there: where there was one chunk.
+struct Turn {
+    int chunk;
+    bool back;
+};
+
+__device__ inline bool is_to_bin(const Job& job, const Turn& turn) {
+    return is_chunk(job, turn.chunk) && !(turn.back && job.at.header->facts.chunks == 1);
+}
+
+__global__ void __launch_bounds__(kThreads) count_pairs_kernel(Job job, Turn turn) {
+    if (is_to_bin(job, turn)) count_pairs(job, turn.chunk);
+}
+__global__ void __launch_bounds__(kThreads) scan_pairs_kernel(Job job, Turn turn) {
+    if (is_to_bin(job, turn)) scan_pairs(job);
+}
+__global__ void __launch_bounds__(kThreads) emit_pairs_kernel(Job job, Turn turn) {
+    if (is_to_bin(job, turn)) emit_pairs(job, turn.chunk);
+}
+__global__ void __launch_bounds__(kThreads) count_tiles(Job job, Turn turn, int pass) {
+    if (is_to_bin(job, turn)) count_digits(tile_pass(job, pass));
+}
+__global__ void __launch_bounds__(kThreads) scan_tiles(Job job, Turn turn, int pass) {
+    if (is_to_bin(job, turn)) scan_digits(tile_pass(job, pass));
+}
+__global__ void __launch_bounds__(kThreads, 2) scatter_tiles(Job job, Turn turn, int pass) {
+    if (is_to_bin(job, turn)) scatter_digits(tile_pass(job, pass));
+}
+
+template <bool kDepth>
+__global__ void __launch_bounds__(kThreads) blend_kernel(Job job, int chunk) {
+    if (is_chunk(job, chunk)) blend_tiles<kDepth>(job, chunk);
+}
+
+// `only`: the chunk is left to rest_back unless it is the only one.
+template <bool kDepth, bool kMagnitudes>
+__global__ void __launch_bounds__(kThreads) blend_back_kernel(Job job, int chunk, bool only) {
+    if (is_chunk(job, chunk) && !(only && job.at.header->facts.chunks > 1))
+        blend_tiles_back<kDepth, kMagnitudes>(job, chunk);
+}
+
+template <bool kDepth>
+__global__ void __launch_bounds__(kThreads) sum_kernel(Job job, int chunk, bool only) {
+    if (is_chunk(job, chunk) && !(only && job.at.header->facts.chunks > 1)) sum_slots<kDepth>(job, chunk);
+}
+
+// All of a chunk's lists, by one block.
+__device__ inline void bin_chunk(const Job& job, int chunk) {
+    count_pairs(job, chunk);
+    __syncthreads();
+    scan_pairs(job);
+    __syncthreads();
+    emit_pairs(job, chunk);
+    for (int pass = 0; pass < kTilePasses; ++pass) {
+        __syncthreads();
+        count_digits(tile_pass(job, pass));
+        __syncthreads();
+        scan_digits(tile_pass(job, pass));
+        __syncthreads();
+        scatter_digits(tile_pass(job, pass));
+    }
+    __syncthreads();
+}
+
+// What nobody foresaw, by one block.
+template <bool kDepth>
+__global__ void __launch_bounds__(kThreads) rest_kernel(Job job, int first) {
+    for (int chunk = first; is_chunk(job, chunk); ++chunk) {
+        bin_chunk(job, chunk);
+        blend_tiles<kDepth>(job, chunk);
+        __syncthreads();
+    }
+}
+
+template <bool kDepth, bool kMagnitudes>
+__global__ void __launch_bounds__(kThreads) rest_back_kernel(Job job, int first) {
+    if (job.at.header->facts.chunks == 1) return;
+    for (int chunk = first; is_chunk(job, chunk); ++chunk) {
+        bin_chunk(job, chunk);
+        blend_tiles_back<kDepth, kMagnitudes>(job, chunk);
+        __syncthreads();
+        sum_slots<kDepth>(job, chunk);
+        __syncthreads();
+    }
+}
+
+bool is_size(const SplatShot* shot, int64_t count, int64_t capacity, View* view) {
+    return shot && !find_view(*shot, view) && count >= 0 && capacity >= count && capacity <= kMaxPairs;
+}
+
+int slot_floats_of(const SplatShot& shot) { return shot.depths ? kDepthSlotFloats : kSlotFloats; }
+
+bool is_aligned(const void* memory) { return memory && reinterpret_cast<uintptr_t>(memory) % 256 == 0; }
+
+// Rounds of the whole device. A chunk has kChunkTiles tiles at most: as many rounds as that takes are always foreseen.
+int passes_of(const Job& job, const SplatFrame& frame) {
+    const int least = static_cast<int>(divide_up(job.tiles, kChunkTiles));
+    return frame.passes > least ? frame.passes : least;
+}
+
+void launch_sort_by_depth(const Job& job, SplatStream stream) {
+    const int64_t blocks = blocks_for(sort_blocks(job.model.count));
+    for (int pass = 0; pass < kDepthPasses; ++pass) {
+        SPLAT_LAUNCH(count_depths, blocks, stream, job, pass);
+        SPLAT_LAUNCH(scan_depths, kDigits, stream, job, pass);
+        SPLAT_LAUNCH(scatter_depths, blocks, stream, job, pass);
+    }
+}
+
+void launch_bin(const Job& job, const Turn& turn, SplatStream stream) {
+    const int64_t ranks = blocks_for(divide_up(job.model.count, kScanBlock));
+    const int64_t blocks = blocks_for(sort_blocks(job.capacity));
+    SPLAT_LAUNCH(count_pairs_kernel, ranks, stream, job, turn);
+    SPLAT_LAUNCH(scan_pairs_kernel, 1, stream, job, turn);
+    SPLAT_LAUNCH(emit_pairs_kernel, ranks, stream, job, turn);
+    for (int pass = 0; pass < kTilePasses; ++pass) {
+        SPLAT_LAUNCH(count_tiles, blocks, stream, job, turn, pass);
+        SPLAT_LAUNCH(scan_tiles, kDigits, stream, job, turn, pass);
+        SPLAT_LAUNCH(scatter_tiles, blocks, stream, job, turn, pass);
+    }
+}
+
+// A block a tile, as many as a chunk can have.
+int64_t tile_blocks(const Job& job) { return job.tiles < kChunkTiles ? job.tiles : kChunkTiles; }
+
+template <bool kDepth>
+void launch_chunks(const Job& job, int passes, SplatStream stream) {
+    for (int chunk = 0; chunk < passes; ++chunk) {
+        launch_bin(job, {chunk, false}, stream);
+        SPLAT_LAUNCH(blend_kernel<kDepth>, tile_blocks(job), stream, job, chunk);
+    }
+    SPLAT_LAUNCH(rest_kernel<kDepth>, 1, stream, job, passes);
+}
+
+// Where one chunk is foreseen, nothing bins it again: if there were more after all, they are the rest.
+template <bool kDepth, bool kMagnitudes>
+void launch_chunks_back(const Job& job, int passes, SplatStream stream) {
+    const bool only = passes == 1;
+    const int64_t ranks = blocks_for(divide_up(job.model.count, kThreads));
+    for (int chunk = 0; chunk < passes; ++chunk) {
+        if (!only) launch_bin(job, {chunk, true}, stream);
+        SPLAT_LAUNCH((blend_back_kernel<kDepth, kMagnitudes>), tile_blocks(job), stream, job, chunk, only);
+        SPLAT_LAUNCH(sum_kernel<kDepth>, ranks, stream, job, chunk, only);
+    }
+    SPLAT_LAUNCH((rest_back_kernel<kDepth, kMagnitudes>), 1, stream, job, only ? 0 : passes);
+}
+
+bool has_pictures(const SplatShot& shot, const SplatPictures& to) {
+    const bool all = to.depth_sum && to.depth_square_sum && to.median_depth;
+    const bool none = !to.depth_sum && !to.depth_square_sum && !to.median_depth;
+    return to.colour && to.alpha && (shot.depths ? all : none);
+}
+
+}  // namespace
+
+int64_t lay_out(void* memory, int64_t count, int64_t tiles, int64_t capacity, FrameMemory* at) {
+    Carver carver(memory);
+    const int64_t blocks = sort_blocks(count > capacity ? count : capacity);
+    at->header = carver.take<Header>(1);
+    at->records = carver.take<Record>(count);
+    at->rows = carver.take<uint32_t>(count);
+    for (int i = 0; i < 2; ++i) at->keys[i] = carver.take<uint32_t>(count);
+    for (int i = 0; i < 2; ++i) at->order[i] = carver.take<int32_t>(count);
+    at->offsets = at->keys[1];
+    at->block_sums = carver.take<uint32_t>(divide_up(count, kScanBlock) + 1);
+    at->digit_table = carver.take<uint32_t>(kDigits * blocks);
+    at->digit_sums = carver.take<uint32_t>(kDigits);
+    at->tile_counts = carver.take<int32_t>(tiles + 1);
+    at->tile_begin = carver.take<int64_t>(tiles + 1);
+    at->chunk_begin = carver.take<int32_t>(tiles + 1);
+    at->transmittance = carver.take<float>(tiles * kTilePixels);
+    at->pixel_end = carver.take<int32_t>(tiles * kTilePixels);
+    for (int i = 0; i < 2; ++i) at->pair_keys[i] = carver.take<uint16_t>(capacity);
+    for (int i = 0; i < 2; ++i) at->pair_values[i] = carver.take<uint32_t>(capacity);
+    at->owners = carver.take<uint32_t>(capacity);
+    return carver.bytes();
+}
+
+int64_t lay_out(void* memory, int64_t count, int64_t capacity, int slot_floats, BackMemory* at) {
+    Carver carver(memory);
+    at->slots = carver.take<float>(capacity * slot_floats);
+    at->sums = carver.take<float>(count * slot_floats);
+    return carver.bytes();
+}
+
+int32_t prepare(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame, bool back, Job* job) {
+    *job = Job{};
+    if (!model || !frame || !is_size(shot, frame->count, frame->capacity, &job->view)) return SPLAT_BAD_ARGUMENT;
+    const bool has_rows = model->means && model->log_scales && model->quats && model->opacity_logits && model->sh;
+    if (frame->passes < 1 || (frame->count && !has_rows) || !is_aligned(frame->memory)) return SPLAT_BAD_ARGUMENT;
+    job->model = {frame->count, model->means, model->log_scales, model->quats, model->opacity_logits, model->sh};
+    job->capacity = frame->capacity;
+    job->tiles = job->view.tiles_x * job->view.tiles_y;
+    job->slot_floats = slot_floats_of(*shot);
+    job->magnitudes = shot->magnitudes;
+    if (lay_out(frame->memory, frame->count, job->tiles, frame->capacity, &job->at) > frame->bytes)
+        return SPLAT_TOO_LITTLE;
+    if (!back) return SPLAT_OK;
+    const int64_t bytes = lay_out(frame->back, frame->count, frame->capacity, job->slot_floats, &job->back);
+    if (bytes > frame->back_bytes) return SPLAT_TOO_LITTLE;
+    return bytes == 0 || is_aligned(frame->back) ? SPLAT_OK : SPLAT_BAD_ARGUMENT;
+}
+
+int64_t blocks_for(int64_t work) {
+    int device = 0, multiprocessors = 1;
+    cudaGetDevice(&device);
+    cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, device);
+    const int64_t most = multiprocessors * kTurns, wanted = work < 1 ? 1 : work;
+    return wanted < most ? wanted : most;
+}
+
+}  // namespace cuda
+}  // namespace splat
+
+using namespace splat::cuda;
+
+int64_t splat_frame_bytes(const SplatShot* shot, int64_t count, int64_t capacity) {
+    splat::View view;
+    FrameMemory at;
+    if (!is_size(shot, count, capacity, &view)) return SPLAT_BAD_ARGUMENT;
+    return lay_out(nullptr, count, int64_t{view.tiles_x} * view.tiles_y, capacity, &at);
+}
+
+int64_t splat_back_bytes(const SplatShot* shot, int64_t count, int64_t capacity) {
+    splat::View view;
+    BackMemory at;
+    if (!is_size(shot, count, capacity, &view)) return SPLAT_BAD_ARGUMENT;
+    return lay_out(nullptr, count, capacity, slot_floats_of(*shot), &at);
+}
+
+int32_t splat_forward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
+                      const SplatPictures* pictures, float* radii, uint8_t* visible, SplatStream stream) {
+    Job job;
+    const int32_t code = prepare(shot, model, frame, false, &job);
+    if (code) return code;
+    if (!pictures || !has_pictures(*shot, *pictures) || (frame->count && !(radii && visible)))
+        return SPLAT_BAD_ARGUMENT;
+    job.pictures = {pictures->colour, pictures->alpha, pictures->depth_sum, pictures->depth_square_sum,
+                    pictures->median_depth};
+    job.radii = radii, job.visible = visible;
+    const auto cuda_stream = static_cast<cudaStream_t>(stream);
+    cudaMemsetAsync(job.at.header, 0, sizeof(Header), cuda_stream);
+    cudaMemsetAsync(job.at.tile_counts, 0, (job.tiles + size_t{1}) * sizeof(int32_t), cuda_stream);
+    if (frame->count) {
+        SPLAT_LAUNCH(project_kernel, divide_up(frame->count, kThreads), stream, job);
+        launch_sort_by_depth(job, stream);
+    }
+    SPLAT_LAUNCH(plan_kernel, 1, stream, job);
+    const int passes = passes_of(job, *frame);
+    if (shot->depths)
+        launch_chunks<true>(job, passes, stream);
+    else
+        launch_chunks<false>(job, passes, stream);
+    return cudaGetLastError();
+}
+
+int32_t splat_blend_backward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
+                             const SplatPictureGradients* gradients, SplatStream stream) {
+    Job job;
+    const int32_t code = prepare(shot, model, frame, true, &job);
+    if (code) return code;
+    if (!gradients || (!shot->depths && (gradients->depth_sum || gradients->depth_square_sum)))
+        return SPLAT_BAD_ARGUMENT;
+    job.gradients = {gradients->colour, gradients->alpha, gradients->depth_sum, gradients->depth_square_sum};
+    if (frame->count == 0) return SPLAT_OK;
+    const auto bytes = static_cast<size_t>(frame->count) * job.slot_floats * sizeof(float);
+    cudaMemsetAsync(job.back.sums, 0, bytes, static_cast<cudaStream_t>(stream));
+    const int passes = passes_of(job, *frame);
+    if (shot->depths && shot->magnitudes)
+        launch_chunks_back<true, true>(job, passes, stream);
+    else if (shot->depths)
+        launch_chunks_back<true, false>(job, passes, stream);
+    else if (shot->magnitudes)
+        launch_chunks_back<false, true>(job, passes, stream);
+    else
+        launch_chunks_back<false, false>(job, passes, stream);
+    return cudaGetLastError();
+}

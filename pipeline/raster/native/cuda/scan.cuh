@@ -1,0 +1,67 @@
+// Prefix sums: of a warp, of a block, and of an array by one block.
+#pragma once
+
+#include "device.h"
+
+namespace splat {
+namespace cuda {
+
+constexpr int kScanItems = 8;  // a thread's, of an array: few turns, each of which waits for memory
+
+__device__ inline int lane_index() { return static_cast<int>(threadIdx.x) % kWarp; }
+__device__ inline int warp_index() { return static_cast<int>(threadIdx.x) / kWarp; }
+
+// The sum of the lanes up to this one, itself included.
+template <class T>
+__device__ inline T warp_inclusive(T value) {
+    for (int step = 1; step < kWarp; step *= 2) {
+        const T before = __shfl_up_sync(kWholeWarp, value, step);
+        if (lane_index() >= step) value += before;
+    }
+    return value;
+}
+
+template <class T>
+struct ScanShared {
+    T warps[kWarps];
+};
+
+// The sum of the block's threads before this one; in `total`, of all.
+template <class T>
+__device__ inline T block_exclusive(T value, ScanShared<T>* shared, T* total) {
+    const T inclusive = warp_inclusive(value);
+    if (lane_index() == kWarp - 1) shared->warps[warp_index()] = inclusive;
+    __syncthreads();
+    T before = 0, sum = 0;
+    for (int warp = 0; warp < kWarps; ++warp) {
+        if (warp == warp_index()) before = sum;
+        sum += shared->warps[warp];
+    }
+    __syncthreads();  // before `shared` is used again
+    *total = sum;
+    return before + inclusive - value;
+}
+
+// By one block: each value becomes the sum of those before it. Returns the sum of all.
+template <class T>
+__device__ inline T scan_array(T* values, int64_t count, ScanShared<T>* shared) {
+    T carry = 0;
+    for (int64_t first = 0; first < count; first += kThreads * kScanItems) {
+        const int64_t begin = first + static_cast<int64_t>(threadIdx.x) * kScanItems;
+        T items[kScanItems], sum = 0, total;
+        for (int i = 0; i < kScanItems; ++i) {
+            items[i] = begin + i < count ? values[begin + i] : T{0};
+            sum += items[i];
+        }
+        T at = carry + block_exclusive(sum, shared, &total);
+        for (int i = 0; i < kScanItems; ++i) {
+            if (begin + i < count) values[begin + i] = at;
+            at += items[i];
+        }
+        carry += total;
+    }
+    return carry;
+}
+
+}  // namespace cuda
+}  // namespace splat

@@ -1,0 +1,198 @@
+// A pass of a stable radix sort, in three phases: count each block's digits, sum them up over the blocks, scatter.
+//
+// The order of equal digits is that of the keys: a virtual block has kSortBlock keys in a row, a warp of it a row of
+// these, and a warp takes kWarp at a time.
+#pragma once
+
+#include "frame.h"
+#include "scan.cuh"
+
+namespace splat {
+namespace cuda {
+
+static_assert(kDigits == kThreads, "a thread a digit");
+
+template <class Key, class Value>
+struct SortPass {
+    const Key* keys_from;  // kCulled ones are left out
+    Key* keys_to;
+    const Value* values_from;  // null: a key's value is its place
+    Value* values_to;
+    int64_t count;
+    int shift;             // of the digit
+    uint32_t* table;       // (kDigits, blocks)
+    uint32_t* digit_sums;  // (kDigits)
+    int32_t* kept;         // how many keys were not left out, null where nobody asks
+};
+
+__host__ __device__ inline int64_t sort_blocks(int64_t count) { return (count + kSortBlock - 1) / kSortBlock; }
+
+template <class Key>
+__device__ inline bool is_kept(Key key) {
+    return static_cast<uint32_t>(key) != kCulled;
+}
+
+template <class Key>
+__device__ inline uint32_t digit_of(Key key, int shift) {
+    return static_cast<uint32_t>(key) >> shift & (kDigits - 1);
+}
+
+struct DigitCounts {
+    uint32_t of[kDigits];
+};
+
+template <class Key, class Value>
+__device__ void count_digits(const SortPass<Key, Value>& pass) {
+    SPLAT_SHARED(DigitCounts, counts);
+    const int64_t blocks = sort_blocks(pass.count);
+    for (int64_t block = blockIdx.x; block < blocks; block += gridDim.x) {
+        counts.of[threadIdx.x] = 0;
+        __syncthreads();
+        for (int i = 0; i < kSortItems; ++i) {
+            const int64_t at = block * kSortBlock + i * kThreads + threadIdx.x;
+            if (at >= pass.count) break;
+            const Key key = pass.keys_from[at];
+            if (is_kept(key)) atomicAdd(&counts.of[digit_of(key, pass.shift)], 1u);
+        }
+        __syncthreads();
+        pass.table[threadIdx.x * blocks + block] = counts.of[threadIdx.x];
+    }
+}
+
+// A digit's counts become the places of each block's first one among those of the digit.
+template <class Key, class Value>
+__device__ void scan_digits(const SortPass<Key, Value>& pass) {
+    SPLAT_SHARED(ScanShared<uint32_t>, shared);
+    const int64_t blocks = sort_blocks(pass.count);
+    for (int64_t digit = blockIdx.x; digit < kDigits; digit += gridDim.x) {
+        const uint32_t sum = scan_array(pass.table + digit * blocks, blocks, &shared);
+        if (threadIdx.x == 0) pass.digit_sums[digit] = sum;
+    }
+}
+
+// Lanes with the same digit as this one, of those that have any.
+__device__ inline unsigned lanes_alike(uint32_t digit, bool has) {
+    unsigned alike = __ballot_sync(kWholeWarp, has);
+    for (int bit = 0; bit < kDigitBits; ++bit) {
+        const bool set = digit >> bit & 1;
+        const unsigned with = __ballot_sync(kWholeWarp, set);
+        alike &= set ? with : ~with;
+    }
+    return alike;
+}
+
+struct ScatterShared {
+    uint16_t warps[kWarps][kDigits];  // a warp's digits counted; then the place in the block of the first of them
+    uint32_t shift[kDigits];          // from a place in the block, sorted by this digit, to one among all
+    uint32_t staged[kSortBlock];      // the block in order, so that neighbours are written together
+    ScanShared<uint32_t> scan;
+};
+static_assert(kSortBlock < 1 << 16, "places in the block are 16 bits");
+
+// A thread's keys of a block: `place` in the block in the order of the pass, where `kept` has the item's bit.
+template <class Key>
+struct SortItems {
+    Key keys[kSortItems];
+    uint32_t place[kSortItems];
+    uint32_t kept;
+};
+static_assert(kSortItems <= 32, "bits of `kept`");
+
+// Where a thread's first item is; the next ones follow in steps of kWarp.
+__device__ inline int64_t first_item(int64_t block) {
+    return block * kSortBlock + warp_index() * kSortItems * kWarp + lane_index();
+}
+
+// Places among the warp's keys of the same digit; the warp's digits are counted.
+template <class Key, class Value>
+__device__ inline void rank_items(const SortPass<Key, Value>& pass, int64_t block, uint16_t* counts,
+                                  SortItems<Key>* items) {
+    const unsigned before_me = (1u << lane_index()) - 1;
+    const int64_t first = first_item(block);
+    const Key* keys = pass.keys_from + first;
+    const int left = static_cast<int>(pass.count - first < kSortBlock ? pass.count - first : kSortBlock);
+    items->kept = 0;
+    SPLAT_UNROLL
+    for (int i = 0; i < kSortItems; ++i) {
+        const bool there = i * kWarp < left;
+        const Key key = there ? keys[i * kWarp] : Key{0};
+        const bool kept = there && is_kept(key);
+        const uint32_t digit = digit_of(key, pass.shift);
+        const unsigned alike = lanes_alike(digit, kept), before = alike & before_me;
+        const uint32_t counted = counts[digit];
+        __syncwarp(kWholeWarp);
+        if (kept && !before) counts[digit] = static_cast<uint16_t>(counted + __popc(alike));
+        __syncwarp(kWholeWarp);
+        items->keys[i] = key;
+        items->place[i] = counted + static_cast<uint32_t>(__popc(before));
+        items->kept |= static_cast<uint32_t>(kept) << i;
+    }
+}
+
+// From counts to places: a thread a digit. Returns how many keys the block keeps.
+template <class Key, class Value>
+__device__ inline uint32_t place_digits(const SortPass<Key, Value>& pass, int64_t block, int64_t blocks,
+                                        ScatterShared* shared) {
+    const int digit = static_cast<int>(threadIdx.x);
+    uint32_t count = 0, kept, all;
+    for (int warp = 0; warp < kWarps; ++warp) count += shared->warps[warp][digit];
+    uint32_t place = block_exclusive(count, &shared->scan, &kept);
+    const uint32_t first = block_exclusive(pass.digit_sums[digit], &shared->scan, &all);
+    shared->shift[digit] = first + pass.table[digit * blocks + block] - place;  // may wrap: so will its sum
+    for (int warp = 0; warp < kWarps; ++warp) {
+        const uint32_t of_warp = shared->warps[warp][digit];
+        shared->warps[warp][digit] = static_cast<uint16_t>(place);
+        place += of_warp;
+    }
+    if (pass.kept && block == 0 && digit == 0) *pass.kept = static_cast<int32_t>(all);
+    return kept;
+}
+
+template <class Key, class Value>
+__device__ void scatter_digits(const SortPass<Key, Value>& pass) {
+    SPLAT_SHARED(ScatterShared, shared);
+    const int64_t blocks = sort_blocks(pass.count);
+    for (int64_t block = blockIdx.x; block < blocks; block += gridDim.x) {
+        for (int warp = 0; warp < kWarps; ++warp) shared.warps[warp][threadIdx.x] = 0;
+        __syncthreads();
+        uint16_t* of_warp = shared.warps[warp_index()];
+        SortItems<Key> items;
+        rank_items(pass, block, of_warp, &items);
+        __syncthreads();
+        const uint32_t kept = place_digits(pass, block, blocks, &shared);
+        __syncthreads();
+        SPLAT_UNROLL
+        for (int i = 0; i < kSortItems; ++i) {
+            if (!(items.kept >> i & 1)) continue;
+            items.place[i] += of_warp[digit_of(items.keys[i], pass.shift)];
+            shared.staged[items.place[i]] = items.keys[i];
+        }
+        __syncthreads();
+        uint32_t to[kSortItems];
+        SPLAT_UNROLL
+        for (int i = 0; i < kSortItems; ++i) {
+            const uint32_t place = i * kThreads + threadIdx.x;
+            if (place >= kept) continue;
+            const Key key = static_cast<Key>(shared.staged[place]);
+            to[i] = shared.shift[digit_of(key, pass.shift)] + place;
+            pass.keys_to[to[i]] = key;
+        }
+        __syncthreads();
+        const int64_t first = first_item(block);
+        SPLAT_UNROLL
+        for (int i = 0; i < kSortItems; ++i) {
+            if (!(items.kept >> i & 1)) continue;
+            const int64_t at = first + i * kWarp;
+            shared.staged[items.place[i]] = static_cast<uint32_t>(pass.values_from ? pass.values_from[at] : at);
+        }
+        __syncthreads();
+        SPLAT_UNROLL
+        for (int i = 0; i < kSortItems; ++i) {
+            const uint32_t place = i * kThreads + threadIdx.x;
+            if (place < kept) pass.values_to[to[i]] = static_cast<Value>(shared.staged[place]);
+        }
+    }
+}
+
+}  // namespace cuda
+}  // namespace splat
