@@ -1,0 +1,81 @@
+"""When a frame counts as equal to the definition: tolerances by quantity, and what is beyond them. Without torch."""
+
+from __future__ import annotations
+
+import numpy as np
+from frames import Case, Outcome
+
+# Largest differences of pictures, float32 against float64.
+PICTURES = {
+    "colour": 2e-5,  # sums of some hundred rounded terms of size 1
+    "alpha": 2e-5,
+    "depth_sum": 2e-4,  # the same, of depths up to ten
+    "depth_square_sum": 2e-3,  # of their squares
+    "median_depth": 2e-3,  # one depth, at a pixel up to its own size from the centre of a slanted Gaussian
+}
+RADII = 1e-4
+"""Relative and in pixels: a root of the covariance's eigenvalue."""
+GRADIENTS = 1e-4
+"""L2 over all Gaussians, relative: sums over a hundred pixels, through divisions by 1 - alpha ≥ 0.01."""
+NO_GRADIENT = 1e-6
+"""What is smaller in all is rounding."""
+FLIPPED = 4e-3
+"""Share of the pixels in which a rounding may decide whether a Gaussian at a threshold (1/255, 1e-4, a half) counts."""
+FLIP = 0.02
+"""How far off such a pixel's colour may be: a step of alpha, 1/255, of colours up to four."""
+
+
+def flipped(ours: Outcome, exact: Outcome) -> np.ndarray:
+    """(h, w) where a picture is beyond its tolerance."""
+    beyond = [
+        (np.abs(ours.pictures[name].astype(np.float64) - exact.pictures[name]) <= limit)
+        for name, limit in PICTURES.items()
+        if name in ours.pictures
+    ]
+    return ~np.logical_and.reduce([each.all(axis=2) if each.ndim == 3 else each for each in beyond])
+
+
+def without_flips(case: Case, flips: np.ndarray) -> Case:
+    """The case with nothing coming back from some pixels."""
+    upstream = {
+        name: np.where(flips[..., None] if value.ndim == 3 else flips, np.float32(0), value)
+        for name, value in case.upstream.items()
+    }
+    return case.changed(upstream=upstream)
+
+
+def picture_complaints(ours: Outcome, exact: Outcome) -> list[str]:
+    """In what way pictures, radii and visible are not those of the definition."""
+    found = []
+    flips = flipped(ours, exact)
+    if flips.sum() > max(2, FLIPPED * flips.size):
+        worst = {
+            name: float(np.nanmax(np.abs(ours.pictures[name] - exact.pictures[name])))
+            for name in PICTURES
+            if name in ours.pictures
+        }
+        found.append(f"{flips.sum()} of {flips.size} pixels differ, by up to {worst}")
+    if not (np.abs(ours.pictures["colour"] - exact.pictures["colour"]) <= FLIP).all():
+        found.append("a pixel's colour is another")
+    if (ours.pictures["visible"] != exact.pictures["visible"]).any():
+        found.append("others are visible")
+    if not np.allclose(ours.pictures["radii"], exact.pictures["radii"], rtol=RADII, atol=RADII):
+        found.append("radii differ")
+    return found
+
+
+def gradient_errors(ours: Outcome, exact: Outcome) -> dict[str, float]:
+    """By parameter, relative in L2 over all Gaussians; not a number where one is not."""
+    return {
+        name: float(
+            np.linalg.norm(ours.gradients[name].astype(np.float64) - expected)
+            / max(float(np.linalg.norm(expected)), NO_GRADIENT)
+        )
+        for name, expected in exact.gradients.items()
+    }
+
+
+def gradient_complaints(ours: Outcome, exact: Outcome, limit: float = GRADIENTS) -> list[str]:
+    """Which gradients are not those of the definition."""
+    errors = gradient_errors(ours, exact)
+    return [f"gradient of {name}: {error:.1e}" for name, error in errors.items() if not error <= limit]

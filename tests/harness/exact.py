@@ -1,0 +1,64 @@
+"""Frames by the definition in float64, and by the CPU's own kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from frames import GREY, PARAMETERS, Case, Outcome
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
+from splatpipe.pipeline.splat.gaussians import Gaussians
+
+
+def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object) -> Case:
+    """The case of a scene, with random gradients of all pictures."""
+    rng = np.random.default_rng(seed)
+    size = camera.height, camera.width
+    upstream = {"colour": rng.normal(size=(*size, 3)), **{name: rng.normal(size=size) for name in GREY}}
+    return Case(
+        {name: getattr(scene, name).detach().numpy() for name in PARAMETERS},
+        camera.cam_from_world[:3].copy(),
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        (camera.width, camera.height),
+        {name: value.astype(np.float32) for name, value in upstream.items()},
+    ).changed(**settings)
+
+
+def camera_of(case: Case) -> Camera:
+    pose = np.eye(4)
+    pose[:3] = case.pose
+    return Camera("view", *case.size, *case.intrinsics, pose)
+
+
+def options_of(case: Case) -> RenderOptions:
+    return RenderOptions(
+        case.sh_degree,
+        background=case.background,
+        antialias=case.antialias,
+        near=case.near,
+        depth=case.depths,
+        depth_origin=case.depth_origin,
+        magnitudes=case.magnitudes,
+    )
+
+
+def exact_outcome(case: Case, backend: str = "reference", gradients: bool = True) -> Outcome:
+    """What the definition gives in float64, or the CPU's kernels in float32."""
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    leaves = {name: torch.from_numpy(case.rows[name]).to(dtype).requires_grad_(gradients) for name in PARAMETERS}
+    probe = torch.zeros(case.count, 2, dtype=dtype, requires_grad=gradients)
+    scene = Gaussians(**leaves)
+    made = render(scene, camera_of(case), options_of(case), backend=backend, means2d_probe=probe)  # type: ignore[arg-type]
+    names = ("colour", *GREY, "median_depth") if case.depths else ("colour", "alpha")
+    pictures = {name: getattr(made, name).detach().numpy() for name in (*names, "radii")}
+    pictures["visible"] = made.visible.numpy().astype(np.uint8)
+    back = {}
+    if gradients and case.upstream:
+        total = torch.zeros((), dtype=dtype)
+        for name, weights in case.upstream.items():
+            if name in names:
+                total = total + (getattr(made, name) * torch.from_numpy(weights).to(dtype)).sum()
+        asked = leaves | {"means2d": probe}
+        back = dict(zip(asked, torch.autograd.grad(total, list(asked.values())), strict=True))
+    return Outcome(pictures, {name: value.numpy() for name, value in back.items()})
