@@ -2,7 +2,7 @@
 // templates.
 
 #include "adam.h"
-#include "simd.h"
+#include "adam_math.h"
 
 namespace splat::SPLAT_ISA_NAMESPACE {
 namespace {
@@ -16,33 +16,20 @@ struct Block {
     const float *gradient, *rates;
 };
 
-struct Constants {
-    Floats one_less_beta1, beta2, one_less_beta2, epsilon, inverse_root_correction;
-};
-
-SPLAT_INLINE Constants constants_of(const AdamJob& job) {
-    return {fill(1.0f - job.beta1), fill(job.beta2), fill(1.0f - job.beta2), fill(job.epsilon),
-            fill(job.inverse_root_correction)};
-}
-
 // kLanes values from j on; with lanes given, only where they are set.
-SPLAT_INLINE void step_lanes(const Block& b, int j, const Constants& c, const Mask* lanes) {
-    const Floats gradient = load(b.gradient + j), old_mean = load(b.mean + j), old_square = load(b.square + j);
-    const Floats old_values = load(b.values + j);
-    Floats mean = fma(c.one_less_beta1, gradient - old_mean, old_mean);
-    Floats square = fma(c.beta2, old_square, c.one_less_beta2 * gradient * gradient);
-    const Floats root = fma(sqrt(square), c.inverse_root_correction, c.epsilon);
-    Floats values = old_values - load(b.rates + j) * mean / root;
+SPLAT_INLINE void step_lanes(const Block& b, int j, const AdamConstants& c, const Mask* lanes) {
+    const AdamValues old = {load(b.values + j), load(b.mean + j), load(b.square + j)};
+    AdamValues next = adam_step(c, load(b.rates + j), load(b.gradient + j), old);
     if (lanes) {
-        mean = select(*lanes, mean, old_mean);
-        square = select(*lanes, square, old_square);
-        values = select(*lanes, values, old_values);
+        next.mean = select(*lanes, next.mean, old.mean);
+        next.square = select(*lanes, next.square, old.square);
+        next.value = select(*lanes, next.value, old.value);
     }
-    store(b.mean + j, mean), store(b.square + j, square), store(b.values + j, values);
+    store(b.mean + j, next.mean), store(b.square + j, next.square), store(b.values + j, next.value);
 }
 
 // The rows of a block that are set, bit by bit.
-SPLAT_INLINE void step_block(const Block& b, const AdamTensor& tensor, const Constants& c, unsigned rows) {
+SPLAT_INLINE void step_block(const Block& b, const AdamTensor& tensor, const AdamConstants& c, unsigned rows) {
     const int width = tensor.width, n = kAdamBlock * width;
     if (rows == kAllRows) {
         for (int j = 0; j < n; j += kLanes) step_lanes(b, j, c, nullptr);
@@ -97,7 +84,7 @@ unsigned stepping_rows(const AdamJob& job, std::int64_t from, int count, std::in
 }
 
 // The last block, of fewer rows: through a copy, so that nothing beyond the tensors is touched.
-void step_last(const AdamTensor& tensor, std::int64_t from, int count, const Constants& c, unsigned rows) {
+void step_last(const AdamTensor& tensor, std::int64_t from, int count, const AdamConstants& c, unsigned rows) {
     float values[kAdamBlock * kAdamWidth], mean[kAdamBlock * kAdamWidth], square[kAdamBlock * kAdamWidth];
     float gradient[kAdamBlock * kAdamWidth];
     const std::int64_t start = from * tensor.width;
@@ -119,7 +106,7 @@ void step_last(const AdamTensor& tensor, std::int64_t from, int count, const Con
 
 // Tensor by tensor, each over all the rows: four streams of memory at a time are as many as a CPU foresees well.
 std::int64_t adam_rows(const AdamJob& job, std::int64_t from, std::int64_t to) {
-    const Constants c = constants_of(job);
+    const AdamConstants c = adam_constants(job.beta1, job.beta2, job.epsilon, job.inverse_root_correction);
     std::int64_t skipped = 0;
     unsigned stepping[kAdamTaskRows / kAdamBlock];
     for (std::int64_t row = from; row < to; row += kAdamBlock) {

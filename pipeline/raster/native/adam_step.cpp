@@ -1,7 +1,6 @@
 #include "adam_step.h"
 
 #include <algorithm>
-#include <cmath>
 #include <cstddef>
 
 #include "adam.h"
@@ -32,10 +31,9 @@ std::int64_t adam_step(const std::vector<AdamRows>& tensors, std::int64_t rows, 
                        const AdamOptions& options) {
     AdamJob job{};
     AdamTables tables;
-    const double step = static_cast<double>(options.step);
-    const double step_scale = 1.0 / (1.0 - std::pow(options.beta1, step));
+    const AdamCorrections corrections = corrections_of(options.beta1, options.beta2, options.step);
     for (const AdamRows& tensor : tensors) {
-        tables.add(tensor.rates, tensor.width, step_scale);
+        tables.add(tensor.rates, tensor.width, corrections.rate);
         job.tensors[job.tensor_count++] = {tensor.values,
                                            tensor.gradient,
                                            tensor.mean,
@@ -47,7 +45,7 @@ std::int64_t adam_step(const std::vector<AdamRows>& tensors, std::int64_t rows, 
     job.rows = rows, job.visible = visible;
     job.beta1 = static_cast<float>(options.beta1), job.beta2 = static_cast<float>(options.beta2);
     job.epsilon = static_cast<float>(options.epsilon);
-    job.inverse_root_correction = static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(options.beta2, step)));
+    job.inverse_root_correction = corrections.inverse_root;
     const std::int64_t tasks = (rows + kAdamTaskRows - 1) / kAdamTaskRows;
     std::vector<std::int64_t> skipped(static_cast<std::size_t>(tasks));
     const AdamKernels& kernels = SPLAT_KERNELS(adam_kernels);

@@ -1,6 +1,7 @@
 // One Adam step over all rows: tables and threads around the kernels. Not for kernel files.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #include <vector>
 
@@ -19,6 +20,21 @@ struct AdamOptions {
     double beta1, beta2, epsilon;
     std::int64_t step;  // counts from 1
 };
+
+inline bool are_adam_options(const AdamOptions& o) {
+    return o.beta1 >= 0.0 && o.beta1 < 1.0 && o.beta2 >= 0.0 && o.beta2 < 1.0 && o.epsilon > 0.0 && o.step >= 1;
+}
+
+// For moments that began with zero.
+struct AdamCorrections {
+    double rate;         // to multiply learning rates with
+    float inverse_root;  // and the root of the second moment
+};
+
+inline AdamCorrections corrections_of(double beta1, double beta2, std::int64_t step) {
+    const double steps = static_cast<double>(step);
+    return {1.0 / (1.0 - std::pow(beta1, steps)), static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(beta2, steps)))};
+}
 
 // Steps the visible rows (null: all) of at most kAdamTensors tensors in place; a row with a gradient that is not finite
 // is left as it is. Returns how many of those there were.

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../splat_math.h"
+#include "four.cuh"
 #include "frame.h"
 
 namespace splat {
@@ -27,13 +28,6 @@ __device__ __forceinline__ Splat expand(const Record& r) {
     s.depth_u = r.depth_u, s.depth_v = r.depth_v;
     return s;
 }
-
-// Sixteen bytes in one transaction.
-struct alignas(16) Four {
-    float of[4];
-};
-
-__device__ __forceinline__ bool is_aligned(const float* p) { return (reinterpret_cast<uintptr_t>(p) & 15) == 0; }
 
 // The first floats of a row of spherical harmonics.
 template <int kFloats>
