@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -14,26 +13,9 @@ from torch.autograd.function import once_differentiable
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.splat.gaussians import Gaussians
-
-
-class GradientBuffers:
-    """Memory for a model's gradients that every backward pass writes anew.
-
-    The system hands out large memory page by page, cleared: with a million Gaussians that is a quarter of the backward
-    pass. The gradients of one pass are gone with the next one, so they must have been used by then, not added up.
-    """
-
-    def __init__(self) -> None:
-        self._buffers: tuple[Tensor, ...] = ()
-
-    def like(self, parameters: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Tensors of the parameters' shapes, not initialised; in the memory of the last ones, where those fit."""
-        if [buffer.shape for buffer in self._buffers] != [tensor.shape for tensor in parameters]:
-            self._buffers = ()
-            self._buffers = tuple(torch.empty_like(tensor) for tensor in parameters)
-        return tuple(buffer.detach() for buffer in self._buffers)
 
 
 def render_native(

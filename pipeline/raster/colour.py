@@ -8,17 +8,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.isa import _native
 
 
 def affine_colour(picture: Float[Tensor, "h w 3"], affine: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
     """Every pixel's colour c becomes A c + b, with A the map's first three columns and b its last.
 
-    Natively for float32 on the CPU, with the same bits for any number of threads; both arguments get gradients.
+    By kernels for float32 on the CPU and on CUDA devices, with the same bits every time; both arguments get gradients.
     """
-    if picture.device.type != "cpu" or picture.dtype != torch.float32 or affine.dtype != torch.float32:
+    kernels = kernels_of(picture.device)
+    fits = kernels is not None or picture.device.type == "cpu"
+    if not fits or picture.dtype != torch.float32 or affine.dtype != torch.float32:
         return picture @ affine[:, :3].T + affine[:, 3]
-    result: Tensor = _AffineColour.apply(picture, affine)  # type: ignore[no-untyped-call]
+    result: Tensor = _AffineColour.apply(kernels, picture, affine)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -26,16 +29,21 @@ class _AffineColour(torch.autograd.Function):
     """torch's own product of pixels and a 3 × 3 matrix takes longer than the picture's whole render."""
 
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, affine: Tensor) -> Tensor:
+    def forward(ctx: Any, kernels: CudaKernels | None, picture: Tensor, affine: Tensor) -> Tensor:
         picture, affine = picture.detach().contiguous(), affine.detach().contiguous()
+        ctx.kernels = kernels
+        ctx.save_for_backward(picture, affine)
+        if kernels is not None:
+            return kernels.affine_colour(affine, picture)
         out = torch.empty_like(picture)
         _native.affine_colour(affine, picture, out)
-        ctx.save_for_backward(picture, affine)
         return out
 
     @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[None, Tensor, Tensor]:
         picture, affine = ctx.saved_tensors
+        if ctx.kernels is not None:
+            return None, *ctx.kernels.affine_colour_backward(affine, picture, upstream[0].contiguous())
         gradient, by_affine = torch.empty_like(picture), torch.empty_like(affine)
         _native.affine_colour_backward(affine, picture, upstream[0].contiguous(), gradient, by_affine)
-        return gradient, by_affine
+        return None, gradient, by_affine

@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from splatpipe.pipeline.raster.cuda import AdamRows, kernels_of, pointer
+from splatpipe.pipeline.raster.cuda_api import SplatStep
+from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward, rows_of
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.splat.gaussians import PARAMETERS
 
 _MEAN = "mean."
 _SQUARE = "square."
 _STEP = "step"
 
 Rate = float | Tensor
-"""A learning rate, or a tensor of them that broadcasts to a row's shape."""
+"""A learning rate, or a tensor of them, on the CPU, that broadcasts to a row's shape."""
+Limits = Mapping[str, tuple[float, float]]
+"""The least and the most that values may be, by the parameter's name."""
 
 
 class Adam:
     """Adam (Kingma and Ba, ICLR 2015) over named tensors that share their rows, one a Gaussian.
 
-    Only the moments live here; the parameters are handed to each step, with their ``.grad``. The step count, and with
-    it the bias correction, is one for all rows: a row that joins late, or sat out, is corrected as the others are.
-    The same bits for any number of threads.
+    Only the moments live here, on the parameters' device; the parameters are handed to each step, with their ``.grad``.
+    The step count, and with it the bias correction, is one for all rows: a row that joins late, or sat out, is
+    corrected as the others are. The same bits for any number of threads, and on every run on a CUDA device.
 
     Attributes:
         step_count: Steps taken.
@@ -52,11 +60,17 @@ class Adam:
         if not all(0.0 <= beta < 1.0 for beta in betas) or not epsilon > 0.0:
             raise ValueError(f"Adam cannot work with betas {betas} and epsilon {epsilon}")
         self.betas, self.epsilon, self.step_count = betas, epsilon, 0
-        self.mean = {name: _zeros(tensor.shape) for name, tensor in parameters.items()}
-        self.square = {name: _zeros(tensor.shape) for name, tensor in parameters.items()}
+        self.mean = {name: _zeros(tensor.shape, tensor.device) for name, tensor in parameters.items()}
+        self.square = {name: _zeros(tensor.shape, tensor.device) for name, tensor in parameters.items()}
+        self._skipped = torch.zeros((), dtype=torch.int64, device=self.device)
 
     def __len__(self) -> int:
         return next((tensor.shape[0] for tensor in self.mean.values()), 0)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the moments are."""
+        return next((tensor.device for tensor in self.mean.values()), torch.device("cpu"))
 
     @torch.no_grad()
     def step(
@@ -64,46 +78,113 @@ class Adam:
         parameters: Mapping[str, Tensor],
         rates: Mapping[str, Rate],
         visible: Bool[Tensor, " n"] | None = None,
-    ) -> int:
+        buffers: GradientBuffers | None = None,
+        limits: Limits | None = None,
+    ) -> None:
         """Step the parameters in place against their ``.grad``; those without one are left alone.
 
-        A row with a gradient that is not finite in any parameter is left as it is, moments included.
+        A row with a gradient that is not finite in any parameter is left as it is, moments included, and counted: see
+        ``take_skipped``. Where the backward pass left its end to the optimiser, that is done now, at once with the step
+        if nothing else gave the parameters gradients; the probe of the render then gets its gradient.
 
         Args:
-            parameters: The tensors by the names given at the start: float32, on the CPU, contiguous.
+            parameters: The tensors by the names given at the start: float32, contiguous, on the moments' device.
             rates: Learning rate of each; for ``sh`` see ``sh_rates``.
             visible: Rows that take part; the others keep their moments too. None: all.
-
-        Returns:
-            How many visible rows were left out for their gradients.
+            buffers: Those of the render that is learned from.
+            limits: Values are clamped to these after the step, those of rows that take no part, too (but on CUDA,
+                where they have been before).
 
         Raises:
             ValueError: if a tensor is not what the moments belong to, or cannot be stepped in place.
         """
         if parameters.keys() != self.mean.keys() or rates.keys() != self.mean.keys():
             raise ValueError(f"parameters and rates are not those of {sorted(self.mean)}")
-        names = [name for name, tensor in parameters.items() if tensor.grad is not None]
-        values = [parameters[name].detach() for name in names]
-        for name, tensor in zip(names, values, strict=True):
-            if tensor.shape != self.mean[name].shape:
-                raise ValueError(f"{name} is {tuple(tensor.shape)}, its moments {tuple(self.mean[name].shape)}")
-            if tensor.dtype != torch.float32 or tensor.device.type != "cpu" or not tensor.is_contiguous():
-                raise ValueError(f"{name} is not a contiguous float32 tensor on the CPU")
-        if visible is not None and (visible.shape != (len(self),) or visible.dtype != torch.bool):
-            raise ValueError(
-                f"visible is {tuple(visible.shape)} of {visible.dtype}, not a bool for each of {len(self)}"
-            )
+        unfinished = None if buffers is None else buffers.take_unfinished()
+        self._check(parameters, visible, [*self.mean] if unfinished else _with_gradients(parameters))
         self.step_count += 1
-        skipped: int = _native.adam_step(
-            values,
+        if unfinished is not None and _is_fused(rates, limits) and unfinished.can_step(parameters, visible):
+            self._step_fused(parameters, rates, unfinished, visible is not None, limits)
+            return
+        if unfinished is not None:
+            unfinished.finish(parameters)
+        self._step_rows(parameters, rates, visible)
+        for name, (least, most) in (limits or {}).items():
+            parameters[name].detach().clamp_(least, most)
+
+    def take_skipped(self) -> int:
+        """How many visible rows were left out for their gradients since this was last asked; waits for the device."""
+        skipped = int(self._skipped)
+        self._skipped.zero_()
+        return skipped
+
+    def _step_rows(
+        self, parameters: Mapping[str, Tensor], rates: Mapping[str, Rate], visible: Bool[Tensor, " n"] | None
+    ) -> None:
+        """Step the parameters that have a gradient."""
+        names = _with_gradients(parameters)
+        rows = AdamRows(
+            [parameters[name].detach() for name in names],
             [_gradient(parameters[name]) for name in names],
             [self.mean[name] for name in names],
             [self.square[name] for name in names],
             [_columns(rates[name], parameters[name]) for name in names],
             None if visible is None else visible.contiguous().view(torch.uint8),
-            (*self.betas, self.epsilon, self.step_count),
         )
-        return skipped
+        options = (*self.betas, self.epsilon, self.step_count)
+        kernels = kernels_of(self.device)
+        if kernels is not None:
+            kernels.adam(rows, options, self._skipped)
+        else:
+            moments = (rows.means, rows.squares)
+            self._skipped += _native.adam_step(rows.values, rows.gradients, *moments, rows.rates, rows.visible, options)
+
+    def _step_fused(
+        self,
+        parameters: Mapping[str, Tensor],
+        rates: Mapping[str, Rate],
+        unfinished: UnfinishedBackward,
+        sparse: bool,
+        limits: Limits | None,
+    ) -> None:
+        """Finish a backward pass and step at once."""
+        low, high = (limits or {}).get("log_scales", (-math.inf, math.inf))
+        sh = torch.as_tensor(rates["sh"], dtype=torch.float32).reshape(-1)
+        step = SplatStep(
+            values=rows_of([parameters[name].detach() for name in PARAMETERS]),
+            means=rows_of([self.mean[name] for name in PARAMETERS]),
+            squares=rows_of([self.square[name] for name in PARAMETERS]),
+            rate_sh_rest=float(sh[-1]),
+            epsilon=self.epsilon,
+            step=self.step_count,
+            sparse=sparse,
+            log_scale_min=low,
+            log_scale_max=high,
+            skipped=pointer(self._skipped),
+        )
+        step.beta1, step.beta2 = self.betas
+        step.rates = (*(float(rates[name]) for name in PARAMETERS if name != "sh"), float(sh[0]))
+        unfinished.step(step, parameters["opacity_logits"])
+
+    def _check(
+        self, parameters: Mapping[str, Tensor], visible: Bool[Tensor, " n"] | None, stepped: Iterable[str]
+    ) -> None:
+        """Refuse what cannot be stepped.
+
+        Raises:
+            ValueError: as of ``step``.
+        """
+        taken = self.device.type == "cpu" or kernels_of(self.device) is not None
+        for name in stepped:
+            tensor = parameters[name]
+            if tensor.shape != self.mean[name].shape:
+                raise ValueError(f"{name} is {tuple(tensor.shape)}, its moments {tuple(self.mean[name].shape)}")
+            if tensor.dtype != torch.float32 or tensor.device != self.device or not tensor.is_contiguous() or not taken:
+                raise ValueError(f"{name} is not a contiguous float32 tensor that kernels on {self.device} step")
+        if visible is not None and (visible.shape != (len(self),) or visible.dtype != torch.bool):
+            raise ValueError(
+                f"visible is {tuple(visible.shape)} of {visible.dtype}, not a bool for each of {len(self)}"
+            )
 
     def select(self, index: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> None:
         """Keep the rows of an index or a mask, in its order."""
@@ -111,7 +192,7 @@ class Adam:
 
     def append(self, count: int) -> None:
         """Add rows of zero moments."""
-        self._each(lambda tensor: torch.cat([tensor, _zeros((count, *tensor.shape[1:]))]))
+        self._each(lambda tensor: torch.cat([tensor, _zeros((count, *tensor.shape[1:]), tensor.device)]))
 
     def zero_state(
         self, rows: Int[Tensor, " m"] | Bool[Tensor, " n"] | None = None, names: Iterable[str] | None = None
@@ -144,7 +225,7 @@ class Adam:
             for name, tensor in moments.items():
                 if tensor.shape[1:] != self.mean[name].shape[1:] or tensor.dtype != torch.float32:
                     raise ValueError(f"the state has no moments of {name} in its shape")
-            loaded.append({name: tensor.clone() for name, tensor in moments.items()})
+            loaded.append({name: tensor.to(self.device, copy=True) for name, tensor in moments.items()})
         if len({tensor.shape[0] for part in loaded for tensor in part.values()}) > 1 or _STEP not in state:
             raise ValueError("the state's moments differ in their number of rows, or its step is missing")
         self.mean, self.square = loaded
@@ -168,8 +249,19 @@ def sh_rates(coefficients: int, constant: float, higher: float) -> Float[Tensor,
     return rates
 
 
-def _zeros(shape: Iterable[int]) -> Tensor:
-    return torch.zeros(tuple(shape), dtype=torch.float32)
+def _zeros(shape: Iterable[int], device: torch.device) -> Tensor:
+    return torch.zeros(tuple(shape), dtype=torch.float32, device=device)
+
+
+def _with_gradients(parameters: Mapping[str, Tensor]) -> list[str]:
+    return [name for name, tensor in parameters.items() if tensor.grad is not None]
+
+
+def _is_fused(rates: Mapping[str, Rate], limits: Limits | None) -> bool:
+    """Whether the step that is fused with the backward pass knows these: a rate each, two of sh, limits of scales."""
+    plain = all(not isinstance(rate, Tensor) or rate.numel() == 1 for name, rate in rates.items() if name != "sh")
+    sh = torch.as_tensor(rates.get("sh", 0.0)).reshape(-1)
+    return plain and bool((sh[1:] == sh[-1]).all()) and (limits or {}).keys() <= {"log_scales"}
 
 
 def _gradient(parameter: Tensor) -> Tensor:

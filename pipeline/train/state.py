@@ -102,7 +102,8 @@ class TrainState:
         }
         tensors = self.gaussians.tensors()
         rows = gradient_rows if given.sparse else None
-        self.history.skipped_gradients += self.adam.step(tensors, rates, rows)
+        self.adam.step(tensors, rates, rows)
+        self.history.skipped_gradients += self.adam.take_skipped()
         for tensor in tensors.values():
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))

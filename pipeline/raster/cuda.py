@@ -1,0 +1,248 @@
+"""The CUDA kernels with torch's memory and torch's stream; which tensors they take."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatShot
+from splatpipe.pipeline.raster.cuda_forecast import Forecast
+from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, load, why_not
+
+ALIGNMENT = 256  # of the memory that kernels are given
+
+
+class CudaKernels:
+    """The library on a device. Nothing waits for the device, and everything is in order on torch's current stream.
+
+    Args:
+        library: The loaded one.
+        device: Where the tensors are, the current CUDA device; the CPU for a library that runs there, in tests.
+
+    Attributes:
+        device: As given.
+        forecast: Of the room that frames need.
+        facts: The device, as the library sees it.
+    """
+
+    def __init__(self, library: CudaLibrary, device: torch.device) -> None:
+        self._library = library
+        self.device = device
+        self.forecast = Forecast()
+        code, self.facts = library.device(device.index or 0)
+        if code:
+            raise MachineError(f"The CUDA kernels cannot use {self.facts.name or device}: {library.error(code)}.")
+
+    def stream(self) -> int | None:
+        """Torch's current stream, as a pointer."""
+        if self.device.type != "cuda":
+            return None
+        return int(torch.cuda.current_stream(self.device).cuda_stream) or None
+
+    def empty(self, size_bytes: int) -> Tensor:
+        """Memory of torch's, not initialised, aligned as kernels want it.
+
+        Raises:
+            torch.OutOfMemoryError: if the device has no more.
+        """
+        memory = torch.empty(size_bytes + ALIGNMENT, dtype=torch.uint8, device=self.device)
+        return memory[-memory.data_ptr() % ALIGNMENT :]
+
+    def call(self, name: str, *arguments: object) -> None:
+        """A function of ``cuda_api.CALLS`` on the current stream, the last argument; errors as of ``CudaLibrary``."""
+        self._library.call(name, *arguments, self.stream())
+
+    def frame_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+        """Memory of a frame from its render on."""
+        return self._library.size("splat_frame_bytes", ctypes.byref(shot), count, capacity)
+
+    def back_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+        """Memory of its backward pass, besides."""
+        return self._library.size("splat_back_bytes", ctypes.byref(shot), count, capacity)
+
+    def photo_loss(
+        self, render: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], mask: Tensor | None, ssim_weight: float
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
+        """The loss, as a float32 on the device, and its gradient by the render.
+
+        Args:
+            render: Contiguous float32, like the photo.
+            photo: What it is compared with.
+            mask: (h, w) uint8, zero where a pixel does not count; None: all do.
+            ssim_weight: Share of 1 - SSIM.
+        """
+        height, width = render.shape[:2]
+        gradient = torch.empty_like(render)
+        value = torch.empty((), dtype=torch.float64, device=self.device)
+        size = self._library.size("splat_loss_bytes", width, height)
+        memory = self.empty(size)
+        pictures = (pointer(render), pointer(photo), pointer(mask), width, height, ssim_weight)
+        self.call("splat_photo_loss", *pictures, pointer(gradient), pointer(value), pointer(memory), size)
+        return value.to(torch.float32), gradient
+
+    def affine_colour(self, affine: Float[Tensor, "3 4"], picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        """The picture's colours through the map; both contiguous float32."""
+        out = torch.empty_like(picture)
+        pixels = picture.numel() // 3
+        self.call("splat_affine_colour", pointer(affine), pointer(picture), pixels, pointer(out))
+        return out
+
+    def affine_colour_backward(
+        self, affine: Float[Tensor, "3 4"], picture: Float[Tensor, "h w 3"], upstream: Float[Tensor, "h w 3"]
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "3 4"]]:
+        """Gradients by the picture and by the map; all contiguous float32."""
+        gradient, by_affine = torch.empty_like(picture), torch.empty_like(affine)
+        pixels = picture.numel() // 3
+        size = self._library.size("splat_affine_bytes", pixels)
+        memory = self.empty(size)
+        inputs = (pointer(affine), pointer(picture), pointer(upstream), pixels)
+        outputs = (pointer(gradient), pointer(by_affine), pointer(memory), size)
+        self.call("splat_affine_colour_backward", *inputs, *outputs)
+        return gradient, by_affine
+
+    def adam(self, rows: AdamRows, options: tuple[float, float, float, int], skipped: Int64[Tensor, ""]) -> None:
+        """One step in place over rows of float32 tensors.
+
+        Args:
+            rows: What is stepped.
+            options: Beta 1, beta 2, epsilon and the step, counted from 1.
+            skipped: Added to: visible rows that were left out for their gradients.
+
+        Raises:
+            ValueError: for more tensors than one call takes.
+        """
+        if len(rows.values) > ADAM_TENSORS:
+            raise ValueError(f"{len(rows.values)} tensors of the same rows, more than {ADAM_TENSORS}")
+        widths = [rate.numel() for rate in rows.rates]
+        ends = [sum(widths[: number + 1]) for number in range(len(widths))]
+        rates = torch.cat([rate.to("cpu") for rate in rows.rates]) if widths else torch.empty(0)
+        rates = upload(rates, self.device)  # one copy, not one a tensor
+        given = SplatAdam(tensors=len(widths), rows=len(rows.values[0]) if widths else 0)
+        for number, end in enumerate(ends):
+            given.widths[number] = widths[number]
+            given.values[number] = pointer(rows.values[number])
+            given.gradients[number] = pointer(rows.gradients[number])
+            given.means[number] = pointer(rows.means[number])
+            given.squares[number] = pointer(rows.squares[number])
+            given.rates[number] = pointer(rates[end - widths[number] :])
+        given.visible, given.skipped = pointer(rows.visible), pointer(skipped)
+        given.beta1, given.beta2, given.epsilon, given.step = options
+        self.call("splat_adam", ctypes.byref(given))
+
+    def uniform(self, seed: int, step: int, stream: int, count: int) -> Float64[Tensor, " n"]:
+        """``train.draws.uniform`` of the indices 0 to count - 1."""
+        out = torch.empty(count, dtype=torch.float64, device=self.device)
+        self.call("splat_uniform", *_words(seed, step, stream), count, pointer(out))
+        return out
+
+    def split_offsets(
+        self,
+        draw: tuple[int, int, int],
+        rows: Int64[Tensor, " k"],
+        log_scales: Float[Tensor, "k 3"],
+        quats: Float[Tensor, "k 4"],
+    ) -> Float[Tensor, "2k 3"]:
+        """Two places within each parent, relative to its mean: the first of all, then the second of all.
+
+        Args:
+            draw: Seed, step and stream, as of ``train.draws``.
+            rows: The parents' rows, by which their random numbers are drawn.
+            log_scales: Of the parents.
+            quats: Of the parents.
+        """
+        out = torch.empty(2 * len(rows), 3, device=self.device)
+        rows, log_scales, quats = rows.contiguous(), log_scales.contiguous(), quats.contiguous()
+        parents = (pointer(rows), len(rows), pointer(log_scales), pointer(quats))
+        self.call("splat_split_offsets", *_words(*draw), *parents, pointer(out))
+        return out
+
+    def morton(
+        self, means: Float[Tensor, "n 3"], lowest: Sequence[float], size: Sequence[float]
+    ) -> Int64[Tensor, " n"]:
+        """Places along a Morton curve through the box from ``lowest`` with sides of ``size``."""
+        out = torch.empty(len(means), dtype=torch.int64, device=self.device)
+        box = (ctypes.c_float * 3)(*lowest), (ctypes.c_float * 3)(*size)
+        means = means.contiguous()
+        self.call("splat_morton", pointer(means), len(means), *box, pointer(out))
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class AdamRows:
+    """Tensors of the same rows, contiguous float32, with what a step of Adam takes.
+
+    Attributes:
+        values: Stepped in place, (rows, ...) each.
+        gradients: Of each.
+        means: First moments of each, changed in place.
+        squares: Second moments of each, changed in place.
+        rates: Of each, (width,): one for every value of a row.
+        visible: (rows,) uint8, zero for what sits out; None: nothing does.
+    """
+
+    values: Sequence[Tensor]
+    gradients: Sequence[Tensor]
+    means: Sequence[Tensor]
+    squares: Sequence[Tensor]
+    rates: Sequence[Tensor]
+    visible: Tensor | None
+
+
+_ON_CPU: ContextVar[CudaKernels | None] = ContextVar("cuda_kernels_on_cpu", default=None)
+
+
+@contextmanager
+def use_kernels(kernels: CudaKernels | None) -> Iterator[None]:
+    """Give the CPU's float32 tensors to kernels that run there: the CUDA sources, built for tests."""
+    token = _ON_CPU.set(kernels)
+    try:
+        yield
+    finally:
+        _ON_CPU.reset(token)
+
+
+def kernels_of(device: torch.device) -> CudaKernels | None:
+    """What takes a device's float32 tensors; None: no CUDA kernels do."""
+    if device.type != "cuda":
+        return _ON_CPU.get() if device.type == "cpu" else None
+    return _on_cuda(torch.cuda.current_device() if device.index is None else device.index)
+
+
+@functools.cache
+def _on_cuda(index: int) -> CudaKernels | None:
+    return None if why_not() else CudaKernels(load(), torch.device("cuda", index))
+
+
+def cuda_device(device: torch.device) -> CudaDevice | None:
+    """The device that kernels run on, None for the CPU's own."""
+    kernels = kernels_of(device)
+    return None if kernels is None else kernels.facts
+
+
+def pointer(tensor: Tensor | None) -> int | None:
+    """Where a tensor's memory is; None for none, and for one without any."""
+    if tensor is None:
+        return None
+    assert tensor.is_contiguous()
+    return tensor.data_ptr() or None
+
+
+def upload(tensor: Tensor, device: torch.device) -> Tensor:
+    """A small tensor of the CPU's on a device, without waiting for it."""
+    if device.type != "cuda":
+        return tensor
+    return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def _words(*numbers: int) -> tuple[int, ...]:
+    """As 64 bits each, as train.draws takes them."""
+    return tuple(number & (1 << 64) - 1 for number in numbers)

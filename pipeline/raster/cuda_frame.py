@@ -1,0 +1,295 @@
+"""The CUDA rasterizer under torch's autograd, and what is left of its backward pass for the optimiser."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.cuda import CudaKernels, pointer
+from splatpipe.pipeline.raster.cuda_api import (
+    SplatFrame,
+    SplatPictureGradients,
+    SplatPictures,
+    SplatRows,
+    SplatShot,
+    SplatStep,
+)
+from splatpipe.pipeline.raster.cuda_forecast import FrameSize
+from splatpipe.pipeline.raster.definitions import Render, RenderOptions
+from splatpipe.pipeline.raster.gradients import GradientBuffers
+from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+
+TILE_PX = 16  # a tile's side
+
+
+@dataclass(frozen=True, eq=False)
+class CudaFrame:
+    """A frame on the device, with the memory that its backward pass wants.
+
+    Attributes:
+        kernels: That rendered it.
+        shot: The camera and how.
+        parameters: What was rendered, in the order of ``PARAMETERS``.
+        memory: The frame's.
+        capacity: Pairs that it holds at a time.
+        passes: Chunks that the whole device works off.
+    """
+
+    kernels: CudaKernels
+    shot: SplatShot
+    parameters: tuple[Tensor, ...]
+    memory: Tensor
+    capacity: int
+    passes: int
+
+    @staticmethod
+    def render(
+        kernels: CudaKernels, shot: SplatShot, parameters: tuple[Tensor, ...], outputs: Sequence[Tensor | None]
+    ) -> CudaFrame:
+        """Render to colour, alpha, the three depths or None, radii and visible (uint8); all contiguous.
+
+        Where memory is short, chunks are made smaller.
+
+        Raises:
+            torch.OutOfMemoryError: if that was not enough.
+        """
+        tiles = -(-shot.width // TILE_PX) * -(-shot.height // TILE_PX)
+        size = FrameSize(len(parameters[0]), tiles)
+        while True:
+            room = kernels.forecast.room(size)
+            try:
+                memory = kernels.empty(kernels.frame_bytes(shot, size.count, room.capacity))
+                break
+            except torch.OutOfMemoryError:
+                if not kernels.forecast.shrink():
+                    raise
+        frame = CudaFrame(kernels, shot, parameters, memory, room.capacity, room.passes)
+        *pictures, radii, visible = outputs
+        kernels.call(
+            "splat_forward",
+            *frame._said(None),
+            ctypes.byref(SplatPictures(*map(pointer, pictures))),
+            pointer(radii),
+            pointer(visible),
+        )
+        kernels.forecast.read_later(memory, size, room.capacity)
+        return frame
+
+    def blend_backward(self, pictures: Sequence[Tensor | None]) -> Tensor:
+        """From the gradients by colour, alpha, depth sum and sum of squares (None: zero) to those on the screen.
+
+        Returns:
+            Memory of the backward pass, which holds them.
+
+        Raises:
+            torch.OutOfMemoryError: if there is too little.
+        """
+        back = self.kernels.empty(self.kernels.back_bytes(self.shot, len(self.parameters[0]), self.capacity))
+        gradients = SplatPictureGradients(*map(pointer, pictures))
+        self.kernels.call("splat_blend_backward", *self._said(back), ctypes.byref(gradients))
+        return back
+
+    def project_backward(self, back: Tensor) -> tuple[tuple[Tensor, ...], Float[Tensor, "n 2"]]:
+        """From there to the gradients of the parameters, and of the centres on the screen."""
+        gradients = tuple(torch.empty_like(tensor) for tensor in self.parameters)
+        means2d = torch.empty(len(self.parameters[0]), 2, device=self.kernels.device)
+        rows = rows_of(gradients)
+        self.kernels.call("splat_project_backward", *self._said(back), ctypes.byref(rows), pointer(means2d))
+        return gradients, means2d
+
+    def step(self, back: Tensor, step: SplatStep, means2d: Float[Tensor, "n 2"] | None) -> None:
+        """The same, and at once a step of Adam."""
+        shot, _, frame = self._said(back)
+        self.kernels.call("splat_step", shot, frame, ctypes.byref(step), pointer(means2d))
+
+    def _said(self, back: Tensor | None) -> tuple[object, object, object]:
+        """The shot, the parameters and the frame, as the library takes them."""
+        frame = SplatFrame(
+            memory=pointer(self.memory),
+            bytes=self.memory.numel(),
+            back=pointer(back),
+            back_bytes=0 if back is None else back.numel(),
+            count=len(self.parameters[0]),
+            capacity=self.capacity,
+            passes=self.passes,
+        )
+        return ctypes.byref(self.shot), ctypes.byref(rows_of(self.parameters)), ctypes.byref(frame)
+
+
+@dataclass(frozen=True, eq=False)
+class UnfinishedBackward:
+    """A backward pass that stopped at the screen.
+
+    Attributes:
+        frame: That was rendered.
+        back: What each Gaussian has on the screen.
+        visible: The Gaussians that it showed.
+        probe: Gets its gradient when the pass is finished.
+        logits_are_leaf: False where a function of the model's logits was rendered; those have the derivative of the
+            rendered ones by them for a gradient, until the pass is finished.
+    """
+
+    frame: CudaFrame
+    back: Tensor
+    visible: Bool[Tensor, " n"]
+    probe: Float[Tensor, "n 2"] | None
+    logits_are_leaf: bool
+
+    def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
+        """Whether a step can be made with it at once: of what was rendered, and by no other gradient besides."""
+        if tuple(parameters) != PARAMETERS:
+            return False
+        rendered = dict(zip(PARAMETERS, self.frame.parameters, strict=True))
+        stepped = [name for name in PARAMETERS if self.logits_are_leaf or name != "opacity_logits"]
+        same = all(parameters[name].data_ptr() == rendered[name].data_ptr() for name in stepped)
+        alone = all(parameters[name].grad is None for name in stepped)
+        return same and alone and (visible is None or visible.data_ptr() == self.visible.data_ptr())
+
+    def step(self, step: SplatStep, logits: Tensor) -> None:
+        """Finish the pass and step the parameters; the probe gets its gradient.
+
+        Args:
+            step: Adam's; what is said of the logits is filled in.
+            logits: The model's, with the gain for a gradient where others were rendered.
+        """
+        if not self.logits_are_leaf:
+            assert logits.grad is not None
+            step.logit_gain = pointer(logits.grad)
+            step.logits = pointer(self.frame.parameters[PARAMETERS.index("opacity_logits")])
+        means2d = None if self.probe is None else torch.empty_like(self.probe)
+        self.frame.step(self.back, step, means2d)
+        if self.probe is not None:
+            self.probe.grad = means2d
+
+    def finish(self, parameters: Mapping[str, Tensor]) -> None:
+        """Finish the pass: add what it gives to the parameters' gradients, as any backward pass does."""
+        gradients, means2d = self.frame.project_backward(self.back)
+        for name, gradient in zip(PARAMETERS, gradients, strict=True):
+            before = parameters[name].grad
+            if name == "opacity_logits" and not self.logits_are_leaf:
+                assert before is not None
+                parameters[name].grad = gradient * before
+            else:
+                parameters[name].grad = gradient if before is None else before + gradient
+        if self.probe is not None:
+            self.probe.grad = means2d
+
+
+def render_cuda(
+    kernels: CudaKernels,
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RenderOptions,
+    means2d_probe: Float[Tensor, "n 2"] | None,
+    buffers: GradientBuffers | None = None,
+) -> Render:
+    """Render with CUDA kernels; arguments as of ``rasterizer.render``.
+
+    Raises:
+        ValueError: if a parameter is not float32 on the kernels' device.
+        torch.OutOfMemoryError: if memory is short in training, which can shrink the model.
+        MachineError: if it is, else.
+    """
+    parameters = tuple(gaussians.tensors().values())
+    for name, tensor in gaussians.tensors().items():
+        if tensor.device.type != kernels.device.type or tensor.dtype != torch.float32:
+            raise ValueError(f"the CUDA rasterizer takes float32 on {kernels.device}, not {name} of {tensor.dtype}")
+    try:
+        outputs = _Rasterize.apply(kernels, camera, options, buffers, means2d_probe, *parameters)  # type: ignore[no-untyped-call]
+    except torch.OutOfMemoryError as error:
+        if buffers is not None:
+            raise
+        raise MachineError(
+            f"Not enough memory on the graphics card to rasterize {len(gaussians)} Gaussians.",
+            hint="Lower undistort.max_megapixels or train.max_gaussians, or give --device cpu.",
+        ) from error
+    return Render(*outputs)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Forward and backward pass of a ``CudaFrame``."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        kernels: CudaKernels,
+        camera: Camera,
+        options: RenderOptions,
+        buffers: GradientBuffers | None,
+        probe: Tensor | None,
+        *leaves: Tensor,
+    ) -> tuple[Tensor, ...]:
+        parameters = tuple(tensor.detach().contiguous() for tensor in leaves)
+        n, size = len(parameters[0]), (camera.height, camera.width)
+        colour, alpha, radii = (parameters[0].new_empty(shape) for shape in ((*size, 3), size, (n,)))
+        depths = tuple(alpha.new_empty(size) if options.depth else None for _ in range(3))
+        visible = torch.empty(n, dtype=torch.uint8, device=colour.device)
+        shot = shot_of(camera, options, parameters[-1].shape[1])
+        frame = CudaFrame.render(kernels, shot, parameters, (colour, alpha, *depths, radii, visible))
+        seen = visible.view(torch.bool)
+        shown = tuple(alpha.new_zeros(()).expand(size) if depth is None else depth for depth in depths)
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(shown[2], seen, radii, *(() if options.depth else shown[:2]))
+        if any(ctx.needs_input_grad):
+            ctx.frame, ctx.visible, ctx.buffers, ctx.probe = frame, seen, buffers, probe
+            ctx.leaves = [tensor.is_leaf for tensor in leaves]
+            ctx.save_for_backward(*parameters)
+        return colour, alpha, *shown, seen, radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any,
+        colour: Tensor | None,
+        alpha: Tensor | None,
+        depth_sum: Tensor | None,
+        depth_square_sum: Tensor | None,
+        *_: None,
+    ) -> tuple[Tensor | None, ...]:
+        _ = ctx.saved_tensors  # raises where one was changed since
+        frame: CudaFrame = ctx.frame
+        wanted = ctx.needs_input_grad[4:]
+        upstream = (colour, alpha, depth_sum, depth_square_sum)
+        back = frame.blend_backward([None if grad is None else grad.contiguous() for grad in upstream])
+        if ctx.buffers is not None and _can_wait(wanted[1:], ctx.leaves, ctx.probe):
+            logits_are_leaf = ctx.leaves[PARAMETERS.index("opacity_logits")]
+            ctx.buffers.unfinished = UnfinishedBackward(frame, back, ctx.visible, ctx.probe, logits_are_leaf)
+            gain = None if logits_are_leaf else torch.ones_like(frame.parameters[PARAMETERS.index("opacity_logits")])
+            given = {"opacity_logits": gain}
+            return (None,) * 5 + tuple(given.get(name) for name in PARAMETERS)
+        gradients, means2d = frame.project_backward(back)
+        asked = (grad if needs else None for grad, needs in zip((means2d, *gradients), wanted, strict=True))
+        return (None, None, None, None, *asked)
+
+
+def _can_wait(wanted: Sequence[bool], leaves: Sequence[bool], probe: Tensor | None) -> bool:
+    """Whether the parameters' gradients can be left to the optimiser: all are the model's own, but for the logits."""
+    own = (leaf for name, leaf in zip(PARAMETERS, leaves, strict=True) if name != "opacity_logits")
+    return all(wanted) and all(own) and (probe is None or probe.is_leaf)
+
+
+def shot_of(camera: Camera, options: RenderOptions, sh_count: int) -> SplatShot:
+    """A camera and what to render, as the library takes them."""
+    pose = np.asarray(camera.cam_from_world, np.float64)[:3]
+    return SplatShot(
+        (ctypes.c_double * 12)(*pose.ravel().tolist()),
+        *(camera.fx, camera.fy, camera.cx, camera.cy, options.near, options.depth_origin),
+        (ctypes.c_double * 3)(*options.background),
+        *(camera.width, camera.height, options.sh_degree, sh_count),
+        *(options.antialias, options.depth, options.magnitudes),
+    )
+
+
+def rows_of(tensors: Sequence[Tensor]) -> SplatRows:
+    """Tensors in the order of ``PARAMETERS``, as the library takes them."""
+    return SplatRows(*map(pointer, tensors))
