@@ -286,7 +286,7 @@ def ends_of(scene: Scene, lists: Lists, ended_by: Tensor) -> Tensor:
 
 SCENES = {
     "odd size": lambda: random_scene(140, 37, 43, 1, (0.01, 0.9), (-1.0, 1.2)),
-    "opaque": lambda: random_scene(110, 41, 21, 2, (0.9, 1.0), (0.3, 1.3)),
+    "opaque": lambda: random_scene(60, 41, 21, 2, (0.992, 1.0), (0.8, 1.6)),
     "one tile with everything": lambda: random_scene(560, 16, 16, 3, (0.004, 0.04), (0.0, 1.5)),
     "empty tiles": lambda: random_scene(5, 100, 50, 4, (0.5, 0.9), (-1.0, 0.4)),
 }
