@@ -7,15 +7,15 @@ from frames import Case, Outcome
 
 # Largest differences of pictures, float32 against float64.
 PICTURES = {
-    "colour": 2e-5,  # sums of some hundred rounded terms of size 1
-    "alpha": 2e-5,
-    "depth_sum": 2e-4,  # the same, of depths up to ten
-    "depth_square_sum": 2e-3,  # of their squares
-    "median_depth": 2e-3,  # one depth, at a pixel up to its own size from the centre of a slanted Gaussian
+    "colour": 5e-6,  # sums of some hundred rounded terms of size 1
+    "alpha": 5e-6,
+    "depth_sum": 5e-5,  # the same, of depths up to ten
+    "depth_square_sum": 3e-4,  # of their squares
+    "median_depth": 5e-5,  # one depth
 }
-RADII = 1e-4
+RADII = 2e-4
 """Relative and in pixels: a root of the covariance's eigenvalue."""
-GRADIENTS = 1e-4
+GRADIENTS = 2e-5
 """L2 over all Gaussians, relative: sums over a hundred pixels, through divisions by 1 - alpha ≥ 0.01."""
 NO_GRADIENT = 1e-6
 """What is smaller in all is rounding."""

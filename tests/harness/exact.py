@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from frames import GREY, PARAMETERS, Case, Outcome
@@ -22,6 +24,7 @@ def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object)
         (camera.fx, camera.fy, camera.cx, camera.cy),
         (camera.width, camera.height),
         {name: value.astype(np.float32) for name, value in upstream.items()},
+        sh_degree=math.isqrt(scene.sh.shape[1]) - 1,
     ).changed(**settings)
 
 

@@ -136,7 +136,9 @@ class Frame:
         self.shot = case.shot()
         count, capacity = case.count, max(capacity, case.count, 1)
         sizes = [library.size(name, self.shot, count, capacity) for name in ("splat_frame_bytes", "splat_back_bytes")]
-        memory, back = (self.at.empty(name, (size,), np.uint8) for name, size in zip(("frame", "back"), sizes))
+        memory, back = (
+            self.at.empty(name, (size,), np.uint8) for name, size in zip(("frame", "back"), sizes, strict=True)
+        )
         self.frame = SplatFrame(pointer(memory), sizes[0], pointer(back), sizes[1], count, capacity, passes)
         self._memory = memory
         self._held = {name: self.at.put(name, np.ascontiguousarray(rows)) for name, rows in case.rows.items()}
