@@ -14,6 +14,8 @@ constexpr int kSubWidth = 8, kSubHeight = 4;  // pixels
 constexpr int kBands = kTile / kSubHeight;    // rows of sub-blocks, of two each
 static_assert(kSubWidth * kSubHeight == kWarp && 2 * kSubWidth == kTile && 2 * kBands == kWarps, "a warp a sub-block");
 
+constexpr int kBlendBlocks = 4;  // that a multiprocessor should hold: 64 registers a thread, and nothing is spilled
+
 // Sub-blocks are looked for with an ellipse that is a little larger: where rounding in here and in log2_alpha disagree
 // on a pixel at the border, the pixel must have its say.
 constexpr float kReachSlack = 1e-4f, kSlackPx = 1.0f / 32.0f;
@@ -228,7 +230,6 @@ __device__ __forceinline__ void blend_tile(const Job& job, const TileList& list,
 template <bool kDepth>
 __device__ void blend_tiles(const Job& job, int chunk) {
     SPLAT_SHARED(Batch<kThreads>, batch);
-    if (chunk >= job.at.header->facts.chunks) return;
     const int first = job.at.chunk_begin[chunk], end = job.at.chunk_begin[chunk + 1];
     for (int tile = first + static_cast<int>(blockIdx.x); tile < end; tile += static_cast<int>(gridDim.x))
         blend_tile<kDepth>(job, list_of(job, first, tile), &batch);

@@ -260,7 +260,6 @@ template <bool kDepth, bool kMagnitudes>
 __device__ void blend_tiles_back(const Job& job, int chunk) {
     using Shared = BackBatch<kDepth, kMagnitudes>;
     SPLAT_SHARED(Shared, batch);
-    if (chunk >= job.at.header->facts.chunks) return;
     const int first = job.at.chunk_begin[chunk], end = job.at.chunk_begin[chunk + 1];
     for (int tile = first + static_cast<int>(blockIdx.x); tile < end; tile += static_cast<int>(gridDim.x))
         blend_tile_back(job, list_of(job, first, tile), &batch);
@@ -273,7 +272,6 @@ template <bool kDepth>
 __device__ void sum_slots(const Job& job, int chunk) {
     constexpr int kFloats = kDepth ? kDepthSlotFloats : kSlotFloats, kRanks = kSlotsAtOnce;
     const Header& header = *job.at.header;
-    if (chunk >= header.facts.chunks) return;
     const int field = static_cast<int>(threadIdx.x) % kSlotThreads;
     const int64_t step = static_cast<int64_t>(gridDim.x) * kRanks;
     for (int64_t rank = static_cast<int64_t>(blockIdx.x) * kRanks + threadIdx.x / kSlotThreads; rank < header.visible;

@@ -92,13 +92,13 @@ __global__ void __launch_bounds__(kThreads, 2) scatter_tiles(Job job, Turn turn,
 }
 
 template <bool kDepth>
-__global__ void __launch_bounds__(kThreads) blend_kernel(Job job, int chunk) {
+__global__ void __launch_bounds__(kThreads, kBlendBlocks) blend_kernel(Job job, int chunk) {
     if (is_chunk(job, chunk)) blend_tiles<kDepth>(job, chunk);
 }
 
 // `only`: the chunk is left to rest_back unless it is the only one.
 template <bool kDepth, bool kMagnitudes>
-__global__ void __launch_bounds__(kThreads) blend_back_kernel(Job job, int chunk, bool only) {
+__global__ void __launch_bounds__(kThreads, kBlendBlocks) blend_back_kernel(Job job, int chunk, bool only) {
     if (is_chunk(job, chunk) && !(only && job.at.header->facts.chunks > 1))
         blend_tiles_back<kDepth, kMagnitudes>(job, chunk);
 }
@@ -200,7 +200,7 @@ void launch_chunks(const Job& job, int passes, SplatStream stream) {
 template <bool kDepth, bool kMagnitudes>
 void launch_chunks_back(const Job& job, int passes, SplatStream stream) {
     const bool only = passes == 1;
-    const int64_t ranks = blocks_for(divide_up(job.model.count, kThreads));
+    const int64_t ranks = blocks_for(divide_up(job.model.count, kSlotsAtOnce));
     for (int chunk = 0; chunk < passes; ++chunk) {
         if (!only) launch_bin(job, {chunk, true}, stream);
         SPLAT_LAUNCH((blend_back_kernel<kDepth, kMagnitudes>), tile_blocks(job), stream, job, chunk, only);
