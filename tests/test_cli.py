@@ -100,6 +100,22 @@ def test_doctor_names_the_instruction_set_in_use_and_those_there_are() -> None:
     assert json.loads(done.stdout)["rasterizer"].startswith("native, baseline ")
 
 
+def unwrapped(panel: str) -> str:
+    """The text of a panel, without its frame and line breaks."""
+    return " ".join(panel.replace("│", " ").split())
+
+
+def test_cuda_is_refused_at_once_with_the_reason_and_doctor_tells_the_same(tmp_path: Path, photos: Path) -> None:
+    hidden = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}  # with a GPU or without
+    told = json.loads(splatpipe("doctor", "--json", env=hidden).stdout)["CUDA"]
+    assert told.startswith("not used. ")
+    done = splatpipe("run", photos, tmp_path / "out", "--device", "cuda", env=hidden)
+    assert done.returncode == 4, done.stderr
+    assert "CUDA does not work here. " + told.removeprefix("not used. ").split(". ")[0] in unwrapped(done.stderr)
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("arguments", [("doctor",), ("run", "{photos}", "{out}")])
 def test_an_unknown_instruction_set_is_told_before_anything_runs(
     tmp_path: Path, photos: Path, arguments: tuple[str, ...]
@@ -107,7 +123,7 @@ def test_an_unknown_instruction_set_is_told_before_anything_runs(
     arguments = tuple(text.format(photos=photos, out=tmp_path / "out") for text in arguments)
     done = splatpipe(*arguments, env={**os.environ, "SPLATPIPE_ISA": "sse9"})
     assert done.returncode == 2, done.stderr
-    assert 'SPLATPIPE_ISA asks for "sse9"' in " ".join(done.stderr.replace("│", " ").split())
+    assert 'SPLATPIPE_ISA asks for "sse9"' in unwrapped(done.stderr)
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
 

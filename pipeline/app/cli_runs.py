@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.errors import UsageError
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runner import Runner
@@ -63,8 +63,11 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     began_s = round(time.monotonic(), 3)
     if device not in ("auto", "cpu", "cuda"):
         raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
-    if device == "cuda":
-        raise MachineError("This splatpipe has no CUDA kernels yet.", "Leave --device out: it trains on the CPU.")
+    if device == "cuda":  # told now, not when training begins; `auto` takes the CPU where CUDA does not work
+        from splatpipe.pipeline.raster.cuda_library import why_not
+
+        if missing := why_not():
+            raise missing.error()
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)

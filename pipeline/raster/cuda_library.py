@@ -129,6 +129,10 @@ class NoCuda:
     reason: str
     hint: str
 
+    def error(self) -> MachineError:
+        """For who asked for CUDA all the same."""
+        return MachineError(f"CUDA does not work here. {self.reason}", self.hint)
+
 
 @dataclass(frozen=True)
 class Installed:
