@@ -166,7 +166,7 @@ void launch_sort_by_depth(const Job& job, SplatStream stream) {
     const int64_t blocks = blocks_for(sort_blocks(job.model.count));
     for (int pass = 0; pass < kDepthPasses; ++pass) {
         SPLAT_LAUNCH(count_depths, blocks, stream, job, pass);
-        SPLAT_LAUNCH(scan_depths, kDigits, stream, job, pass);
+        SPLAT_LAUNCH(scan_depths, kScanBlocks, stream, job, pass);
         SPLAT_LAUNCH(scatter_depths, blocks, stream, job, pass);
     }
 }
@@ -179,7 +179,7 @@ void launch_bin(const Job& job, const Turn& turn, SplatStream stream) {
     SPLAT_LAUNCH(emit_pairs_kernel, ranks, stream, job, turn);
     for (int pass = 0; pass < kTilePasses; ++pass) {
         SPLAT_LAUNCH(count_tiles, blocks, stream, job, turn, pass);
-        SPLAT_LAUNCH(scan_tiles, kDigits, stream, job, turn, pass);
+        SPLAT_LAUNCH(scan_tiles, kScanBlocks, stream, job, turn, pass);
         SPLAT_LAUNCH(scatter_tiles, blocks, stream, job, turn, pass);
     }
 }

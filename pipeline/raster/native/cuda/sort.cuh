@@ -11,6 +11,7 @@ namespace splat {
 namespace cuda {
 
 static_assert(kDigits == kThreads, "a thread a digit");
+constexpr int kScanBlocks = kDigits / kWarps;  // of the phase in the middle
 
 template <class Key, class Value>
 struct SortPass {
@@ -59,14 +60,13 @@ __device__ void count_digits(const SortPass<Key, Value>& pass) {
     }
 }
 
-// A digit's counts become the places of each block's first one among those of the digit.
+// A digit's counts become the places of each block's first one among those of the digit; by a warp a digit.
 template <class Key, class Value>
 __device__ void scan_digits(const SortPass<Key, Value>& pass) {
-    SPLAT_SHARED(ScanShared<uint32_t>, shared);
     const int64_t blocks = sort_blocks(pass.count);
-    for (int64_t digit = blockIdx.x; digit < kDigits; digit += gridDim.x) {
-        const uint32_t sum = scan_array(pass.table + digit * blocks, blocks, &shared);
-        if (threadIdx.x == 0) pass.digit_sums[digit] = sum;
+    for (int digit = blockIdx.x * kWarps + warp_index(); digit < kDigits; digit += gridDim.x * kWarps) {
+        const uint32_t sum = scan_array_by_warp(pass.table + digit * blocks, blocks);
+        if (lane_index() == 0) pass.digit_sums[digit] = sum;
     }
 }
 
