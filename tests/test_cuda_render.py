@@ -1,0 +1,313 @@
+"""CUDA tensors under autograd, proven with the kernels' sources on the CPU: gradients, the fused step, memory."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.raster.colour import affine_colour
+from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda_forecast import FIRST_PASSES, WINDOW, Forecast, FrameFacts, FrameSize
+from splatpipe.pipeline.raster.cuda_frame import shot_of
+from splatpipe.pipeline.raster.loss import photo_loss
+from splatpipe.pipeline.raster.optim import Adam, sh_rates
+from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, RenderOptions, isa_name, kernels_name, render
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.dropout import _Dropped
+
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from on_cpu import kernels_on_cpu, library_on_cpu
+from random_scene import random_camera, random_scene
+
+# Two float32 computations of the same sums in another order; between the backends 2e-6 was the most that was seen.
+GRADIENT_RTOL = 1e-5
+# A step is the rate times a quotient of moments, and Adam divides by small ones: what differs in the tenth place of a
+# gradient near zero differs in the third of its first step.
+STEP_SHARE = 2e-2
+RATES = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": sh_rates(16, 2.5e-3, 1e-4)}
+LIMITS = {"log_scales": (-2.5, -1.0)}
+OPTIONS = RenderOptions(3, background=(0.2, 0.3, 0.4), depth=False)
+CAMERA = random_camera(0)
+
+
+@pytest.fixture
+def kernels() -> CudaKernels:
+    return kernels_on_cpu()
+
+
+def weighted(rendered: Render) -> Tensor:
+    """A scalar that every picture with a gradient has a part in."""
+    generator = torch.Generator().manual_seed(1)
+    pictures = (rendered.colour, rendered.alpha, rendered.depth_sum, rendered.depth_square_sum)
+    terms = [(p * torch.randn(p.shape, generator=generator)).sum() for p in pictures if p.requires_grad]
+    return torch.stack(terms).sum()
+
+
+def backward_of(options: RenderOptions, kernels: CudaKernels | None) -> tuple[Render, dict[str, Tensor]]:
+    scene, probe = random_scene(0).requires_grad_(), torch.zeros(60, 2, requires_grad=True)
+    with use_kernels(kernels):
+        rendered = render(scene, CAMERA, options, means2d_probe=probe)
+        weighted(rendered).backward()
+    return rendered, {name: tensor.grad for name, tensor in (scene.tensors() | {"means2d": probe}).items()}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [OPTIONS, RenderOptions(3), RenderOptions(1, antialias=True, magnitudes=True)],
+    ids=("colour", "depth", "alias"),
+)
+def test_pictures_and_gradients_are_the_cpus(kernels, options):
+    expected, gradients = backward_of(options, None)
+    rendered, ours = backward_of(options, kernels)
+    for name, picture in vars(expected).items():
+        torch.testing.assert_close(getattr(rendered, name), picture, rtol=1e-5, atol=2e-5, msg=name)
+    for name, gradient in gradients.items():
+        assert (ours[name] - gradient).norm() <= GRADIENT_RTOL * gradient.norm(), name
+
+
+def test_a_second_backward_pass_adds_up(kernels):
+    with use_kernels(kernels):
+        scene = random_scene(0).requires_grad_()
+        loss = weighted(render(scene, CAMERA, OPTIONS))
+        loss.backward(retain_graph=True)
+        once = scene.means.grad.clone()
+        loss.backward()
+        assert torch.equal(scene.means.grad, 2.0 * once)
+        plain = scene.detach()
+        plain.sh.requires_grad_()  # one parameter alone
+        weighted(render(plain, CAMERA, OPTIONS)).backward()
+        assert torch.equal(2.0 * plain.sh.grad, scene.sh.grad)
+        assert plain.means.grad is None
+
+
+def trained(kernels: CudaKernels | None, sparse: bool, dropout: bool, penalty: float = 0.0, steps: int = 2):
+    """The model, its optimiser and the last gradient of the probe after some steps."""
+    scene, buffers = random_scene(0).requires_grad_(), GradientBuffers()
+    optimizer, kept = Adam(scene.tensors()), torch.arange(60) % 4 > 0
+    with use_kernels(kernels):
+        for _ in range(steps):
+            model, probe = scene, torch.zeros(60, 2, requires_grad=True)
+            if dropout:
+                model = replace(scene, opacity_logits=_Dropped.apply(scene.opacity_logits, kept, 0.25))
+            rendered = render(model, CAMERA, OPTIONS, means2d_probe=probe, buffers=buffers)
+            (weighted(rendered) + penalty * scene.means.square().sum()).backward()
+            visible = rendered.visible if sparse else None
+            optimizer.step(scene.tensors(), RATES, visible, buffers, LIMITS)
+            for tensor in scene.tensors().values():
+                tensor.grad = None
+    return scene, optimizer, probe.grad
+
+
+def assert_stepped_alike(ours, expected, steps: int = 2) -> None:
+    start = random_scene(0)
+    for name, tensor in expected[0].tensors().items():
+        moved = (tensor.detach() - getattr(start, name)).abs().max()
+        assert (getattr(ours[0], name) - tensor).abs().max() <= STEP_SHARE * moved, name
+        for moments in ("mean", "square"):
+            found, right = getattr(ours[1], moments)[name], getattr(expected[1], moments)[name]
+            assert (found - right).norm() <= 1e-2 * right.norm(), (moments, name)
+    assert (ours[2] - expected[2]).norm() <= 1e-2 * expected[2].norm()
+    assert ours[1].step_count == expected[1].step_count == steps
+
+
+@pytest.mark.parametrize("dropout", [False, True], ids=("whole", "dropout"))
+@pytest.mark.parametrize("sparse", [True, False], ids=("seen", "all"))
+def test_the_fused_step_is_the_backward_pass_and_the_step(kernels, sparse, dropout):
+    assert_stepped_alike(trained(kernels, sparse, dropout), trained(None, sparse, dropout))
+
+
+def test_training_leaves_no_gradient_but_the_probes(kernels):
+    scene, buffers, probe = random_scene(0).requires_grad_(), GradientBuffers(), torch.zeros(60, 2, requires_grad=True)
+    optimizer = Adam(scene.tensors())
+    with use_kernels(kernels):
+        rendered = render(scene, CAMERA, OPTIONS, means2d_probe=probe, buffers=buffers)
+        weighted(rendered).backward()
+        assert buffers.unfinished is not None
+        assert all(tensor.grad is None for tensor in (*scene.tensors().values(), probe))
+        optimizer.step(scene.tensors(), RATES, rendered.visible, buffers)
+    assert buffers.unfinished is None
+    assert probe.grad is not None
+    assert all(tensor.grad is None for tensor in scene.tensors().values())
+
+
+@pytest.mark.parametrize("dropout", [False, True], ids=("whole", "dropout"))
+def test_another_gradient_besides_the_renders_is_stepped_with_it(kernels, dropout):
+    ours, expected = (trained(k, True, dropout, penalty=0.05) for k in (kernels, None))
+    assert_stepped_alike(ours, expected)
+    without = trained(None, True, dropout)
+    assert not torch.allclose(without[0].means, expected[0].means, atol=1e-5)
+
+
+@pytest.mark.parametrize("fused", [True, False], ids=("fused", "apart"))
+def test_rows_with_gradients_that_are_not_finite_are_left_out_and_counted(kernels, fused):
+    scene, buffers = random_scene(0).requires_grad_(), GradientBuffers()
+    optimizer = Adam(scene.tensors())
+    before = scene.detach().clone()
+    with use_kernels(kernels):
+        rendered = render(scene, CAMERA, OPTIONS, buffers=buffers if fused else None)
+        row, column = (rendered.alpha > 0.5).nonzero()[0].tolist()
+        upstream = torch.zeros_like(rendered.colour)
+        upstream[row, column] = torch.inf
+        rendered.colour.backward(upstream)
+        optimizer.step(scene.tensors(), RATES, rendered.visible, buffers)
+    skipped = optimizer.take_skipped()
+    assert 0 < skipped <= int(rendered.visible.sum())
+    assert optimizer.take_skipped() == 0
+    unchanged = (scene.means.detach() == before.means).all(1)
+    assert int((unchanged & rendered.visible).sum()) >= skipped
+    assert all(bool(tensor.isfinite().all()) for tensor in (*scene.tensors().values(), *optimizer.mean.values()))
+
+
+def test_loss_and_colours_are_the_cpus(kernels):
+    generator = torch.Generator().manual_seed(3)
+    photo, mask = torch.rand(41, 37, 3, generator=generator), torch.rand(41, 37, generator=generator) > 0.2
+    start, turn = (
+        torch.rand(41, 37, 3, generator=generator),
+        torch.eye(3, 4) + 0.1 * torch.rand(3, 4, generator=generator),
+    )
+    found = []
+    for device in (None, kernels):
+        picture, affine = start.clone().requires_grad_(), turn.clone().requires_grad_()
+        with use_kernels(device):
+            loss = 3.0 * photo_loss(affine_colour(picture, affine), photo, 0.2, mask)
+            loss.backward()
+        found.append((loss.detach(), picture.grad, affine.grad))
+    for ours, expected in zip(found[1], found[0], strict=True):
+        torch.testing.assert_close(ours, expected, rtol=2e-4, atol=1e-8)
+
+
+def test_adam_alone_is_the_cpus(kernels):
+    found = []
+    for device in (None, kernels):
+        generator = torch.Generator().manual_seed(4)
+        tensors = {
+            name: torch.randn(50, size, generator=generator).requires_grad_() for name, size in (("a", 3), ("b", 12))
+        }
+        optimizer, visible = Adam(tensors), torch.rand(50, generator=generator) > 0.3
+        with use_kernels(device):
+            for _ in range(3):
+                for tensor in tensors.values():
+                    tensor.grad = torch.randn(tensor.shape, generator=generator)
+                optimizer.step(tensors, {"a": 0.1, "b": torch.arange(12) * 0.01}, visible, limits={"a": (-1.0, 1.0)})
+        found.append([tensor.detach() for tensor in (*tensors.values(), *optimizer.state_dict().values())])
+    for ours, expected in zip(found[1], found[0], strict=True):
+        torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-7)
+
+
+def test_a_view_in_many_chunks_has_the_same_bits_and_is_foreseen(kernels):
+    whole, gradients = backward_of(RenderOptions(3), kernels)
+    assert kernels.forecast.room(FrameSize(60, 20)).passes == 1
+    few = kernels_on_cpu()
+    few.forecast.most_pairs = 1  # so that chunks hold as many pairs as there are Gaussians
+    for _ in range(2):
+        chunked, ours = backward_of(RenderOptions(3), few)
+        assert all(torch.equal(getattr(chunked, name), picture) for name, picture in vars(whole).items())
+        assert all(torch.equal(ours[name], gradient) for name, gradient in gradients.items())
+    room = few.forecast.room(FrameSize(60, 20))
+    assert room.capacity == 60
+    assert 3 < room.passes < FIRST_PASSES
+
+
+def test_what_was_not_foreseen_is_rendered_all_the_same(kernels):
+    whole, gradients = backward_of(RenderOptions(3), kernels)
+    blind = kernels_on_cpu()
+    blind.forecast.most_pairs = 1
+    blind.forecast.learn(FrameFacts(FrameSize(60, 20), 60, pairs=10, chunks=1))  # far too few
+    assert blind.forecast.room(FrameSize(60, 20)).passes == 1
+    chunked, ours = backward_of(RenderOptions(3), blind)
+    assert all(torch.equal(getattr(chunked, name), picture) for name, picture in vars(whole).items())
+    assert all(torch.equal(ours[name], gradient) for name, gradient in gradients.items())
+    assert blind.forecast.room(FrameSize(60, 20)).passes > 3  # it has learned
+
+
+def facts(pairs: int) -> FrameFacts:
+    return FrameFacts(FrameSize(1000, 400), 100_000, pairs, chunks=1)
+
+
+def test_forecast_keeps_the_most_of_late_and_forgets_it():
+    forecast, size = Forecast(), FrameSize(1000, 400)
+    assert forecast.room(size).passes == FIRST_PASSES
+    for pairs in (5000, 9000, 4000):
+        forecast.learn(facts(pairs))
+    assert 9000 < forecast.room(size).capacity < 1.5 * 9000
+    assert forecast.room(size).passes == 1
+    for _ in range(2 * WINDOW):
+        forecast.learn(facts(4000))
+    assert 4000 < forecast.room(size).capacity < 1.5 * 4000
+
+
+def test_forecast_grows_with_the_model_and_the_picture_and_keeps_to_its_limit():
+    forecast = Forecast(most_pairs=20_000)
+    forecast.learn(facts(8000))
+    assert forecast.room(FrameSize(1500, 400)).capacity > 1.5 * 8000
+    larger = forecast.room(FrameSize(1000, 4000))
+    assert larger.capacity == 20_000
+    assert larger.capacity * larger.passes > 10 * 8000
+    assert forecast.room(FrameSize(50_000, 400)).capacity == 50_000  # any tile's pairs must fit
+    assert forecast.room(FrameSize(10, 200_000)).passes > 3  # a chunk's tiles have 16 bits
+
+
+def test_forecast_never_waits(kernels, monkeypatch):
+    monkeypatch.setattr("splatpipe.pipeline.raster.cuda_forecast.Reading.arrived", lambda self: False)
+    for _ in range(2):
+        backward_of(OPTIONS, kernels)
+    assert kernels.forecast.room(FrameSize(60, 20)).passes == FIRST_PASSES  # nothing is known yet
+    monkeypatch.undo()
+    assert kernels.forecast.room(FrameSize(60, 20)).passes == 1
+
+
+class ShortOfMemory(CudaKernels):
+    """Kernels on a device that has no more than some bytes at a time."""
+
+    most_bytes = 1 << 40
+
+    def empty(self, size_bytes: int) -> Tensor:
+        if size_bytes > self.most_bytes:
+            raise torch.OutOfMemoryError("out of memory")
+        return super().empty(size_bytes)
+
+
+def test_short_memory_makes_chunks_smaller_then_is_told():
+    kernels, scene = ShortOfMemory(library_on_cpu(), torch.device("cpu")), random_scene(0)
+    with use_kernels(kernels):
+        expected = render(scene, CAMERA, OPTIONS).colour
+        kernels.forecast = Forecast()
+        assert kernels.forecast.room(FrameSize(60, 20)).capacity > 200
+        kernels.most_bytes = kernels.frame_bytes(shot_of(CAMERA, OPTIONS, 16), 60, 200)
+        assert torch.equal(render(scene, CAMERA, OPTIONS).colour, expected)
+        assert 60 <= kernels.forecast.most_pairs <= 200
+        kernels.most_bytes = 100
+        with pytest.raises(MachineError, match="60 Gaussians"):
+            render(scene, CAMERA, OPTIONS)
+        assert kernels.forecast.most_pairs == 60
+        with pytest.raises(torch.OutOfMemoryError):  # the training answers it
+            render(scene.requires_grad_(), CAMERA, OPTIONS, buffers=GradientBuffers())
+        assert not kernels.forecast.shrink()
+
+
+def test_an_empty_model_is_the_background(kernels):
+    nothing = Gaussians.empty(0, 3).requires_grad_()
+    with use_kernels(kernels):
+        rendered = render(nothing, CAMERA, OPTIONS)
+        torch.testing.assert_close(rendered.colour, torch.tensor(OPTIONS.background).expand(53, 70, 3))
+        rendered.colour.sum().backward()
+    assert nothing.means.grad.shape == (0, 3)
+
+
+def test_only_what_kernels_take_goes_to_them(kernels):
+    with use_kernels(kernels):
+        assert kernels_name(torch.device("cpu")) == kernels.facts.described()
+        doubles = random_scene(0).to(dtype=torch.float64)
+        assert render(doubles, CAMERA, OPTIONS).colour.dtype == torch.float64
+        with pytest.raises(ValueError, match="float64"):
+            render(doubles, CAMERA, OPTIONS, backend="cuda")
+    assert kernels_name(torch.device("cpu")) == isa_name()
+    with pytest.raises(ValueError, match="no CUDA kernels"):
+        render(random_scene(0), CAMERA, OPTIONS, backend="cuda")
+    with pytest.raises(ValueError, match="no kernels for meta"):
+        kernels_name(torch.device("meta"))
