@@ -17,6 +17,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatShot
 from splatpipe.pipeline.raster.cuda_forecast import Forecast
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, load, why_not
+from splatpipe.pipeline.splat.upload import upload
 
 ALIGNMENT = 256  # of the memory that kernels are given
 
@@ -234,13 +235,6 @@ def pointer(tensor: Tensor | None) -> int | None:
         return None
     assert tensor.is_contiguous()
     return tensor.data_ptr() or None
-
-
-def upload(tensor: Tensor, device: torch.device) -> Tensor:
-    """A small tensor of the CPU's on a device, without waiting for it."""
-    if device.type != "cuda":
-        return tensor
-    return tensor.pin_memory().to(device, non_blocking=True)
 
 
 def _words(*numbers: int) -> tuple[int, ...]:

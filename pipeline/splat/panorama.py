@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.archives import read_archive
 from splatpipe.pipeline.splat.sky_mask import directions, horizontal_axes
+from splatpipe.pipeline.splat.upload import rgb_beside, upload
 
 ROWS = 32  # from straight down to straight up, cells of 5.6°: gradients and large clouds, no building
 COLUMNS = 2 * ROWS
@@ -43,16 +45,123 @@ class Panorama:
             camera: The camera.
             background: Red, green, blue, 0..1.
         """
-        nodes = directions(camera, STEP_PX)
-        below = self.colours.new_tensor(background)
-        share = torch.from_numpy(cover(nodes, self.up)).to(self.colours.dtype)[:, :, None]
-        return between_nodes(share * self.at(nodes) + (1.0 - share) * below, camera)
+        return self.look(camera).behind(self.colours, background)
+
+    def look(self, camera: Camera) -> Look:
+        """Where a camera's nodes look, for colours of this panorama's cells."""
+        if self.colours.device.type == "cpu":
+            return gathered_look(camera, self.up, self.colours)
+        return multiplied_look(camera, self.up, self.colours)
 
     def at(self, rays: Float64[np.ndarray, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
         """The colours in some directions of any length."""
-        cells, weights = cells_of(rays.reshape(-1, 3), self.up)
-        mixed = self.colours[torch.from_numpy(cells)] * torch.from_numpy(weights).to(self.colours.dtype)[:, :, None]
-        return mixed.sum(dim=1).reshape(rays.shape)
+        return Gathered.of_rays(rays, self.up, self.colours).mixed(self.colours).reshape(rays.shape)
+
+    def to(self, device: torch.device) -> Panorama:
+        """The same with its colours on a device; no leaf of autograd any more where they have to move."""
+        return Panorama(self.up, self.colours.to(device))
+
+
+@runtime_checkable
+class Lookup(Protocol):
+    """The cells that some directions mix, whatever the cells' colours are."""
+
+    def mixed(self, colours: Float[Tensor, "cells 3"]) -> Float[Tensor, "n 3"]:
+        """The directions' colours."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Where a camera's nodes look.
+
+    Attributes:
+        camera: The camera.
+        share: How much of what is behind is the panorama, (rows, columns, 1).
+        cells: What the nodes mix, row by row.
+    """
+
+    camera: Camera
+    share: Float[Tensor, "rows columns 1"]
+    cells: Lookup
+
+    def behind(
+        self, colours: Float[Tensor, "cells 3"], background: tuple[float, float, float]
+    ) -> Float[Tensor, "h w 3"]:
+        """What the camera sees of some cells' colours, and below the horizon of the background."""
+        below = rgb_beside(background, colours)
+        seen = self.cells.mixed(colours).reshape(*self.share.shape[:2], 3)
+        return between_nodes(self.share * seen + (1.0 - self.share) * below, self.camera)
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Four cells a direction, fetched by their numbers: little work, for a CPU.
+
+    Attributes:
+        cells: (n, 4) numbers.
+        weights: (n, 4, 1).
+    """
+
+    cells: Int64[Tensor, "n 4"]
+    weights: Float[Tensor, "n 4 1"]
+
+    @staticmethod
+    def of_rays(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"], like: Tensor) -> Gathered:
+        """Those around some directions; weights in another tensor's type and on its device."""
+        cells, weights = (torch.from_numpy(array).to(like.device) for array in cells_of(rays.reshape(-1, 3), up))
+        return Gathered(cells, weights.to(like.dtype)[:, :, None])
+
+    def mixed(self, colours: Float[Tensor, "cells 3"]) -> Float[Tensor, "n 3"]:
+        """The directions' colours."""
+        return (colours[self.cells] * self.weights).sum(dim=1)
+
+
+@dataclass(frozen=True)
+class Multiplied:
+    """All cells with weights that are mostly zero, by products of matrices: their backward pass adds in a fixed order
+    on a GPU, too, where numbers that fetch would add in any or be sorted first.
+
+    Attributes:
+        by_row: (n, ROWS) weights.
+        by_column: (n, COLUMNS) weights.
+    """
+
+    by_row: Float[Tensor, "n rows"]
+    by_column: Float[Tensor, "n columns"]
+
+    def mixed(self, colours: Float[Tensor, "cells 3"]) -> Float[Tensor, "n 3"]:
+        """The directions' colours."""
+        by_columns = colours.reshape(ROWS, COLUMNS, 3).transpose(0, 1).reshape(COLUMNS, ROWS * 3)
+        along = (self.by_column @ by_columns).reshape(-1, ROWS, 3)
+        return (self.by_row[:, :, None] * along).sum(dim=1)
+
+
+def gathered_look(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> Look:
+    """A camera's look at a panorama with that pole, in another tensor's type."""
+    nodes = directions(camera, STEP_PX)
+    share = torch.from_numpy(cover(nodes, up)).to(like.dtype)[:, :, None]
+    return Look(camera, share, Gathered.of_rays(nodes, up, like))
+
+
+def multiplied_look(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> Look:
+    """The same, all of it made on the other tensor's device: the host does nothing that grows with the photo."""
+    device, dtype = like.device, like.dtype
+    east, north = horizontal_axes(up)
+    axes = upload(torch.from_numpy(camera.cam_from_world[:3, :3] @ np.stack([east, north, up], axis=1)), device)
+    x, y = (
+        (STEP_PX * torch.arange(nodes_along(size), dtype=torch.float64, device=device) + 0.5 - centre) / focal
+        for size, centre, focal in ((camera.width, camera.cx, camera.fx), (camera.height, camera.cy, camera.fy))
+    )
+    rays = x[None, :, None] * axes[0] + y[:, None, None] * axes[1] + axes[2]
+    elevation = torch.asin((rays[:, :, 2] / rays.norm(dim=2)).clamp(-1.0, 1.0)) / math.pi  # half turns
+    azimuth = torch.atan2(rays[:, :, 1], rays[:, :, 0]) / (2.0 * math.pi)
+    share = (180.0 * elevation - NOTHING_UP_TO_DEG) / (FULL_FROM_DEG - NOTHING_UP_TO_DEG)
+    row = ((elevation + 0.5) * ROWS - 0.5).clamp(0.0, ROWS - 1.0).reshape(-1, 1).to(dtype)
+    column = ((azimuth + 0.5) * COLUMNS - 0.5).reshape(-1, 1).to(dtype)
+    across = (column - torch.arange(COLUMNS, device=device)).abs()
+    by_column = (1.0 - torch.minimum(across, COLUMNS - across)).clamp(min=0.0)
+    by_row = (1.0 - (row - torch.arange(ROWS, device=device)).abs()).clamp(min=0.0)
+    return Look(camera, share.clamp(0.0, 1.0).to(dtype)[:, :, None], Multiplied(by_row, by_column))
 
 
 def laid_over(
@@ -69,13 +178,13 @@ def laid_over(
         background: What it has behind it.
         behind: What takes its place.
     """
-    return colour + (1.0 - alpha)[:, :, None] * (behind - behind.new_tensor(background))
+    return colour + (1.0 - alpha)[:, :, None] * (behind - rgb_beside(background, behind))
 
 
 def between_nodes(values: Float[Tensor, "rows columns 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
     """Interpolate bilinearly from the nodes to every pixel."""
     down, right = (
-        torch.from_numpy(_between(size, count)).to(values.dtype)
+        _between(size, count, values)
         for size, count in ((camera.height, values.shape[0]), (camera.width, values.shape[1]))
     )
     across = right @ values.transpose(0, 1).reshape(values.shape[1], -1)  # two plain products: a fifth of batched ones
@@ -113,7 +222,7 @@ def cells_of(
 def write_panorama(path: Path, panorama: Panorama | None) -> None:
     """Write a panorama; without one, a file that says so."""
     up = np.zeros(3) if panorama is None else panorama.up
-    colours = np.zeros((0, 3), np.float32) if panorama is None else panorama.colours.detach().numpy()
+    colours = np.zeros((0, 3), np.float32) if panorama is None else panorama.colours.detach().cpu().numpy()
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, up=up, colours=colours)
 
@@ -151,7 +260,13 @@ def panorama_of(up: np.ndarray, colours: np.ndarray) -> Panorama:
     return Panorama(up, torch.from_numpy(colours))
 
 
-def _between(size: int, count: int) -> Float32[np.ndarray, "size count"]:
-    """Weights of the nodes for each pixel along one side."""
-    place = np.arange(size) / STEP_PX
-    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(count)[None])).astype(np.float32)
+def nodes_along(size: int) -> int:
+    """How many nodes a side of a picture has: the last one is at its last pixel or a little outside."""
+    return -((1 - size) // STEP_PX) + 1
+
+
+def _between(size: int, count: int, like: Tensor) -> Float[Tensor, "size count"]:
+    """Weights of the nodes for each pixel along one side: multiples of 1 / STEP_PX, exact in any type."""
+    place = torch.arange(size, dtype=like.dtype, device=like.device) / STEP_PX
+    nodes = torch.arange(count, dtype=like.dtype, device=like.device)
+    return (1.0 - (place[:, None] - nodes).abs()).clamp(min=0.0)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -43,6 +44,9 @@ class Technique:
     """
 
     name: ClassVar[str]
+
+    def move_to(self, device: torch.device) -> None:
+        """Take what is kept as tensors to where the model is trained; before the first iteration."""
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
         """How to render, e.g. with depths."""

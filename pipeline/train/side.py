@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -27,6 +28,12 @@ class SideModel:
     def __init__(self, tensors: Mapping[str, Tensor], epsilon: float = 1e-15) -> None:
         self.tensors = {name: tensor.detach().clone().requires_grad_() for name, tensor in tensors.items()}
         self.adam = Adam(self.tensors, epsilon=epsilon)
+
+    def move_to(self, device: torch.device) -> None:
+        """Take the tensors, nothing of them trained, to where they are trained."""
+        if any(tensor.device != device for tensor in self.tensors.values()):
+            self.tensors = {name: tensor.detach().to(device).requires_grad_() for name, tensor in self.tensors.items()}
+            self.adam = Adam(self.tensors, epsilon=self.adam.epsilon)
 
     def descend(self, rates: Mapping[str, Rate], rows: Bool[Tensor, " n"] | None = None) -> None:
         """Step the tensors against their gradients, which are dropped.

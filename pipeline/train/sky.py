@@ -12,10 +12,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64, Shaped
@@ -27,14 +25,14 @@ from splatpipe.pipeline.photos.images import reduced_sky, reduced_view
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
+from splatpipe.pipeline.splat.upload import rgb_beside
 from splatpipe.pipeline.train.draws import ELSEWHERE
 from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.seen_sky import PhotoSkies, SeenSky
 from splatpipe.pipeline.train.side import SideModel
 
 LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
 MOST_ERROR_PX = 2.0
-SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
-RIM_PX = 3  # around the sky, of ``WORK_MEGAPIXELS``: what the search may have left of it, and thin things before it
 OPACITY_WEIGHT = 0.1  # of the mean opacity before the sky in the loss; judgement
 SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills what no photo shows
 FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # of the colours, a step, from the start to the end of the schedule
@@ -45,19 +43,6 @@ LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour
 RGB = tuple[float, float, float]
 
 _COLOURS = "colours"
-
-
-@dataclass(frozen=True)
-class SeenSky:
-    """A photo's sky.
-
-    Attributes:
-        mask: Where it surely is.
-        around: The same and its surroundings.
-    """
-
-    mask: Bool[Tensor, "h w"]
-    around: Bool[Tensor, "h w"]
 
 
 class SkyModel(SideModel, Technique):
@@ -81,17 +66,23 @@ class SkyModel(SideModel, Technique):
         """
         super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
         self.panorama = Panorama(up, self.tensors[_COLOURS])
-        self._masks = {name: mask for name, mask in masks.items() if mask.any()}
+        self._skies = PhotoSkies(masks)
         self._seen: SeenSky | None = None  # of the photo that is trained on
 
     def copied(self) -> SkyModel:
         """The same with tensors of its own; the masks, which nothing changes, are shared."""
-        return copy.deepcopy(self, {id(self._masks): self._masks})
+        return copy.deepcopy(self, {id(self._skies): self._skies})
+
+    def move_to(self, device: torch.device) -> None:
+        """Take the colours and the masks to where they are trained."""
+        super().move_to(device)
+        self.panorama = Panorama(self.panorama.up, self.tensors[_COLOURS])
+        self._skies = self._skies.on(device)
 
     @property
     def photos(self) -> int:
         """In how many photos there is sky."""
-        return len(self._masks)
+        return len(self._skies)
 
     @staticmethod
     def begin(views: Sequence[View], dataset: Path, threads: int) -> SkyModel | None:
@@ -154,12 +145,13 @@ class SkyModel(SideModel, Technique):
             background: Stays behind everything below the horizon.
             elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
         """
-        behind = self.panorama.behind(camera, background)
+        look, colours = self.panorama.look(camera), self.panorama.colours
+        behind = look.behind(colours, background)
         if seen is None:
             return laid_over(rendered.colour, rendered.alpha, background, behind.detach())
-        flat = Panorama(self.panorama.up, behind.new_tensor(elsewhere).expand_as(self.panorama.colours))
+        flat = look.behind(rgb_beside(elsewhere, colours).expand_as(colours), background)
         behind = torch.where(seen.mask[:, :, None], behind, behind.detach())
-        behind = torch.where(seen.around[:, :, None], behind, flat.behind(camera, background))
+        behind = torch.where(seen.around[:, :, None], behind, flat)
         return laid_over(rendered.colour, rendered.alpha, background, behind)
 
     def loss(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None) -> Float[Tensor, ""]:
@@ -169,12 +161,7 @@ class SkyModel(SideModel, Technique):
 
     def seen(self, camera: Camera) -> SeenSky | None:
         """The sky of a training photo at the size of ``camera``; None where it shows none."""
-        found = self._masks.get(camera.name)
-        if found is None:
-            return None
-        share = found.unpacked().astype(np.float32)
-        wider = np.asarray(cv2.dilate(share, np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)))
-        return SeenSky(_surely(share, camera), _surely(wider, camera))
+        return self._skies.seen(camera)
 
     def step(self, share: float) -> None:
         """Step the colours against their gradient, which is dropped.
@@ -185,14 +172,6 @@ class SkyModel(SideModel, Technique):
         rate = math.exp(math.log(FIRST_RATE) * (1.0 - share) + math.log(LAST_RATE) * share)
         self.descend({_COLOURS: rate})
         self.panorama.colours.detach().clamp_(0.0, 1.0)
-
-
-def _surely(share: Float32[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
-    if share.shape != (camera.height, camera.width):
-        shrinks = camera.height < share.shape[0]
-        way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        share = np.asarray(cv2.resize(share, (camera.width, camera.height), interpolation=way), np.float32)
-    return torch.from_numpy(share > SURE)
 
 
 def roughness(colours: Float[Tensor, "cells 3"]) -> Float[Tensor, ""]:

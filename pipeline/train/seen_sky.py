@@ -1,0 +1,107 @@
+"""Where a training photo shows the sky, at the size that it is trained at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.sky_mask import SkyMask
+
+SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
+RIM_PX = 3  # around the sky, of ``WORK_MEGAPIXELS``: what the search may have left of it, and thin things before it
+
+
+@dataclass(frozen=True)
+class SeenSky:
+    """A photo's sky.
+
+    Attributes:
+        mask: Where it surely is.
+        around: The same and its surroundings.
+    """
+
+    mask: Bool[Tensor, "h w"]
+    around: Bool[Tensor, "h w"]
+
+
+class PhotoSkies:
+    """The skies of all photos.
+
+    Args:
+        masks: By the photos' names; those without sky may be left out.
+    """
+
+    def __init__(self, masks: Mapping[str, SkyMask]) -> None:
+        self._masks = {name: mask for name, mask in masks.items() if mask.any()}
+        self._bits: dict[str, UInt8[Tensor, " n"]] = {}  # on a device, where photos are trained on one
+
+    def __len__(self) -> int:
+        """In how many photos there is sky."""
+        return len(self._masks)
+
+    def on(self, device: torch.device) -> PhotoSkies:
+        """The same for training on a device: the masks, an eighth of a byte a pixel, are kept there."""
+        moved = PhotoSkies(self._masks)
+        if device.type != "cpu":
+            moved._bits = {name: torch.from_numpy(mask.bits).to(device) for name, mask in self._masks.items()}
+        return moved
+
+    def seen(self, camera: Camera) -> SeenSky | None:
+        """The sky of a photo at the size of ``camera``; None where it shows none."""
+        found = self._masks.get(camera.name)
+        if found is None:
+            return None
+        bits = self._bits.get(camera.name)
+        return seen_by_cpu(found, camera) if bits is None else seen_by_device(bits, found.shape, camera)
+
+
+def seen_by_cpu(found: SkyMask, camera: Camera) -> SeenSky:
+    """A photo's sky at the size of ``camera``."""
+    share = found.unpacked().astype(np.float32)
+    wider = np.asarray(cv2.dilate(share, np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)))
+    return SeenSky(_surely(share, camera), _surely(wider, camera))
+
+
+def seen_by_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camera: Camera) -> SeenSky:
+    """The same from a mask's bits, made where they are; only rounding may differ.
+
+    Args:
+        bits: ``SkyMask.bits``.
+        shape: ``SkyMask.shape``.
+        camera: A training photo's.
+    """
+    places = torch.arange(7, -1, -1, dtype=torch.uint8, device=bits.device)  # the first pixel is the highest bit
+    flat = torch.bitwise_and(torch.bitwise_right_shift(bits[:, None], places), 1).flatten()
+    share = flat[: shape[0] * shape[1]].reshape(1, *shape).float()
+    wider = functional.max_pool2d(share, 2 * RIM_PX + 1, stride=1, padding=RIM_PX)
+    down, right = (_resizing(*sides, share) for sides in zip(shape, (camera.height, camera.width), strict=True))
+    mask, around = down @ torch.cat((share, wider)) @ right.T > SURE
+    return SeenSky(mask, around)
+
+
+def _surely(share: Float32[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
+    if share.shape != (camera.height, camera.width):
+        shrinks = camera.height < share.shape[0]
+        way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        share = np.asarray(cv2.resize(share, (camera.width, camera.height), interpolation=way), np.float32)
+    return torch.from_numpy(share > SURE)
+
+
+def _resizing(old: int, new: int, like: Tensor) -> Float[Tensor, "new old"]:
+    """Weights of the old pixels for each new one along a side: their overlap where it shrinks, else bilinear."""
+    step = old / new
+    before = torch.arange(old, dtype=like.dtype, device=like.device)
+    after = torch.arange(new, dtype=like.dtype, device=like.device)[:, None] * step
+    if step > 1.0:
+        overlap = torch.minimum(after + step, before + 1.0) - torch.maximum(after, before)
+        return overlap.clamp(min=0.0) / step
+    middle = (after + (0.5 * step - 0.5)).clamp(0.0, old - 1.0)
+    return (1.0 - (middle - before).abs()).clamp(min=0.0)
