@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -17,6 +18,8 @@ from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, RenderOptions, isa_name, kernels_name, render
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.densify import _split_offsets
+from splatpipe.pipeline.train.draws import SPLIT_POSITION, uniform
 from splatpipe.pipeline.train.dropout import _Dropped
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
@@ -197,6 +200,16 @@ def test_adam_alone_is_the_cpus(kernels):
         found.append([tensor.detach() for tensor in (*tensors.values(), *optimizer.state_dict().values())])
     for ours, expected in zip(found[1], found[0], strict=True):
         torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-7)
+
+
+def test_draws_and_places_are_the_cpus(kernels):
+    draw, scene = (-7, 300, SPLIT_POSITION), random_scene(0)
+    assert torch.equal(kernels.uniform(*draw, 100), torch.from_numpy(uniform(*draw, np.arange(100))))
+    rows = torch.tensor([3, 59, 20])
+    offsets = kernels.split_offsets(draw, rows, scene.log_scales, scene.quats)
+    torch.testing.assert_close(offsets, _split_offsets(scene, rows, *draw[:2]), rtol=1e-4, atol=1e-5)
+    means = torch.tensor([[1.9, 1.9, 1.9], [0.1, 0.1, 0.1], [1.9, 0.1, 0.1], [0.1, 0.2, 0.1]])
+    assert kernels.morton(means, (0.0, 0.0, 0.0), (2.0, 2.0, 2.0)).argsort().tolist() == [1, 3, 2, 0]
 
 
 def test_a_view_in_many_chunks_has_the_same_bits_and_is_foreseen(kernels):

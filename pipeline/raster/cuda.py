@@ -149,16 +149,16 @@ class CudaKernels:
         self,
         draw: tuple[int, int, int],
         rows: Int64[Tensor, " k"],
-        log_scales: Float[Tensor, "k 3"],
-        quats: Float[Tensor, "k 4"],
-    ) -> Float[Tensor, "2k 3"]:
+        log_scales: Float[Tensor, "n 3"],
+        quats: Float[Tensor, "n 4"],
+    ) -> Float[Tensor, "two_k 3"]:
         """Two places within each parent, relative to its mean: the first of all, then the second of all.
 
         Args:
             draw: Seed, step and stream, as of ``train.draws``.
-            rows: The parents' rows, by which their random numbers are drawn.
-            log_scales: Of the parents.
-            quats: Of the parents.
+            rows: The parents' in the model.
+            log_scales: The model's.
+            quats: The model's.
         """
         out = torch.empty(2 * len(rows), 3, device=self.device)
         rows, log_scales, quats = rows.contiguous(), log_scales.contiguous(), quats.contiguous()
