@@ -5,7 +5,6 @@
 #pragma once
 
 #include "frame.h"
-#include "project.cuh"
 
 namespace splat {
 namespace cuda {
@@ -36,6 +35,16 @@ __device__ __forceinline__ float inverse(float x) {
 #else  // within one unit of the last place, at a tenth of a division's cost
     float y;
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#endif
+}
+
+__device__ __forceinline__ float root(float x) {
+#if SPLAT_ON_CPU
+    return sqrtf(x);
+#else
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
     return y;
 #endif
 }
@@ -103,12 +112,15 @@ struct Ellipse {
     float x, y;  // centre
     float c, slope, inv_a, reach, half_y, rows_dy;
 
-    __device__ __forceinline__ Ellipse(const Record& record, const TileList& list) {
-        const Splat s = expand(record);
+    // What expand makes of a record, but by fast operations: each is off by a few units of the last place, which is
+    // little beside the slack, and exact ones would be much of the work on a pair.
+    __device__ __forceinline__ Ellipse(const Record& s, const TileList& list) {
+        const float tight = fmaxf(s.log2_opacity - kLog2AlphaMin, 0.0f);
         x = s.x - static_cast<float>(list.left) - 0.5f, y = s.y - static_cast<float>(list.top) - 0.5f;
-        c = s.c, slope = s.slope, inv_a = s.inv_a, rows_dy = s.rows_dy;
-        reach = fmaf(s.reach, kReachSlack, s.reach) + kReachSlack;
-        half_y = sqrtf(reach) / c;
+        c = s.c, inv_a = inverse(s.a), slope = -s.b * inv_a;
+        rows_dy = -s.b * inverse(s.c) * root(tight * inverse(fmaf(s.b, s.b, s.c * s.c)));
+        reach = fmaf(tight, kReachSlack, tight) + kReachSlack;
+        half_y = root(reach) * inverse(s.c);
     }
 
     // Which of a band's two sub-blocks have a pixel centre between the leftmost and the rightmost point that the
@@ -126,7 +138,7 @@ struct Ellipse {
 
     __device__ __forceinline__ float half_chord(float dy) const {
         const float v = c * dy;
-        return inv_a * sqrtf(fmaxf(fmaf(-v, v, reach), 0.0f));
+        return inv_a * root(fmaxf(fmaf(-v, v, reach), 0.0f));
     }
 };
 
@@ -146,7 +158,7 @@ __device__ __forceinline__ void stage(const Job& job, const TileList& list, int3
         stage_start(s, list, thread, batch);
         batch->rest[thread] = make_float4(s.blue, s.depth, s.depth_u, s.depth_v);
         const Ellipse ellipse(s, list);
-#pragma unroll
+#pragma unroll 2  // all four at once take more registers than four blocks leave
         for (int band = 0; band < kBands; ++band) touched |= ellipse.sub_blocks(band) << (2 * band);
     }
 #pragma unroll

@@ -71,7 +71,7 @@ struct BackBatch {
     using Of = Fields<kDepth, kMagnitudes>;
     Batch<Of::kBatch> pairs;
     uint32_t slots[Of::kBatch];
-    unsigned summed[kWarps][Batch<Of::kBatch>::kWords];  // by warp, a bit a pair: `sums` has something
+    unsigned summed[Batch<Of::kBatch>::kWords][kWarps];  // by warp, a bit a pair: `sums` has something
     float sums[Of::kBatch][kWarps][Of::kValues];
     int32_t last[kWarps];
 };
@@ -192,7 +192,7 @@ __device__ __forceinline__ void walk_back(const Place& at, int32_t from, int32_t
             if (own >= 0) batch->sums[i][warp][own] = sum;
             summed |= 1u << bit;
         }
-        if (lane == 0) batch->summed[warp][word] = summed;
+        if (lane == 0) batch->summed[word][warp] = summed;
     }
 }
 
@@ -209,11 +209,12 @@ __device__ __forceinline__ void put_slots(const Job& job, const BackBatch<kDepth
     const int value = Of::value_of(field);
 #pragma unroll 1
     for (int i = thread / kSlotThreads; i < pairs; i += kSlotsAtOnce) {
+        const unsigned (&words)[kWarps] = batch.summed[i / kWarp];
         float sum = 0.0f;
         if (value >= 0) {
 #pragma unroll
             for (int warp = 0; warp < kWarps; ++warp)
-                if (batch.summed[warp][i / kWarp] >> (i % kWarp) & 1) sum += batch.sums[i][warp][value];
+                if (words[warp] >> (i % kWarp) & 1) sum += batch.sums[i][warp][value];
         }
         job.back.slots[static_cast<int64_t>(batch.slots[i]) * Of::kFloats + field] = sum;
     }
