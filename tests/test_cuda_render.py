@@ -304,12 +304,16 @@ def test_short_memory_makes_chunks_smaller_then_is_told():
 
 
 def test_an_empty_model_is_the_background(kernels):
-    nothing = Gaussians.empty(0, 3).requires_grad_()
+    nothing, buffers = Gaussians.empty(0, 3).requires_grad_(), GradientBuffers()
     with use_kernels(kernels):
-        rendered = render(nothing, CAMERA, OPTIONS)
+        render(nothing, CAMERA, OPTIONS).colour.sum().backward()
+        assert nothing.means.grad.shape == (0, 3)
+        for tensor in nothing.tensors().values():
+            tensor.grad = None
+        rendered = render(nothing, CAMERA, OPTIONS, buffers=buffers)
         torch.testing.assert_close(rendered.colour, torch.tensor(OPTIONS.background).expand(53, 70, 3))
         rendered.colour.sum().backward()
-    assert nothing.means.grad.shape == (0, 3)
+        Adam(nothing.tensors()).step(nothing.tensors(), RATES, rendered.visible, buffers, LIMITS)
 
 
 def test_only_what_kernels_take_goes_to_them(kernels):
@@ -319,6 +323,8 @@ def test_only_what_kernels_take_goes_to_them(kernels):
         assert render(doubles, CAMERA, OPTIONS).colour.dtype == torch.float64
         with pytest.raises(ValueError, match="float64"):
             render(doubles, CAMERA, OPTIONS, backend="cuda")
+        with pytest.raises(ValueError, match="a tensor on meta"):
+            photo_loss(torch.rand(9, 9, 3), torch.rand(9, 9, 3, device="meta"))
     assert kernels_name(torch.device("cpu")) == isa_name()
     with pytest.raises(ValueError, match="no CUDA kernels"):
         render(random_scene(0), CAMERA, OPTIONS, backend="cuda")

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatShot
+from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatRows, SplatShot
 from splatpipe.pipeline.raster.cuda_forecast import Forecast
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, load, why_not
 from splatpipe.pipeline.splat.upload import upload
@@ -58,6 +58,22 @@ class CudaKernels:
         memory = torch.empty(size_bytes + ALIGNMENT, dtype=torch.uint8, device=self.device)
         return memory[-memory.data_ptr() % ALIGNMENT :]
 
+    def at(self, tensor: Tensor | None) -> int | None:
+        """Where a tensor's memory is; None for none, and for one without any.
+
+        Raises:
+            ValueError: if that is nowhere a kernel may look.
+        """
+        if tensor is None:
+            return None
+        if tensor.device != self.device or not tensor.is_contiguous():
+            raise ValueError(f"a tensor on {tensor.device} is not a contiguous one on {self.device}")
+        return tensor.data_ptr() or None
+
+    def rows(self, tensors: Sequence[Tensor]) -> SplatRows:
+        """Tensors in the order of ``PARAMETERS``, as the library takes them."""
+        return SplatRows(*map(self.at, tensors))
+
     def call(self, name: str, *arguments: object) -> None:
         """A function of ``cuda_api.CALLS`` on the current stream, the last argument; errors as of ``CudaLibrary``."""
         self._library.call(name, *arguments, self.stream())
@@ -86,15 +102,15 @@ class CudaKernels:
         value = torch.empty((), dtype=torch.float64, device=self.device)
         size = self._library.size("splat_loss_bytes", width, height)
         memory = self.empty(size)
-        pictures = (pointer(render), pointer(photo), pointer(mask), width, height, ssim_weight)
-        self.call("splat_photo_loss", *pictures, pointer(gradient), pointer(value), pointer(memory), size)
+        pictures = (self.at(render), self.at(photo), self.at(mask), width, height, ssim_weight)
+        self.call("splat_photo_loss", *pictures, self.at(gradient), self.at(value), self.at(memory), size)
         return value.to(torch.float32), gradient
 
     def affine_colour(self, affine: Float[Tensor, "3 4"], picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """The picture's colours through the map; both contiguous float32."""
         out = torch.empty_like(picture)
         pixels = picture.numel() // 3
-        self.call("splat_affine_colour", pointer(affine), pointer(picture), pixels, pointer(out))
+        self.call("splat_affine_colour", self.at(affine), self.at(picture), pixels, self.at(out))
         return out
 
     def affine_colour_backward(
@@ -105,8 +121,8 @@ class CudaKernels:
         pixels = picture.numel() // 3
         size = self._library.size("splat_affine_bytes", pixels)
         memory = self.empty(size)
-        inputs = (pointer(affine), pointer(picture), pointer(upstream), pixels)
-        outputs = (pointer(gradient), pointer(by_affine), pointer(memory), size)
+        inputs = (self.at(affine), self.at(picture), self.at(upstream), pixels)
+        outputs = (self.at(gradient), self.at(by_affine), self.at(memory), size)
         self.call("splat_affine_colour_backward", *inputs, *outputs)
         return gradient, by_affine
 
@@ -130,19 +146,19 @@ class CudaKernels:
         given = SplatAdam(tensors=len(widths), rows=len(rows.values[0]) if widths else 0)
         for number, end in enumerate(ends):
             given.widths[number] = widths[number]
-            given.values[number] = pointer(rows.values[number])
-            given.gradients[number] = pointer(rows.gradients[number])
-            given.means[number] = pointer(rows.means[number])
-            given.squares[number] = pointer(rows.squares[number])
-            given.rates[number] = pointer(rates[end - widths[number] :])
-        given.visible, given.skipped = pointer(rows.visible), pointer(skipped)
+            given.values[number] = self.at(rows.values[number])
+            given.gradients[number] = self.at(rows.gradients[number])
+            given.means[number] = self.at(rows.means[number])
+            given.squares[number] = self.at(rows.squares[number])
+            given.rates[number] = self.at(rates[end - widths[number] :])
+        given.visible, given.skipped = self.at(rows.visible), self.at(skipped)
         given.beta1, given.beta2, given.epsilon, given.step = options
         self.call("splat_adam", ctypes.byref(given))
 
     def uniform(self, seed: int, step: int, stream: int, count: int) -> Float64[Tensor, " n"]:
         """``train.draws.uniform`` of the indices 0 to count - 1."""
         out = torch.empty(count, dtype=torch.float64, device=self.device)
-        self.call("splat_uniform", *_words(seed, step, stream), count, pointer(out))
+        self.call("splat_uniform", *_words(seed, step, stream), count, self.at(out))
         return out
 
     def split_offsets(
@@ -162,8 +178,8 @@ class CudaKernels:
         """
         out = torch.empty(2 * len(rows), 3, device=self.device)
         rows, log_scales, quats = rows.contiguous(), log_scales.contiguous(), quats.contiguous()
-        parents = (pointer(rows), len(rows), pointer(log_scales), pointer(quats))
-        self.call("splat_split_offsets", *_words(*draw), *parents, pointer(out))
+        parents = (self.at(rows), len(rows), self.at(log_scales), self.at(quats))
+        self.call("splat_split_offsets", *_words(*draw), *parents, self.at(out))
         return out
 
     def morton(
@@ -173,7 +189,7 @@ class CudaKernels:
         out = torch.empty(len(means), dtype=torch.int64, device=self.device)
         box = (ctypes.c_float * 3)(*lowest), (ctypes.c_float * 3)(*size)
         means = means.contiguous()
-        self.call("splat_morton", pointer(means), len(means), *box, pointer(out))
+        self.call("splat_morton", self.at(means), len(means), *box, self.at(out))
         return out
 
 
@@ -227,14 +243,6 @@ def cuda_device(device: torch.device) -> CudaDevice | None:
     """The device that kernels run on, None for the CPU's own."""
     kernels = kernels_of(device)
     return None if kernels is None else kernels.facts
-
-
-def pointer(tensor: Tensor | None) -> int | None:
-    """Where a tensor's memory is; None for none, and for one without any."""
-    if tensor is None:
-        return None
-    assert tensor.is_contiguous()
-    return tensor.data_ptr() or None
 
 
 def _words(*numbers: int) -> tuple[int, ...]:

@@ -5,6 +5,7 @@ What a frame has more than was foreseen is rendered all the same, with the same 
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from dataclasses import dataclass
 
@@ -110,9 +111,14 @@ class Forecast:
         self._seen = 0  # frames in this window
         self._last = Room(0, 0)
         self._last_count = 0
+        self._lock = threading.Lock()  # pages of the viewer are rendered by several threads
 
     def room(self, size: FrameSize) -> Room:
         """What the next frame gets; never waits."""
+        with self._lock:
+            return self._room(size)
+
+    def _room(self, size: FrameSize) -> Room:
         while self._readings and self._readings[0].arrived():
             self.learn(self._readings.popleft().facts())
         known = [facts for facts in (self._before, self._recent) if facts is not None]

@@ -15,12 +15,11 @@ from torch.autograd.function import once_differentiable
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster.cuda import CudaKernels, pointer
+from splatpipe.pipeline.raster.cuda import CudaKernels
 from splatpipe.pipeline.raster.cuda_api import (
     SplatFrame,
     SplatPictureGradients,
     SplatPictures,
-    SplatRows,
     SplatShot,
     SplatStep,
 )
@@ -78,9 +77,9 @@ class CudaFrame:
         kernels.call(
             "splat_forward",
             *frame._said(None),
-            ctypes.byref(SplatPictures(*map(pointer, pictures))),
-            pointer(radii),
-            pointer(visible),
+            ctypes.byref(SplatPictures(*map(kernels.at, pictures))),
+            kernels.at(radii),
+            kernels.at(visible),
         )
         kernels.forecast.read_later(memory, size, room.capacity)
         return frame
@@ -95,7 +94,7 @@ class CudaFrame:
             torch.OutOfMemoryError: if there is too little.
         """
         back = self.kernels.empty(self.kernels.back_bytes(self.shot, len(self.parameters[0]), self.capacity))
-        gradients = SplatPictureGradients(*map(pointer, pictures))
+        gradients = SplatPictureGradients(*map(self.kernels.at, pictures))
         self.kernels.call("splat_blend_backward", *self._said(back), ctypes.byref(gradients))
         return back
 
@@ -103,27 +102,27 @@ class CudaFrame:
         """From there to the gradients of the parameters, and of the centres on the screen."""
         gradients = tuple(torch.empty_like(tensor) for tensor in self.parameters)
         means2d = torch.empty(len(self.parameters[0]), 2, device=self.kernels.device)
-        rows = rows_of(gradients)
-        self.kernels.call("splat_project_backward", *self._said(back), ctypes.byref(rows), pointer(means2d))
+        rows, at = self.kernels.rows(gradients), self.kernels.at(means2d)
+        self.kernels.call("splat_project_backward", *self._said(back), ctypes.byref(rows), at)
         return gradients, means2d
 
     def step(self, back: Tensor, step: SplatStep, means2d: Float[Tensor, "n 2"] | None) -> None:
         """The same, and at once a step of Adam."""
         shot, _, frame = self._said(back)
-        self.kernels.call("splat_step", shot, frame, ctypes.byref(step), pointer(means2d))
+        self.kernels.call("splat_step", shot, frame, ctypes.byref(step), self.kernels.at(means2d))
 
     def _said(self, back: Tensor | None) -> tuple[object, object, object]:
         """The shot, the parameters and the frame, as the library takes them."""
         frame = SplatFrame(
-            memory=pointer(self.memory),
+            memory=self.kernels.at(self.memory),
             bytes=self.memory.numel(),
-            back=pointer(back),
+            back=self.kernels.at(back),
             back_bytes=0 if back is None else back.numel(),
             count=len(self.parameters[0]),
             capacity=self.capacity,
             passes=self.passes,
         )
-        return ctypes.byref(self.shot), ctypes.byref(rows_of(self.parameters)), ctypes.byref(frame)
+        return ctypes.byref(self.shot), ctypes.byref(self.kernels.rows(self.parameters)), ctypes.byref(frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +163,8 @@ class UnfinishedBackward:
         """
         if not self.logits_are_leaf:
             assert logits.grad is not None
-            step.logit_gain = pointer(logits.grad)
-            step.logits = pointer(self.frame.parameters[PARAMETERS.index("opacity_logits")])
+            step.logit_gain = self.frame.kernels.at(logits.grad)
+            step.logits = self.frame.kernels.at(self.frame.parameters[PARAMETERS.index("opacity_logits")])
         means2d = None if self.probe is None else torch.empty_like(self.probe)
         self.frame.step(self.back, step, means2d)
         if self.probe is not None:
@@ -288,8 +287,3 @@ def shot_of(camera: Camera, options: RenderOptions, sh_count: int) -> SplatShot:
         *(camera.width, camera.height, options.sh_degree, sh_count),
         *(options.antialias, options.depth, options.magnitudes),
     )
-
-
-def rows_of(tensors: Sequence[Tensor]) -> SplatRows:
-    """Tensors in the order of ``PARAMETERS``, as the library takes them."""
-    return SplatRows(*map(pointer, tensors))

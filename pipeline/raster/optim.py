@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import AdamRows, kernels_of, pointer
+from splatpipe.pipeline.raster.cuda import AdamRows, kernels_of
 from splatpipe.pipeline.raster.cuda_api import SplatStep
-from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward, rows_of
+from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward
 from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
@@ -150,17 +150,18 @@ class Adam:
         """Finish a backward pass and step at once."""
         low, high = (limits or {}).get("log_scales", (-math.inf, math.inf))
         sh = torch.as_tensor(rates["sh"], dtype=torch.float32).reshape(-1)
+        kernels = unfinished.frame.kernels
         step = SplatStep(
-            values=rows_of([parameters[name].detach() for name in PARAMETERS]),
-            means=rows_of([self.mean[name] for name in PARAMETERS]),
-            squares=rows_of([self.square[name] for name in PARAMETERS]),
+            values=kernels.rows([parameters[name] for name in PARAMETERS]),
+            means=kernels.rows([self.mean[name] for name in PARAMETERS]),
+            squares=kernels.rows([self.square[name] for name in PARAMETERS]),
             rate_sh_rest=float(sh[-1]),
             epsilon=self.epsilon,
             step=self.step_count,
             sparse=sparse,
             log_scale_min=low,
             log_scale_max=high,
-            skipped=pointer(self._skipped),
+            skipped=kernels.at(self._skipped),
         )
         step.beta1, step.beta2 = self.betas
         step.rates = (*(float(rates[name]) for name in PARAMETERS if name != "sh"), float(sh[0]))
