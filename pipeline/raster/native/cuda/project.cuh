@@ -23,7 +23,7 @@ __device__ __forceinline__ Splat expand(const Record& r) {
     s.colour[0] = r.red, s.colour[1] = r.green, s.colour[2] = r.blue;
     s.depth = r.depth;
     s.slope = -r.b / r.a, s.inv_a = 1.0f / r.a;
-    s.reach = r.log2_opacity - kLog2AlphaMin;
+    s.reach = __fsub_rn(r.log2_opacity, kLog2AlphaMin);  // not fused with what the logarithm ends with
     s.rows_dy = -lane::root(s.reach) * r.b / (r.c * sqrtf(lane::fused(r.b, r.b, r.c * r.c)));
     s.depth_u = r.depth_u, s.depth_v = r.depth_v;
     return s;
