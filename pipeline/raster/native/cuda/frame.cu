@@ -128,7 +128,7 @@ __device__ inline void bin_chunk(const Job& job, int chunk) {
 
 // What nobody foresaw, by one block.
 template <bool kDepth>
-__global__ void __launch_bounds__(kThreads) rest_kernel(Job job, int first) {
+__global__ void __launch_bounds__(kThreads, 1) rest_kernel(Job job, int first) {
     for (int chunk = first; is_chunk(job, chunk); ++chunk) {
         bin_chunk(job, chunk);
         blend_tiles<kDepth>(job, chunk);
@@ -137,7 +137,7 @@ __global__ void __launch_bounds__(kThreads) rest_kernel(Job job, int first) {
 }
 
 template <bool kDepth, bool kMagnitudes>
-__global__ void __launch_bounds__(kThreads) rest_back_kernel(Job job, int first) {
+__global__ void __launch_bounds__(kThreads, 1) rest_back_kernel(Job job, int first) {
     if (job.at.header->facts.chunks == 1) return;
     for (int chunk = first; is_chunk(job, chunk); ++chunk) {
         bin_chunk(job, chunk);
@@ -223,9 +223,8 @@ int64_t lay_out(void* memory, int64_t count, int64_t tiles, int64_t capacity, Fr
     at->header = carver.take<Header>(1);
     at->records = carver.take<Record>(count);
     at->rows = carver.take<uint32_t>(count);
-    for (int i = 0; i < 2; ++i) at->keys[i] = carver.take<uint32_t>(count);
-    for (int i = 0; i < 2; ++i) at->order[i] = carver.take<int32_t>(count);
-    at->offsets = at->keys[1];
+    at->order[0] = carver.take<int32_t>(count);
+    at->offsets = carver.take<uint32_t>(count);
     at->block_sums = carver.take<uint32_t>(divide_up(count, kScanBlock) + 1);
     at->digit_table = carver.take<uint32_t>(kDigits * blocks);
     at->digit_sums = carver.take<uint32_t>(kDigits);
@@ -237,6 +236,9 @@ int64_t lay_out(void* memory, int64_t count, int64_t tiles, int64_t capacity, Fr
     for (int i = 0; i < 2; ++i) at->pair_keys[i] = carver.take<uint16_t>(capacity);
     for (int i = 0; i < 2; ++i) at->pair_values[i] = carver.take<uint32_t>(capacity);
     at->owners = carver.take<uint32_t>(capacity);
+    // Once depths are sorted, nobody asks for their keys; before, there are no pairs. `capacity` is at least `count`.
+    at->keys[0] = at->pair_values[0], at->keys[1] = at->pair_values[1];
+    at->order[1] = reinterpret_cast<int32_t*>(at->owners);
     return carver.bytes();
 }
 

@@ -46,9 +46,9 @@ struct FrameMemory {
     Header* header;
     Record* records;           // (n), meaningful where visible
     uint32_t* rows;            // (n): first tile row << 16 | number of tile rows; 0 rows where not visible
-    uint32_t* keys[2];         // (n): bits of the depth or kCulled; two for the sort
-    int32_t* order[2];         // (n): ranks to Gaussians, from near to far, in order[0] once sorted
-    uint32_t* offsets;         // (n) by rank: the first pair in the chunk; keys[1]'s memory, free after the sort
+    uint32_t* keys[2];         // (n): bits of the depth or kCulled, two for the sort; in the memory of pairs
+    int32_t* order[2];         // (n): ranks to Gaussians, from near to far, in order[0] once sorted; [1] as keys
+    uint32_t* offsets;         // (n) by rank: the first pair in the chunk
     uint32_t* block_sums;      // (ceil(n / kScanBlock) + 1)
     uint32_t* digit_table;     // (kDigits, sort blocks of max(n, c)), digits first
     uint32_t* digit_sums;      // (kDigits)
