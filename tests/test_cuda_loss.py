@@ -10,10 +10,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import _split_offsets
 from splatpipe.pipeline.train.draws import DROPOUT, SPLIT_POSITION, uniform
+from splatpipe.pipeline.train.dropout import dropped
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.schedule import resolve_schedule
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 from building import FORWARD, NATIVE, REVERSE, SHUFFLED, build_on_cpu, load
@@ -210,6 +215,16 @@ def test_uniform_numbers_are_those_of_the_cpu_to_the_bit(kernels: Kernels, seed:
     key = (ctypes.c_uint64(seed), ctypes.c_uint64(step), ctypes.c_uint64(DROPOUT))
     called(kernels, kernels.splat_uniform, *key, ctypes.c_int64(1000), at(out))
     assert np.array_equal(out.numpy(), uniform(seed, step, DROPOUT, np.arange(1000)))
+
+
+def test_dropout_on_a_device_drops_the_same_gaussians() -> None:
+    library = CudaLibrary(build_on_cpu())
+    gaussians = Gaussians.empty(500, 1)
+    schedule = resolve_schedule(TrainConfig(iterations=100, dropout=0.4))
+    expected = dropped(gaussians, schedule, 60).opacity_logits
+    with use_kernels(CudaKernels(library, torch.device("cpu"))):
+        assert torch.equal(dropped(gaussians, schedule, 60).opacity_logits, expected)
+    assert 0 < int((expected < -20.0).sum()) < 500
 
 
 def test_halves_of_a_split_lie_where_the_cpu_has_them(kernels: Kernels) -> None:

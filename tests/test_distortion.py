@@ -15,8 +15,10 @@ from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train.distortion import FREE_PX, HALF_PX, Distortion, depth_origin, spread_loss
+from splatpipe.pipeline.train.distortion import CENTRE_EVERY, FREE_PX, HALF_PX, Distortion, depth_origin, spread_loss
+from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 from splatpipe.pipeline.train.techniques import make_techniques
 from splatpipe.stages import initialize, train
 
@@ -91,6 +93,26 @@ def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> N
     for weight in (0.0, 0.1):
         plan = make_plan(tiny_scene.plain(distortion_weight=weight), views, tiny_scene.split_of(views), 9)
         assert (make_techniques(plan).find(Distortion) is not None) == (weight > 0.0)
+
+
+def test_on_a_device_the_centre_is_looked_for_seldom_and_goes_on_through_a_checkpoint() -> None:
+    model, camera, options = layers((4.0, 6.0), 0.6), FRONT, rasterizer.RenderOptions(0)
+    for device, moves in (("cpu", True), ("meta", False)):
+        distortion = Distortion(0.1, iterations=1)
+        moment = make_schedule().at(CENTRE_EVERY, 0)
+        distortion.settings(options, model, camera, moment)
+        moved = replace(model, means=model.means + 1.0)
+        elsewhere = replace(moved, means=moved.means.to(device))
+        later = make_schedule().at(CENTRE_EVERY + 1, 0)
+        found = distortion.settings(options, elsewhere, camera, later).depth_origin
+        assert found == pytest.approx(6.0 if moves else 5.0)
+        other = Distortion(0.1, iterations=1)
+        other.load(distortion.to_arrays())
+        assert other.settings(options, elsewhere, camera, later).depth_origin == found
+
+
+def make_schedule() -> Schedule:
+    return resolve_schedule(TrainConfig(iterations=2 * CENTRE_EVERY))
 
 
 def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:

@@ -100,6 +100,19 @@ def test_block_that_the_other_photos_contradict_is_left_out_and_little_else(robu
     assert robust.share_left_out() == pytest.approx(float((~counts).float().mean()) / 9.0, rel=1e-6)
 
 
+def test_a_device_that_works_on_all_cells_leaves_out_the_same(robust: Robust, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = Robust([camera.name for camera in cameras()])
+    other.watch(cameras())
+    an_epoch(robust), an_epoch(other)
+    photos = an_epoch(robust)
+    monkeypatch.setattr("splatpipe.pipeline.train.robust._worth_asking", lambda asked: torch.arange(len(asked)))
+    for number, photo in an_epoch(other).items():
+        expected = photos[number].mask
+        assert (photo.mask is None) == (expected is None)
+        assert photo.mask is None or expected is None or torch.equal(photo.mask, expected)
+    assert torch.equal(robust.scores, other.scores)
+
+
 def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(robust: Robust) -> None:
     """The model lacks a thing that all photos show: it has to be learnt."""
     for _ in range(2):

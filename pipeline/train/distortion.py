@@ -9,10 +9,11 @@ pixel rightly sees two depths.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
@@ -25,6 +26,7 @@ FIRST_SHARE = 0.2  # of the run, without it: the surface has to be found first
 LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth
 FREE_PX = 0.5  # standard deviation that costs nothing, pixels on the ground
 HALF_PX = 10.0  # beyond it at which half of the most is reached
+CENTRE_EVERY = 500  # iterations between looks for the model's centre on a device: by then it hardly moves
 
 
 class Distortion(Technique):
@@ -39,6 +41,7 @@ class Distortion(Technique):
 
     def __init__(self, weight: float, iterations: int) -> None:
         self._weight, self._iterations = weight, iterations
+        self._centre = torch.full((3,), torch.nan, dtype=torch.float64)  # kept on the CPU
 
     def is_counted(self, place: int) -> bool:
         """Whether it has a part in the loss at a place of the schedule, from 1."""
@@ -48,7 +51,24 @@ class Distortion(Technique):
         """With depths, measured from where float32 tells them best."""
         if not self.is_counted(now.place):
             return settings
-        return replace(settings, depth=True, depth_origin=depth_origin(model.means, camera))
+        if self._is_worn(model, now):
+            self._centre = model.means.detach().mean(dim=0).double().cpu()
+        return replace(settings, depth=True, depth_origin=depth_along(self._centre, camera))
+
+    def _is_worn(self, model: Gaussians, now: Moment) -> bool:
+        """Whether the model's centre has to be looked for again: on a device seldom, for that waits for it."""
+        if model.means.device.type == "cpu":
+            return True
+        return now.iteration % CENTRE_EVERY == 0 or bool(self._centre.isnan().any())
+
+    def to_arrays(self) -> dict[str, Tensor]:
+        """The centre, by which depths are rounded."""
+        return {"centre": self._centre}
+
+    def load(self, arrays: Mapping[str, Tensor]) -> None:
+        """The inverse of ``to_arrays``; where there is no centre, it is looked for again."""
+        if "centre" in arrays:
+            self._centre = arrays["centre"].clone()
 
     def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
         """The spread of the photo's rays, weighted."""
@@ -59,8 +79,13 @@ class Distortion(Technique):
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:
     """Where depths are measured from: that of the Gaussians' mean."""
+    return depth_along(means.detach().mean(dim=0).double(), camera)
+
+
+def depth_along(point: Float64[Tensor, " 3"], camera: Camera) -> float:
+    """A world point's depth along the camera's axis, world units."""
     pose = camera.cam_from_world
-    x, y, z = means.detach().mean(dim=0).tolist()
+    x, y, z = point.tolist()
     return float(pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3])
 
 

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.draws import DROPOUT, uniform
 from splatpipe.pipeline.train.hooks import Technique
@@ -41,7 +42,7 @@ def dropped(gaussians: Gaussians, schedule: Schedule, iteration: int) -> Gaussia
     share = share_at(schedule, iteration)
     if share == 0.0:
         return gaussians
-    drawn = torch.from_numpy(uniform(schedule.seed, iteration, DROPOUT, np.arange(len(gaussians))))
+    drawn = _drawn(schedule.seed, iteration, gaussians)
     logits = _Dropped.apply(gaussians.opacity_logits, drawn >= share, share)  # type: ignore[no-untyped-call]
     return replace(gaussians, opacity_logits=logits)
 
@@ -61,6 +62,14 @@ class Dropout(Technique):
     def before_render(self, model: Gaussians, now: Moment) -> Gaussians:
         """The Gaussians without those left out."""
         return dropped(model, self._schedule, now.place)
+
+
+def _drawn(seed: int, iteration: int, gaussians: Gaussians) -> Float64[Tensor, " n"]:
+    """A number in (0, 1) for each Gaussian, the same on every device."""
+    kernels = kernels_of(gaussians.opacity_logits.device)
+    if kernels is not None:
+        return kernels.uniform(seed, iteration, DROPOUT, len(gaussians))
+    return torch.from_numpy(uniform(seed, iteration, DROPOUT, np.arange(len(gaussians))))
 
 
 class _Dropped(torch.autograd.Function):

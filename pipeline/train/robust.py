@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn import functional
 
@@ -30,6 +30,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.witnesses import Witnesses
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them
 LEAST_CELL_PX = 4  # smaller photos have fewer: a cell has to average out detail
@@ -68,7 +69,7 @@ class Robust(Technique):
         scores: (n, GRID, GRID) residual of each cell, ``UNKNOWN`` where there is none.
         threshold: (1,) above which a cell stands out among all photos' cells; infinite before the first epoch's end.
         left_out: (n,) share of each photo that its last visit left out.
-        cameras: Of the photos in the order of ``scores``; not in the checkpoint.
+        witnesses: The photos' cameras in the order of ``scores``; not in the checkpoint, None where they are unknown.
     """
 
     name = "robust"
@@ -79,11 +80,18 @@ class Robust(Technique):
         self.scores = torch.full((len(names), GRID, GRID), UNKNOWN)
         self.threshold = torch.full((1,), torch.inf)
         self.left_out = torch.zeros(len(names))
-        self.cameras: list[Camera] = []
+        self.witnesses: Witnesses | None = None
 
     def watch(self, cameras: Iterable[Camera]) -> None:
         """Say where the photos were taken, of any size; without it nothing is contradicted, so nothing left out."""
-        self.cameras = sorted(cameras, key=lambda camera: self._row[camera.name])
+        ordered = sorted(cameras, key=lambda camera: self._row[camera.name])
+        self.witnesses = Witnesses.of(ordered, MOST_WITNESSES) if ordered else None
+
+    def move_to(self, device: torch.device) -> None:
+        """Take all to where photos are looked at."""
+        self.scores, self.threshold = self.scores.to(device), self.threshold.to(device)
+        self.left_out = self.left_out.to(device)
+        self.witnesses = None if self.witnesses is None else self.witnesses.to(device)
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
         """With depths, by which the photos' places are compared."""
@@ -117,52 +125,35 @@ class Robust(Technique):
             mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
             faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: nothing held against it
             self.scores[row] = torch.where(now < 0.0, faded, mixed)
-            cells = self._left_out_cells(row, photo.camera, rendered)
+            cells = self._left_out_cells(row, rendered)
             size = shown.shape[:2]
             out = functional.interpolate(cells[None, None].float(), size=size, mode="nearest")[0, 0] > 0.0
             self.left_out[row] = out.float().mean()
-        if not bool(out.any()):
+        if out.device.type == "cpu" and not bool(out.any()):  # on a device, to ask is to wait
             return photo
         return replace(photo, mask=~out if photo.mask is None else photo.mask & ~out)
 
-    def _left_out_cells(self, row: int, camera: Camera, rendered: Render) -> Bool[Tensor, "g g"]:
-        scores, threshold = self.scores[row], float(self.threshold)
-        none = torch.zeros_like(scores, dtype=torch.bool)
-        most = float(torch.quantile(scores, 1.0 - MOST_OF_A_PHOTO))
-        high, low = max(threshold, most), max(RIM * threshold, most)
-        if not bool((scores > high).any()):
-            return none
+    def _left_out_cells(self, row: int, rendered: Render) -> Bool[Tensor, "g g"]:
+        scores, threshold = self.scores[row], self.threshold
+        most = torch.quantile(scores, 1.0 - MOST_OF_A_PHOTO)
+        high, low = torch.maximum(threshold, most), torch.maximum(RIM * threshold, most)
         core = _voted(scores > high)
-        core &= self._contradicted(row, core, camera, rendered)
+        core &= self._contradicted(row, core, rendered)
         return (_near(core) & (scores > low)) | core
 
-    def _contradicted(
-        self, row: int, cells: Bool[Tensor, "g g"], camera: Camera, rendered: Render
-    ) -> Bool[Tensor, "g g"]:
+    def _contradicted(self, row: int, cells: Bool[Tensor, "g g"], rendered: Render) -> Bool[Tensor, "g g"]:
         """Of some cells, those where more of the other photos that see the place agree with the model than not."""
-        result = torch.zeros_like(cells)
+        result = torch.zeros_like(cells).flatten()
+        if self.witnesses is None:
+            return result.view_as(cells)
         alpha, depth_sum = _pooled(torch.stack((rendered.alpha, rendered.depth_sum)), (GRID, GRID)).double()
-        asked = cells & (alpha >= SURFACE_ALPHA)
-        v, u = (index.numpy() for index in torch.nonzero(asked, as_tuple=True))
-        if len(u) == 0 or not self.cameras:
-            return result
-        z = (depth_sum[asked] / alpha[asked]).numpy()
-        cell = np.array([camera.width, camera.height]) / GRID
-        places = camera.unproject((np.stack((u, v), axis=1) + 0.5) * cell, z)
-        agree, seen = np.zeros(len(u), np.int64), np.zeros(len(u), np.int64)
-        limit = float(self.threshold)
-        for other in self._witnesses(row):
-            score = _looked_up(self.scores[other].numpy(), self.cameras[other], places)
-            seen += score >= 0.0
-            agree += (score >= 0.0) & (score <= limit)
-        result[asked] = torch.from_numpy(2 * agree > seen)
-        return result
-
-    def _witnesses(self, row: int) -> list[int]:
-        """The photos nearest to one, itself left out."""
-        centres = np.array([camera.centre() for camera in self.cameras])
-        order = np.argsort(np.linalg.norm(centres - centres[row], axis=1), kind="stable")
-        return [int(other) for other in order if other != row][:MOST_WITNESSES]
+        asked = (cells & (alpha >= SURFACE_ALPHA)).flatten()
+        numbers = _worth_asking(asked)
+        middles = (torch.stack((numbers % GRID, numbers // GRID), dim=1) + 0.5) / GRID
+        depths = (depth_sum / alpha).flatten()[numbers]
+        places = self.witnesses.places(row, middles.double(), depths)
+        result[numbers] = asked[numbers] & self.witnesses.agree(row, places, self.scores, self.threshold)
+        return result.view_as(cells)
 
     def end_epoch(self, share: float) -> None:
         """Take the threshold from all photos' cells.
@@ -170,7 +161,7 @@ class Robust(Technique):
         Args:
             share: Of the cells that stand out at most.
         """
-        known = self.scores[self.scores >= 0.0].numpy()
+        known = self.scores[self.scores >= 0.0].cpu().numpy()
         if share <= 0.0 or len(known) == 0:
             self.threshold.fill_(torch.inf)
             return
@@ -214,16 +205,28 @@ def cell_residuals(
     size = (min(GRID, max(1, height // LEAST_CELL_PX)), min(GRID, max(1, width // LEAST_CELL_PX)))
     weight = _pooled(counts[None].float(), size)
     known = weight[0] >= 0.5
-    if not bool(known.any()):
-        return torch.full((GRID, GRID), UNKNOWN)
     model, picture = (
         _pooled(picture.permute(2, 0, 1) * counts, size) / weight.clamp(min=1e-6) for picture in (shown, colour)
     )
-    model = model - (model - picture)[:, known].median(dim=1).values[:, None, None]
+    model = model - _medians(model - picture, known)[:, None, None]
     usable = _nearby(known[None].float())[0] > 0.0
     apart = torch.where(usable, (_nearby(model) - picture[:, None]).abs().mean(dim=0), torch.inf)
     residual = torch.where(known, apart.amin(dim=0), UNKNOWN)
     return functional.interpolate(residual[None, None], size=(GRID, GRID), mode="nearest")[0, 0]
+
+
+def _medians(planes: Float[Tensor, "c gh gw"], known: Bool[Tensor, "gh gw"]) -> Float[Tensor, " c"]:
+    """The lower median of each plane's known cells, without asking how many those are; infinite if there are none."""
+    ordered = torch.where(known, planes, torch.inf).flatten(1).sort(dim=1).values
+    middle = (known.sum() - 1).clamp(min=0) // 2
+    return ordered.index_select(1, middle[None])[:, 0]
+
+
+def _worth_asking(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
+    """Numbers of the cells to work on: of those asked, but of all on a device, where to know how many is to wait."""
+    if asked.device.type == "cpu":
+        return torch.nonzero(asked).flatten()
+    return torch.arange(len(asked), device=asked.device)
 
 
 def _nearby(planes: Float[Tensor, "c gh gw"]) -> Float[Tensor, "c k gh gw"]:
@@ -244,12 +247,3 @@ def _voted(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
 
 def _near(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
     return functional.max_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0.0
-
-
-def _looked_up(scores: np.ndarray, camera: Camera, places: np.ndarray) -> np.ndarray:
-    """A photo's residuals at world points, ``UNKNOWN`` at those that it does not show."""
-    found = np.full(len(places), UNKNOWN)
-    rows, pixels, _ = camera.in_view(places)
-    u, v = (pixels * (GRID / np.array([camera.width, camera.height]))).astype(np.int64).T.clip(max=GRID - 1)
-    found[rows] = scores[v, u]
-    return found
