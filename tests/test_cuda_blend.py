@@ -331,6 +331,19 @@ def test_chunks_and_blocks_leave_the_same_bits(kernels, how):
     assert_same_bits(ours, expected)
 
 
+def test_gradients_that_are_not_given_are_zero(kernels):
+    scene = SCENES["odd size"]()
+    _, gradients = blend_exactly("odd size", True)
+    for given in ("colour", "alpha", "depth_sum", "depth_square_sum"):
+        zeros = {name: each * (1.0 if name == given else 0.0) for name, each in gradients.items()}
+        expected, _ = blend(kernels, scene, zeros, Blend(True, True))
+        # One of depth's must be there: without, the kernels are those that have no gradient of depth.
+        kept = {name: each for name, each in zeros.items() if name in (given, "depth_sum")}
+        ours, _ = blend(kernels, scene, kept, Blend(True, True))
+        assert_same_bits(ours, expected)
+        assert any(values.any() for values in ours.sums.values())
+
+
 @pytest.mark.parametrize(("order", "seed"), [(REVERSE, 0), (SHUFFLED, 1)])
 def test_order_of_threads_does_not_matter(kernels, order, seed):
     scene = SCENES["one tile with everything"]()  # in several batches
