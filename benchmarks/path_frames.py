@@ -41,6 +41,7 @@ from splatpipe.pipeline.film.photo_route import Capture, followed_photos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.consistency import AGREEMENT
 
@@ -176,7 +177,7 @@ def nearest_first(cameras: Sequence[Camera]) -> list[Camera]:
 
 def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder: Path) -> list[Row]:
     """Render and write the frames and their contact sheet; a row a frame."""
-    capture = open_scene({name: part.path for name, part in run.parts.items()}, 1).capture
+    capture = open_scene({name: part.path for name, part in run.parts.items()}, 1, cpu()).capture
     surroundings = Surroundings(run, cameras)
     rows: list[Row] = []
     small: list[Pixels] = []

@@ -10,10 +10,11 @@ from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.photos.images import reduced_camera, reduced_view
+from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.floaters import measure_floaters
 from splatpipe.pipeline.render.options import EvaluateConfig
-from splatpipe.pipeline.render.rendering import as_trained, render_depth, render_pixels
+from splatpipe.pipeline.render.rendering import as_trained, placed, render_depth, render_pixels
 from splatpipe.pipeline.render.splat_accuracy import measure_accuracy
 from splatpipe.pipeline.render.view_measures import evaluate_view, flat_stems, mean_measures
 from splatpipe.pipeline.splat.panorama import read_panorama
@@ -30,7 +31,8 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     chosen = [view for view in views if view.camera.name in set(held_out)]
     gaussians = read_splat(inputs["train.model"])
     options, megapixels = as_trained(inputs["train.rendering"], gaussians)
-    sky = read_panorama(inputs["train.sky"])
+    device = choose_device(inputs.machine.device)
+    gaussians, sky = placed((gaussians, read_panorama(inputs["train.sky"])), device)
     folder = out / "views"
     folder.mkdir(parents=True, exist_ok=True)
     if not chosen:
@@ -56,4 +58,4 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     write_json(out / "metrics.json", result)
     summary: dict[str, Any] = {"test_views": len(per_view)}
     summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
-    return summary | {"veil": floaters["veil"]["mean"]}
+    return summary | {"veil": floaters["veil"]["mean"], "device": device.name}

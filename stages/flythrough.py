@@ -10,6 +10,7 @@ from splatpipe.pipeline.film.camera_path import cameras_along
 from splatpipe.pipeline.film.filming import FilmFile, open_scene, write_film
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.film.photo_route import photo_film
+from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import render_pixels
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
@@ -28,7 +29,7 @@ def run(config: FlythroughConfig, inputs: Inputs, out: Path, report: Reporter) -
         return {"frames": 0}
     frames = max(1, round(config.seconds * config.fps))
     with same_bits(inputs.machine.threads):
-        scene = open_scene(inputs.parts, inputs.machine.threads)
+        scene = open_scene(inputs.parts, inputs.machine.threads, choose_device(inputs.machine.device))
         try:
             route = photo_film(scene.capture, frames, config.seconds)
         except UsageError as error:

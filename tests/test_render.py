@@ -27,6 +27,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import render_normals, render_pixels
 from splatpipe.pipeline.splat.gaussians import Gaussians, quat_from_rotation
@@ -66,7 +67,7 @@ def test_every_run_leaves_a_film_that_a_browser_plays(demo_run: Path, parts: dic
     film = demo_run / "flythrough.webm"
     told, pictures = decoded(browser, film, [0.5 / 25, 2.0 + 0.5 / 25, SECONDS - 0.5 / 25])
     assert told["duration"] == pytest.approx(SECONDS, abs=0.01)
-    scene = open_scene(parts, 1)
+    scene = open_scene(parts, 1, cpu())
     lens = scene.lens(None)
     assert (told["width"], told["height"]) == (lens.width, lens.height)
     assert lens.width / lens.height == pytest.approx(16 / 9, abs=0.02)
@@ -79,7 +80,7 @@ def test_every_run_leaves_a_film_that_a_browser_plays(demo_run: Path, parts: dic
 
 
 def test_the_film_of_the_demo_flies_outside_of_the_house(parts: dict[str, Path]) -> None:
-    scene = open_scene(parts, 1)
+    scene = open_scene(parts, 1, cpu())
     route = photo_film(scene.capture, 100, SECONDS)
     cameras = cameras_along(route, scene.lens(None), scene.capture.up)
     centres = load_frame(parts["georef.frame"]).world_from_model.apply(np.array([c.centre() for c in cameras]))
@@ -211,7 +212,7 @@ def test_keyframes_of_the_world_are_found_in_the_models_frame(tmp_path: Path) ->
     path.write_text(json.dumps([{"position": [300, -80, 30], "target": [312, -86, 21], "fov_deg": 70}]))
     camera = tiny_scene.cameras()[0]
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")
-    scene = open_scene(tiny_parts(tmp_path, dataset), 1)
+    scene = open_scene(tiny_parts(tmp_path, dataset), 1, cpu())
     names, (found,) = RenderTask(scene, world, Wanted(stills=True), read_keyframes(path), (320, 180)).stills()
     assert len(names) == 1 and found.width == 320
     np.testing.assert_allclose(world.apply(found.centre()[None])[0], [300, -80, 30], atol=1e-9)

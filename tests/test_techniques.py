@@ -106,9 +106,8 @@ def test_a_picture_and_a_penalty_change_what_is_learnt(plan: Plan) -> None:
 def test_a_photo_of_which_nothing_counts_leaves_techniques_alone(plan: Plan) -> None:
     tint, photo = Tint(), photos()[0]
     state = TrainState.begin(tiny_scene.true_model(), plan, Techniques((tint,)))
-    iterate(
-        state, plan, TrainingPhoto(photo.camera, photo.colour, torch.zeros(photo.colour.shape[:2], dtype=torch.bool))
-    )
+    nothing = torch.zeros(photo.colour.shape[:2], dtype=torch.bool)
+    iterate(state, plan, TrainingPhoto(photo.camera, photo.colour, nothing, is_empty=True))
     assert tint.calls == ["unwanted"] and state.iteration == 1 and float(tint.red) == 0.0
 
 

@@ -199,7 +199,7 @@ def test_going_on_with_another_instruction_set_is_told(
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         die_at(patch, 20, killed)
         trained(scene, tmp_path)
-    monkeypatch.setattr(loop.rasterizer, "isa_name", lambda: "other")
+    monkeypatch.setattr(rasterizer, "isa_name", lambda: "other")
     recorder = tiny_scene.Recorder()
     train.run(QUICK, make_inputs(scene), tmp_path, recorder)
     assert len(recorder.warnings) == 1 and "goes on with other" in recorder.warnings[0]

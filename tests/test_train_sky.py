@@ -17,6 +17,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -24,7 +25,7 @@ from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.splat.sky_mask import SkyMask, directions
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.measure import Effort, measure
+from splatpipe.pipeline.train.measure import Effort, Subject, measure
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.sky import SkyModel, filled
@@ -275,5 +276,5 @@ def test_a_budget_measures_iterations_with_the_sky_and_leaves_it_as_it_was(scene
         assert trained is not None
         moved.append(not torch.equal(trained.panorama.colours, before))
 
-    measure(plan, start, views, step, Effort(0.0, 1e-3), sky)
+    measure(plan, Subject(start, views, cpu(), sky), step, Effort(0.0, 1e-3))
     assert any(moved) and torch.equal(sky.panorama.colours, before)

@@ -35,6 +35,7 @@ from splatpipe.pipeline.film.photo_route import followed_photos, photo_film
 from splatpipe.pipeline.film.video import CODECS
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.view_measures import flat_stems
 from splatpipe.pipeline.survey.frames import load_frame
@@ -178,21 +179,24 @@ class RenderTask:
         return cameras
 
 
-def render_run(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
+def render_run(out: Path, wanted: Wanted, threads: int, device: str = "auto") -> dict[str, Any]:
     """Render a run that has been trained.
 
     Args:
         out: Its OUT.
         wanted: What.
         threads: Of the rasterizer, at least 1.
+        device: ``auto``, ``cpu`` or ``cuda``.
 
     Returns:
         What was written.
 
     Raises:
         SplatpipeError: if there is nothing to render, or the wish makes no sense.
+        MachineError: if the device does not work.
     """
     what, size = wanted.checked()
+    chosen = choose_device(device)
     keyframes = None if wanted.path in OWN_PATHS else read_keyframes(_file(wanted.path))
     parts = _parts(out)
     target = wanted.target(out)
@@ -201,7 +205,7 @@ def render_run(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
     try:
         with same_bits(threads):
             similarity = load_frame(parts["georef.frame"]).world_from_model
-            task = RenderTask(open_scene(parts, threads), similarity, wanted, keyframes, size)
+            task = RenderTask(open_scene(parts, threads, chosen), similarity, wanted, keyframes, size)
             told = _render(task, what, target, EventReporter("render", console))
     finally:
         console.close()

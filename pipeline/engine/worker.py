@@ -29,6 +29,7 @@ from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, StageConfig, load_body
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
+NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # of libraries' errors, in small letters
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
 
 
@@ -125,7 +126,7 @@ def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
         return MachineError(
             f"The disk ran full in the stage {stage}.", "Make room, then run again: it goes on from here."
         )
-    if isinstance(error, MemoryError) or "not enough memory" in text or "bad_alloc" in text:
+    if isinstance(error, MemoryError) or any(said in text for said in NO_MEMORY):
         return MachineError(
             f"The stage {stage} ran out of memory.",
             "Close other programs, or lower undistort.max_megapixels or train.max_gaussians.",

@@ -21,7 +21,8 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_views
 from splatpipe.pipeline.photos.images import Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.render.rendering import Model, as_trained, render_depth, render_normals, render_pixels
+from splatpipe.pipeline.raster.device import Device
+from splatpipe.pipeline.render.rendering import Model, as_trained, placed, render_depth, render_normals, render_pixels
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
@@ -62,12 +63,13 @@ def _even(length: float) -> int:
     return max(LEAST_SIDE, 2 * round(length / 2.0))
 
 
-def open_scene(parts: Mapping[str, Path], threads: int) -> TrainedScene:
+def open_scene(parts: Mapping[str, Path], threads: int, device: Device) -> TrainedScene:
     """Read what training left.
 
     Args:
         parts: `train.model`, `train.rendering`, `train.sky` and `undistort.dataset`.
         threads: That read photos, where these have to tell which way is up.
+        device: What it is rendered on.
 
     Raises:
         StageError: if one is broken.
@@ -81,7 +83,7 @@ def open_scene(parts: Mapping[str, Path], threads: int) -> TrainedScene:
     up = _up(views, cameras, points.xyz, threads) if sky is None else sky.up
     seen = [tracks[camera.name] for camera in cameras]
     capture = Capture(cameras, seen, points.xyz, up, Clearance(solid_places(gaussians)))
-    return TrainedScene((gaussians, sky), options, cameras, capture)
+    return TrainedScene(placed((gaussians, sky), device), options, cameras, capture)
 
 
 def _up(

@@ -12,6 +12,7 @@ from torch import Tensor
 from splatpipe.pipeline.raster.cuda import AdamRows, kernels_of
 from splatpipe.pipeline.raster.cuda_api import SplatStep
 from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward
+from splatpipe.pipeline.raster.device import take_rows
 from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
@@ -188,8 +189,9 @@ class Adam:
             )
 
     def select(self, index: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> None:
-        """Keep the rows of an index or a mask, in its order."""
-        self._each(lambda tensor: tensor[index])
+        """Keep the rows of an index or a mask, in its order; one tensor after the other, for memory is tight."""
+        for moments in (self.mean, self.square):
+            take_rows(moments, index)
 
     def append(self, count: int) -> None:
         """Add rows of zero moments."""

@@ -74,7 +74,7 @@ def measure_floaters(
 
 def _flagged(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> Gaussians:
     """The same Gaussians, the chosen white and the others black: a render is the part of the light that they give."""
-    colours = rgb_to_dc(chosen.to(torch.float32)[:, None].expand(-1, 3))
+    colours = rgb_to_dc(chosen.to(gaussians.sh)[:, None].expand(-1, 3))
     return replace(gaussians, sh=colours[:, None].contiguous())
 
 
@@ -84,8 +84,8 @@ def _look(
     """A view's median depth, and the light that reaches it: from the chosen Gaussians, and from all."""
     with torch.no_grad():
         rendered = rasterizer.render(flagged, camera, options.for_depths())
-    light = [part.numpy().sum(dtype=np.float64) for part in (rendered.colour[..., 0], rendered.alpha)]
-    return rendered.median_depth.numpy(), np.array(light)
+    light = [part.numpy(force=True).sum(dtype=np.float64) for part in (rendered.colour[..., 0], rendered.alpha)]
+    return rendered.median_depth.numpy(force=True), np.array(light)
 
 
 def _rounded(value: float | None) -> float | None:

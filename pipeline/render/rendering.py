@@ -14,6 +14,7 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Pixels
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.raster.reference import project
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama, laid_over
@@ -81,6 +82,12 @@ def as_trained(rendering: Path, gaussians: Gaussians) -> tuple[rasterizer.Render
     """
     found = load_rendering(rendering)
     return found.options(gaussians), found.megapixels
+
+
+def placed(model: Model, device: Device) -> Model:
+    """The model where it is rendered."""
+    gaussians, sky = model
+    return gaussians.to(device.tensors), None if sky is None else sky.to(device.tensors)
 
 
 def render_pixels(model: Model, camera: Camera, options: rasterizer.RenderOptions) -> Pixels:

@@ -94,7 +94,7 @@ def light_stopped(
     _, pixels, depths = camera.in_view(xyz)
     order = np.argsort(depths, kind="stable")
     pixels, depths = pixels[order], depths[order]
-    reach = camera.depths(gaussians.means.detach().numpy().astype(np.float64))
+    reach = camera.depths(gaussians.means.numpy(force=True).astype(np.float64))
     reach += spread_along(gaussians, np.arange(len(gaussians)), camera.cam_from_world[2, :3])
     stopped = np.zeros(len(depths))
     options = replace(options, sh_degree=0, depth=False)  # alpha is all that counts
@@ -102,7 +102,7 @@ def light_stopped(
         before = np.flatnonzero(reach < (1.0 - MARGIN) * depths[part[0]]) if len(part) else part
         if len(before):
             with torch.no_grad():
-                alpha = rasterizer.render(gaussians.select(torch.from_numpy(before)), camera, options).alpha.numpy()
+                rendered = rasterizer.render(gaussians.select(torch.from_numpy(before)), camera, options)
             columns, rows = pixels[part].astype(np.int64).T
-            stopped[part] = alpha[rows, columns]
+            stopped[part] = rendered.alpha.numpy(force=True)[rows, columns]
     return stopped

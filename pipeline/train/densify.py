@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.draws import SPLIT_POSITION, normal
 
@@ -90,8 +91,8 @@ class Growth:
     log_scales: Float[Tensor, "m 3"]
     opacity_logits: Float[Tensor, " m"]
 
-    def select(self, rows: Bool[Tensor, " m"]) -> Growth:
-        """The rows of a mask."""
+    def select(self, rows: Bool[Tensor, " m"] | Int64[Tensor, " k"]) -> Growth:
+        """The rows of a mask or an index."""
         return Growth(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
@@ -99,7 +100,22 @@ def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> Growth:
     """The Gaussians of a mask, as they are."""
     source = torch.nonzero(rows).flatten()
     kept = gaussians.select(source)
-    return Growth(source, torch.zeros(len(kept), dtype=torch.bool), kept.means, kept.log_scales, kept.opacity_logits)
+    fresh = torch.zeros(len(kept), dtype=torch.bool, device=source.device)
+    return Growth(source, fresh, kept.means, kept.log_scales, kept.opacity_logits)
+
+
+def along_curve(growth: Growth) -> Growth:
+    """The same rows in the order of their places on a Morton curve: what is near in space is near in memory.
+
+    On a CUDA device, where neighbouring threads then read neighbouring memory; on the CPU as they are.
+    """
+    kernels = kernels_of(growth.means.device)
+    if kernels is None or len(growth.means) == 0:
+        return growth
+    lowest = growth.means.amin(dim=0)
+    size = growth.means.amax(dim=0) - lowest
+    keys = kernels.morton(growth.means, tuple(lowest.tolist()), tuple(size.tolist()))
+    return growth.select(torch.argsort(keys, stable=True))
 
 
 @dataclass(frozen=True)
@@ -136,10 +152,10 @@ class DensityStatistics:
         max_radius_px: (n,) largest radius on screen.
     """
 
-    def __init__(self, count: int) -> None:
-        self.score_sum = torch.zeros(count)
-        self.seen = torch.zeros(count)
-        self.max_radius_px = torch.zeros(count)
+    def __init__(self, count: int, device: torch.device | None = None) -> None:
+        self.score_sum = torch.zeros(count, device=device)
+        self.seen = torch.zeros(count, device=device)
+        self.max_radius_px = torch.zeros(count, device=device)
 
     def observe(self, gradient_px: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"], width: int, height: int) -> None:
         """Add an iteration's image-plane gradients, by their norm in NDC.
@@ -220,11 +236,11 @@ def grow(
     large = size[chosen] > math.log(SPLIT_EXTENT * extent)
     cloned, split = chosen[~large], chosen[large]
 
-    kept = torch.ones(len(gaussians), dtype=torch.bool)
+    kept = torch.ones(len(gaussians), dtype=torch.bool, device=size.device)
     kept[split] = False
     old = torch.nonzero(kept).flatten()
     source = torch.cat((old, cloned, split, split))
-    fresh = torch.arange(len(source)) >= len(old)
+    fresh = torch.arange(len(source), device=source.device) >= len(old)
     means, log_scales = gaussians.means[source], gaussians.log_scales[source]
     children = len(old) + len(cloned)
     means[children:] += _split_offsets(gaussians, split, schedule.seed, iteration)
@@ -261,6 +277,8 @@ def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit:
 
 def _split_offsets(gaussians: Gaussians, rows: Int64[Tensor, " s"], seed: int, iteration: int) -> Float[Tensor, "t 3"]:
     """Draw two positions within each parent, relative to its mean: the first of all, then the second of all."""
+    if (kernels := kernels_of(rows.device)) is not None:
+        return kernels.split_offsets((seed, iteration, SPLIT_POSITION), rows, gaussians.log_scales, gaussians.quats)
     parents = rows.numpy().astype(np.uint64)
     children = np.concatenate((2 * parents, 2 * parents + np.uint64(1)))
     index = (3 * children)[:, None] + np.arange(3, dtype=np.uint64)

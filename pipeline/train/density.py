@@ -48,17 +48,18 @@ class Density:
     Args:
         count: Gaussians in the model.
         magnitudes: Ranked by the sum of the pixels' magnitudes, not of their gradients.
+        device: Where the model is; None for the CPU.
 
     Attributes:
         statistics: The score's sums.
     """
 
-    def __init__(self, count: int, magnitudes: bool) -> None:
+    def __init__(self, count: int, magnitudes: bool, device: torch.device | None = None) -> None:
         self.magnitudes = magnitudes
-        self.statistics = DensityStatistics(count)
+        self.statistics = DensityStatistics(count, device)
 
     def observe(self, rendered: Render, gradient_px: Float[Tensor, "n 2"], schedule: DensitySchedule) -> None:
-        """Add an iteration after the loss's backward pass, before the parameters step.
+        """Add an iteration after its step, which leaves the gradient on the image plane.
 
         Args:
             rendered: What was compared with the photo.
@@ -87,7 +88,7 @@ class Density:
 
     def restart(self, count: int) -> None:
         """Forget what was observed: the model has new rows."""
-        self.statistics = DensityStatistics(count)
+        self.statistics = DensityStatistics(count, self.statistics.seen.device)
 
     def to_arrays(self) -> dict[str, Tensor]:
         """The sums by name, for a checkpoint; not copied."""

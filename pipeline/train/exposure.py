@@ -44,7 +44,8 @@ class Exposure(SideModel, Technique):
 
     def map_of(self, name: str) -> Float[Tensor, "3 4"]:
         """What a photo's map is now: its colours are A c + b of the splat's, [A b]."""
-        return torch.eye(3, 4) + self._deviations()[self._row[name]].view(3, 4)
+        deviations = self._deviations()
+        return torch.eye(3, 4, device=deviations.device) + deviations[self._row[name]].view(3, 4)
 
     def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
         """A render as the photo's exposure would show it."""
@@ -69,7 +70,7 @@ class Exposure(SideModel, Technique):
         deviations, row = self._deviations(), self._row[name]
         if deviations.grad is not None:
             deviations.grad[row] += self._decay * deviations.detach()[row]
-        rows = torch.zeros(len(deviations), dtype=torch.bool)
+        rows = torch.zeros(len(deviations), dtype=torch.bool, device=deviations.device)
         rows[row] = True
         self.descend({_NAME: self._first_rate * math.exp(math.log(LAST_RATE) * share)}, rows)
         self._centre()

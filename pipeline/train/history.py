@@ -8,6 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from splatpipe.pipeline.train.densify import DensityEvent
 
 CURVE_EVERY = 50  # iterations that a point of the curve is the mean of
@@ -16,6 +19,8 @@ CURVE_EVERY = 50  # iterations that a point of the curve is the mean of
 @dataclass
 class History:
     """The curve of the loss and the events of density control.
+
+    Losses are read from the device in bunches, when somebody asks what they come to: an iteration waits for none.
 
     Attributes:
         curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and width of the photo.
@@ -43,9 +48,19 @@ class History:
     epoch_count: int = 0
     flat_at: int = 0
 
-    def add_loss(self, loss: float) -> None:
-        """Count an iteration's loss; one that is not finite is left out."""
-        if math.isfinite(loss):
+    def __post_init__(self) -> None:
+        self._unread: list[Tensor] = []
+
+    def add_loss(self, loss: Tensor) -> None:
+        """Count an iteration's loss, a scalar on any device; one that is not finite is left out."""
+        self._unread.append(loss)
+
+    def _read_losses(self) -> None:
+        """Add up what was counted, one after the other in float64: the same sums whenever they are asked for."""
+        if not self._unread:
+            return
+        losses, self._unread = torch.stack(self._unread).tolist(), []
+        for loss in filter(math.isfinite, losses):
             self.loss_sum += loss
             self.loss_count += 1
             self.epoch_sum += loss
@@ -66,6 +81,7 @@ class History:
         closed = bool(self.curve) and self.curve[-1]["iteration"] == iteration
         if closed or (iteration % CURVE_EVERY != 0 and not last):
             return
+        self._read_losses()
         loss = self.loss_sum / self.loss_count if self.loss_count else None
         self.curve.append({"iteration": iteration, "loss": loss, **facts})
         self.loss_sum, self.loss_count = 0.0, 0
@@ -77,12 +93,14 @@ class History:
             middle: Its middle iteration.
             judged: Whether it is one to judge the end of training by.
         """
+        self._read_losses()
         if judged and self.epoch_count:
             self.epochs.append((middle, self.epoch_sum / self.epoch_count))
         self.epoch_sum, self.epoch_count = 0.0, 0
 
     def recent_loss(self) -> float | int | None:
         """Mean loss since the last point of the curve, or that point's."""
+        self._read_losses()
         return self.loss_sum / self.loss_count if self.loss_count else self.last_loss()
 
     def last_loss(self) -> float | int | None:
@@ -91,6 +109,7 @@ class History:
 
     def state(self) -> dict[str, Any]:
         """All of it as JSON values, for a checkpoint."""
+        self._read_losses()
         return {
             "curve": self.curve,
             "density": self.density,

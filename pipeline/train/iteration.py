@@ -32,12 +32,12 @@ def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
         photo: What to compare with.
     """
     now = plan.schedule.at(state.iteration + 1, state.history.flat_at)
-    if photo.mask is None or bool(photo.mask.any()):
+    if not photo.is_empty:
         techniques = state.techniques
         # Render.
         magnitudes = now.is_observed and state.density.magnitudes
         settings = techniques.settings(render_options(plan, now, magnitudes), state.gaussians, photo.camera, now)
-        probe = torch.zeros(len(state.gaussians), 2, requires_grad=True) if now.is_observed else None
+        probe = state.screen_probe() if now.is_observed else None
         model = techniques.before_render(state.gaussians, now)
         rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
         # Show.
@@ -50,13 +50,13 @@ def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
         loss = techniques.with_penalties(photometric, shot)
         # Backward.
         loss.backward()  # type: ignore[no-untyped-call]
-        state.history.add_loss(float(photometric.detach()))
         # Step.
         with torch.no_grad():
+            state.step(rendered.visible, now, plan)
             if probe is not None and probe.grad is not None:
                 state.density.observe(rendered, probe.grad, plan.schedule.density)
-            state.step(rendered.visible, now, plan)
             techniques.after_step(shot)
+        state.history.add_loss(photometric.detach())
     # Density.
     if now.iteration % len(plan.train_views) == 0:
         state.techniques.after_epoch(now.iteration)
@@ -79,8 +79,10 @@ def render_options(plan: Plan, now: Moment, magnitudes: bool) -> rasterizer.Rend
 def close(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> None:
     """Count the iteration, and note what followed from it: the memory's end of growth, a flat loss, the curve."""
     history, photos = state.history, len(plan.train_views)
-    if not history.growth_ended and plan.schedule.density.is_step(now.iteration) and over_memory(plan.options):
-        history.growth_ended = now.iteration
+    if not history.growth_ended and plan.schedule.density.is_step(now.iteration):
+        # A device's memory is looked at before anything grows (see ``within_room``).
+        on_cpu = state.gaussians.means.device.type == "cpu"
+        history.growth_ended = now.iteration if on_cpu and over_memory(plan.options) else 0
     state.iteration = now.iteration
     if plan.options.stop_when_flat > 0.0 and now.iteration % photos == 0:
         history.end_epoch(now.iteration - photos // 2, now.iteration - photos >= settled_from(plan.schedule))

@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Reporter, Summary
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.photos.dataset import load_split, load_views
-from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
@@ -26,6 +25,7 @@ from splatpipe.pipeline.train.iteration import curve_facts, iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
 from splatpipe.pipeline.train.planning import Scene, under_budgets
+from splatpipe.pipeline.train.shortage import iterate_within_memory
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
@@ -36,6 +36,7 @@ CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
 REPORT_EVERY = 10  # iterations
+CUDA_REPORT_EVERY = 50  # the same where telling the loss waits for the device
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -46,7 +47,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         MachineError: if the device asked for is not there.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
-    check_device(inputs.machine)
+    device = choose_device(inputs.machine.device, config.unfit_for_cuda())
     dataset = inputs["undistort.dataset"]
     views = load_views(dataset)
     start = read_start(inputs["initialize.splat"])
@@ -54,13 +55,14 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     kept = set(split.train)
     trained_on = [view for view in views if view.camera.name in kept]
     free = make_plan(config, views, split, len(start.gaussians))
-    scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine)
+    scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine, device)
 
     def make() -> Plan:
         decided = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
         return under_budgets(free.of(decided), replace(scene, config=decided, sky=sky), iterate, report)
 
-    with same_bits(inputs.machine.threads):
+    with same_bits(inputs.machine.threads), device.one_order():
+        device.limit_memory(config.max_memory_bytes)
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
         plan = load_or_write_plan(out / "plan.json", make)
         write_durably(out / "rendering.json", plan.rendering().to_json())
@@ -68,25 +70,26 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             report.note(plan.described())
 
         def techniques() -> Techniques:
-            return make_techniques(plan, sky, trained_on, dataset)
+            return make_techniques(plan, sky, trained_on, dataset, device.tensors)
 
-        state = resume(out / CHECKPOINT, plan, techniques, report)
+        state = resume(out / CHECKPOINT, plan, techniques, device, report)
         if state is None:
-            state = TrainState.begin(start.within(plan.options.max_gaussians), plan, techniques())
+            begun = start.within(plan.options.max_gaussians).to(device.tensors)
+            state = TrainState.begin(begun, plan, techniques())
         levels = plan.schedule.coarse_levels_to(ends_at(plan, state.history.flat_at))
         first, size = state.iteration + 1, plan.megapixels
-        with PhotoStream(trained_on, levels, plan.options.seed, first, out, size) as photos:
+        with PhotoStream(trained_on, levels, plan.options.seed, first, out, size).to(device.tensors) as photos:
             photos.tell(report)
-            optimise(state, plan, photos, out / CHECKPOINT, report)
+            optimise(Training(state, plan, device, out / CHECKPOINT), photos, report)
         if (flat_at := state.history.flat_at) > 0:
             report.note(
                 f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.options.iterations:,}"
             )
-        gaussians = state.finished()
+        gaussians = state.finished().to("cpu")
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
-    (out / "history.json").write_text(state.history.to_json(), encoding="utf-8")
+    (out / "history.json").write_text(state.whole_history().to_json(), encoding="utf-8")
     write_side_models(out, state.techniques)
-    return {"gaussians": len(gaussians)} | summary_of(state, plan)
+    return {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
 
 
 def write_side_models(out: Path, techniques: Techniques) -> None:
@@ -105,8 +108,6 @@ def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
         "train_seconds": round(state.seconds, 1),
         "train_megapixels": plan.train_megapixels,
         "peak_memory_bytes": peak_memory_bytes(),
-        "device": "cpu",
-        "instruction_set": rasterizer.isa_name(),
         "plan": plan.figures(),
     }
     if plan.options.sky != "off":
@@ -121,43 +122,64 @@ def budgeted(plan: Plan) -> bool:
     return bool(plan.options.time_budget_s or plan.options.max_memory_bytes)
 
 
-def check_device(machine: Machine) -> None:
-    """Refuse a device that is not there.
+@dataclass(frozen=True)
+class Training:
+    """One that runs.
 
-    Raises:
-        MachineError: for `cuda`, for which this build has no kernels.
+    Attributes:
+        state: Changed in place.
+        plan: What it does.
+        device: What it is computed on.
+        path: Of its checkpoint.
     """
-    if machine.device == "cuda":
-        raise MachineError(
-            "This build of splatpipe has no CUDA kernels, so it cannot train on a CUDA device.",
-            hint="Leave --device out, or give --device cpu.",
-        )
+
+    state: TrainState
+    plan: Plan
+    device: Device
+    path: Path
+
+    def save(self) -> None:
+        """Leave a checkpoint."""
+        save_checkpoint(self.path, self.plan.digest(), self.state.checkpoint(self.device.kernels))
+
+    @property
+    def last(self) -> int:
+        """Its last iteration, as far as is known by now."""
+        return ends_at(self.plan, self.state.history.flat_at)
+
+    def is_told(self) -> bool:
+        """Whether it is reported how far it is."""
+        every = REPORT_EVERY if self.device.name == "cpu" else CUDA_REPORT_EVERY
+        return self.state.iteration % every == 0 or self.state.iteration == self.last
 
 
-def resume(path: Path, plan: Plan, make: Callable[[], Techniques], report: Reporter) -> TrainState | None:
+def resume(
+    path: Path, plan: Plan, make: Callable[[], Techniques], device: Device, report: Reporter
+) -> TrainState | None:
     """The state that a killed run left, or None; a broken one is told and ignored.
 
     Args:
         path: The checkpoint.
         plan: The training's.
         make: Its techniques, untrained.
+        device: What it goes on on, whatever it was begun on.
         report: Takes warnings.
     """
     try:
         checkpoint = load_checkpoint(path, plan.digest())
-        state = TrainState.restore(checkpoint, plan, make())
+        state = TrainState.restore(checkpoint, plan, make(), device.tensors)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:
         report.warning(f"The checkpoint of the training cannot be used: {error}. It starts afresh.")
         return None
-    begun, here = checkpoint.facts.get("instruction_set"), rasterizer.isa_name()
+    begun, here = checkpoint.facts.get("instruction_set"), device.kernels
     if begun != here:
         report.warning(f"The training goes on with {here} from {begun}: as good, but not the same to the last bit.")
     return state
 
 
-def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Path, report: Reporter) -> None:
+def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
     """Train to the plan's last iteration or last second, leaving checkpoints on the way.
 
     The clock decides when a checkpoint is written and, under a time budget, after which iteration the training ends.
@@ -165,33 +187,42 @@ def optimise(state: TrainState, plan: Plan, photos: PhotoStream, checkpoint: Pat
 
     Raises:
         KeyboardInterrupt: when asked to end, after a checkpoint.
+        MachineError: if a device's memory is too small for it.
     """
+    state, plan = training.state, training.plan
     clock = _Clock(state.seconds)
     with deferred_interrupts() as interrupt:
         for photo in photos:
-            iterate(state, plan, photo)
+            iterate_within_memory(iterate, state, plan, photo, report)
             state.seconds = clock.seconds()
             if state.history.growth_ended == state.iteration:
-                report.warning(
-                    f"The memory limit is close, so no Gaussian is added after iteration {state.iteration:,}.",
-                    hint="Give more with --max-memory, or smaller photos with undistort.max_megapixels.",
-                )
+                tell_growth_ended(state, plan, report)
             if interrupt.requested:
                 break
             if clock.is_up(plan):
                 end_now(state, plan, photo, report)
                 break
-            last = ends_at(plan, state.history.flat_at)
-            if clock.checkpoint_due() and state.iteration < last:
+            if clock.checkpoint_due() and state.iteration < training.last:
                 with clock.checkpointing():
-                    save_checkpoint(checkpoint, plan.digest(), state.checkpoint(rasterizer.isa_name()))
-            if state.iteration % REPORT_EVERY == 0 or state.iteration == last:
+                    training.save()
+            if training.is_told():
                 tell(state, plan, report)
-            if state.iteration == last:
+            if state.iteration == training.last:
                 break
     if interrupt.requested:  # asked of once more: it may have come after the last iteration's look
-        save_checkpoint(checkpoint, plan.digest(), state.checkpoint(rasterizer.isa_name()))
+        training.save()
         raise KeyboardInterrupt
+
+
+def tell_growth_ended(state: TrainState, plan: Plan, report: Reporter) -> None:
+    """Warn that memory keeps the model from growing."""
+    limited = plan.options.max_memory_bytes > 0
+    report.warning(
+        f"The {'memory limit is close' if limited else 'device has no memory left'}, "
+        f"so no Gaussian is added after iteration {state.iteration:,}.",
+        hint=f"{'Give more with --max-memory' if limited else 'Lower train.max_gaussians'}, "
+        "or smaller photos with undistort.max_megapixels.",
+    )
 
 
 def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporter) -> None:

@@ -8,12 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
-import numpy as np
 import torch
 
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import reduced_view
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
@@ -23,6 +23,7 @@ from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.upload import Uploader
 
 MOST_VIEWS = 8  # a size is timed on: their mean is within a few percent of all photos'
 PICTURES = 3  # that evaluate keeps of a view: photo, render, error
@@ -64,37 +65,51 @@ class Effort:
     iteration_s: float
 
 
-def measure(
-    plan: Plan, start: Gaussians, views: Sequence[View], step: Step, effort: Effort, sky: SkyModel | None = None
-) -> Measured:
+@dataclass(frozen=True)
+class Subject:
+    """What is trained for a moment.
+
+    Attributes:
+        start: The initial Gaussians.
+        views: To train on.
+        device: What it is computed on.
+        sky: As training begins with; a copy is trained.
+    """
+
+    start: Gaussians
+    views: Sequence[View]
+    device: Device
+    sky: SkyModel | None = None
+
+
+def measure(plan: Plan, subject: Subject, step: Step, effort: Effort) -> Measured:
     """Time real iterations at two sizes and two numbers of Gaussians.
 
     Args:
         plan: Without a budget; its cap is the larger number of Gaussians.
-        start: The initial Gaussians.
-        views: To train on.
+        subject: What is trained.
         step: An iteration of training.
         effort: Its limit.
-        sky: As training begins with; a copy is trained.
     """
+    start, views, device = subject.start, subject.views, subject.device
     began = time.monotonic()
     chosen = [views[index * len(views) // min(len(views), MOST_VIEWS)] for index in range(min(len(views), MOST_VIEWS))]
     trial = replace(plan, schedule=pilot_schedule(plan.schedule))
-    small, _ = _photos(chosen, SMALLEST_MEGAPIXELS)
+    small, _ = _photos(chosen, SMALLEST_MEGAPIXELS, device)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
     models = [stretched(start, count, plan.options.seed) for count in counts]
-    states = [_pilot_state(model, trial, sky) for model in models]
+    states = [_pilot_state(model.to(device.tensors), trial, subject) for model in models]
     _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
-    first = _timed(states[0], trial, small[0], step)
+    first = _timed(states[0], trial, small[0], step, device)
     # Cost grows a little slower than size, so the line through two sizes is right near them only.
     megapixels = SMALLEST_MEGAPIXELS * max(2.0, effort.iteration_s / first.seconds)
-    large, decode_s = _photos(chosen, megapixels)
+    large, decode_s = _photos(chosen, megapixels, device)
     _evaluation_seconds(states[-1].finished(), small[0], plan)  # pays for what is loaded once
     evaluate_s = _evaluation_seconds(states[-1].finished(), large[0], plan)
     timings = [first]
     for photos in zip(small, large, strict=True):
         for state in states:
-            timings += [_timed(state, trial, photo, step) for photo in photos]
+            timings += [_timed(state, trial, photo, step, device) for photo in photos]
         if time.monotonic() - began > effort.most_s:
             break
     return Measured(fit_speed(timings), decode_s, evaluate_s)
@@ -124,8 +139,8 @@ def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
     return model
 
 
-def _pilot_state(start: Gaussians, trial: Plan, sky: SkyModel | None) -> TrainState:
-    state = TrainState.begin(start, trial, make_techniques(trial, sky))
+def _pilot_state(start: Gaussians, trial: Plan, subject: Subject) -> TrainState:
+    state = TrainState.begin(start, trial, make_techniques(trial, subject.sky, device=subject.device.tensors))
     state.iteration = PILOT_ITERATION
     return state
 
@@ -141,21 +156,22 @@ def _warm_up(
             break
 
 
-def _photos(views: Sequence[View], megapixels: float) -> tuple[list[TrainingPhoto], float]:
+def _photos(views: Sequence[View], megapixels: float, device: Device) -> tuple[list[TrainingPhoto], float]:
     """The views as training sees them, and the seconds that one took."""
     began = time.monotonic()
-    photos = []
+    uploader, photos = Uploader(device.tensors), []
     for view in views:
         camera, pixels, mask = reduced_view(view, megapixels)
-        colour = torch.from_numpy(pixels.astype(np.float32) * np.float32(1.0 / 255.0))
-        counts = None if mask is None else torch.from_numpy(mask)
-        photos.append(TrainingPhoto(camera, colour, counts))
+        sent = uploader.end(uploader.begin(pixels, mask))
+        photos.append(TrainingPhoto(camera, *sent, mask is not None and not mask.any()))
     return photos, (time.monotonic() - began) / len(photos)
 
 
-def _timed(state: TrainState, trial: Plan, photo: TrainingPhoto, step: Step) -> Timing:
+def _timed(state: TrainState, trial: Plan, photo: TrainingPhoto, step: Step, device: Device) -> Timing:
+    device.wait()
     began = time.monotonic()
     step(state, trial, photo)
+    device.wait()
     seconds = time.monotonic() - began
     return Timing(len(state.gaussians), photo.camera.width * photo.camera.height, max(seconds, 1e-6))
 
@@ -168,12 +184,14 @@ def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Plan) 
             gaussians.sh_degree, antialias=plan.options.antialias, near=plan.near, depth=False
         )
         colour = rasterizer.render(gaussians, photo.camera, options).colour.clamp(0.0, 1.0)
+    shown = photo.colour.cpu()
+    mask = None if photo.mask is None else photo.mask.cpu()
     for function in metrics.METRICS.values():
         try:
-            function(colour, photo.colour, photo.mask)
+            function(colour.cpu(), shown, mask)
         except ValueError:
             continue  # too few pixels for this measure: evaluate leaves it out, too
-    pixels = (photo.colour * 255.0).to(torch.uint8).numpy()
+    pixels = (shown * 255.0).to(torch.uint8).numpy()
     for _ in range(PICTURES):
         cv2.imencode(".png", pixels)
     return (time.monotonic() - began) / (1e-6 * photo.camera.width * photo.camera.height)

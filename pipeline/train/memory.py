@@ -8,6 +8,16 @@
 | statistics of density control | 12 |
 | **state of training** | **956** |
 | while density control copies parameters and moments, and the model is written | 860 |
+
+On a CUDA device gradients are never stored, and density control moves one tensor at a time:
+
+| of the same Gaussian on a CUDA device | bytes |
+|---|---|
+| parameters and moments | 708 |
+| statistics of density control | 12 |
+| **state of training** | **720** |
+| a frame with its pairs in the smallest chunks (see `frame.h`), radii, gradients on the screen | 201 |
+| or, later, density control: a copy of the harmonics, places, scores, an index and its sort | 320 |
 """
 
 from __future__ import annotations
@@ -18,6 +28,8 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.raster.device import free_bytes
+from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS
 from splatpipe.pipeline.train.options import TrainConfig
@@ -29,36 +41,48 @@ STATE_COPIES = 4  # a parameter has a gradient and two moments
 STATISTICS_BYTES = 12
 PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
 PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
+DEVICE_COPIES = 3  # a parameter has two moments there
+DEVICE_PASSING_BYTES = 320  # the larger of what a frame and density control take
 FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
 RESIDENT_STEP = 16_000_000  # what the process has is rounded up to it: a few pages more or less change no plan
 GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
 
 
 def bytes_per_gaussian(options: TrainConfig) -> int:
-    """Most that a Gaussian takes at any time of a training."""
+    """Most that a Gaussian takes at any time of a training on the CPU."""
     numbers = SHAPE_NUMBERS + 3 * coefficient_count(options.sh_degree)
     state = STATE_COPIES * FLOAT_BYTES * numbers + STATISTICS_BYTES
     return int(state * (1.0 + PEAK_SHARE))
 
 
-def within_memory(plan: Plan, largest_pixels: int, sparse: int, report: Reporter) -> Plan:
-    """The plan with a cap on Gaussians that keeps the process within ``max_memory_bytes``.
+def device_bytes_per_gaussian(sh_degree: int) -> int:
+    """The same on a CUDA device."""
+    numbers = SHAPE_NUMBERS + 3 * coefficient_count(sh_degree)
+    return DEVICE_COPIES * FLOAT_BYTES * numbers + STATISTICS_BYTES + DEVICE_PASSING_BYTES
+
+
+def within_memory(plan: Plan, largest_pixels: int, sparse: int, report: Reporter, on_cuda: bool = False) -> Plan:
+    """The plan with a cap on Gaussians that keeps the process, or a device's tensors, within ``max_memory_bytes``.
 
     Args:
         plan: Without it.
         largest_pixels: Of a training photo.
         sparse: Gaussians of sparse points at the start; the sweep's go before they do, and nobody misses those.
         report: Is told where those of sparse points have to be thinned.
+        on_cuda: The training's tensors are a CUDA device's.
 
     Raises:
         MachineError: if not even the fewest fit beside what the process has already.
     """
     return_free_heap()
     limit, taken = plan.options.max_memory_bytes, -(-resident_bytes() // RESIDENT_STEP) * RESIDENT_STEP
+    of_one = bytes_per_gaussian(plan.options)
+    if on_cuda:
+        taken, of_one = 0, device_bytes_per_gaussian(plan.options.sh_degree)
     room = limit - taken - FIXED_BYTES - PIXEL_BYTES * largest_pixels
-    most = room // bytes_per_gaussian(plan.options)
+    most = room // of_one
     if most < min(FEWEST_GAUSSIANS, sparse):
-        least = limit - room + FEWEST_GAUSSIANS * bytes_per_gaussian(plan.options)
+        least = limit - room + FEWEST_GAUSSIANS * of_one
         raise MachineError(
             f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB of them already, "
             f"and photos of {largest_pixels / 1e6:.1f} megapixels need room, too.",
@@ -72,6 +96,19 @@ def within_memory(plan: Plan, largest_pixels: int, sparse: int, report: Reporter
         )
     cap = min(plan.options.max_gaussians, int(most))
     return plan.of(plan.options.model_copy(update={"max_gaussians": cap}))
+
+
+def within_room(wanted: int, gaussians: Gaussians) -> int:
+    """The most Gaussians, up to those wanted, that the free memory of their device holds; all of them on the CPU.
+
+    Where it is fewer, growth ends for the rest of the training and its checkpoints, and that is told.
+    """
+    free, count = free_bytes(gaussians.means.device), len(gaussians)
+    if free is None:
+        return wanted
+    passing = DEVICE_PASSING_BYTES * count  # those that are there have their state already
+    more = (free - passing) // device_bytes_per_gaussian(gaussians.sh_degree)
+    return min(wanted, count + max(0, int(more)))
 
 
 def over_memory(options: TrainConfig) -> bool:

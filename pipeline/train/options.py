@@ -87,3 +87,9 @@ class TrainConfig(StageConfig):
     stop_when_flat: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     """Where going on would take off less than this share of the training photos' loss, the schedule is run down within
     a tenth of the iterations done; 0 for never. The presets have 0.1."""
+
+    def unfit_for_cuda(self) -> str:
+        """Why these options do not train on a CUDA device; empty where they do."""
+        if self.loss == "kornia":
+            return "train.loss=kornia has no gradient on a CUDA device that is the same each time."
+        return ""

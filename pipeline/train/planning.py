@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.raster.device import Device, cpu
 from splatpipe.pipeline.train.budget import (
     FEWEST_GAUSSIANS,
     FIRST_GROWTH,
@@ -16,7 +17,7 @@ from splatpipe.pipeline.train.budget import (
     choose,
     worthwhile_iterations,
 )
-from splatpipe.pipeline.train.measure import Effort, Measured, Step, measure
+from splatpipe.pipeline.train.measure import Effort, Measured, Step, Subject, measure
 from splatpipe.pipeline.train.memory import within_memory
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.plan import Plan, mean_megapixels
@@ -41,6 +42,7 @@ class Scene:
         trained_on: Views to train on.
         held_out: How many others evaluate measures.
         machine: Threads, and when the command began.
+        device: What it is trained on.
         sky: As training begins with; None without one.
     """
 
@@ -49,6 +51,7 @@ class Scene:
     trained_on: Sequence[View]
     held_out: int
     machine: Machine
+    device: Device = field(default_factory=cpu)
     sky: SkyModel | None = None
 
 
@@ -66,7 +69,7 @@ def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Pla
     """
     if plan.options.max_memory_bytes:
         largest = max(view.camera.width * view.camera.height for view in scene.trained_on)
-        plan = within_memory(plan, largest, scene.start.sparse, report)
+        plan = within_memory(plan, largest, scene.start.sparse, report, scene.device.name == "cuda")
     if plan.options.time_budget_s:
         plan = within_time(plan, scene, step, report)
     start = scene.start
@@ -84,8 +87,8 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
         max(LEAST_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
     )
     trial = pilot(plan, scene)
-    start = scene.start.within(trial.options.max_gaussians)
-    measured = measure(trial, start, scene.trained_on, step, effort, scene.sky)
+    subject = Subject(scene.start.within(trial.options.max_gaussians), scene.trained_on, scene.device, scene.sky)
+    measured = measure(trial, subject, step, effort)
     left = budget - (time.monotonic() - began)
     choice = choose(_task(plan, scene, measured, left))
     if choice.seconds <= LEAST_SHARE * budget:

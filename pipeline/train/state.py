@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatpipe.pipeline.raster.device import CPU, take_rows
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
@@ -18,12 +19,14 @@ from splatpipe.pipeline.train.densify import (
     RESET_OPACITY,
     DensityEvent,
     Growth,
+    along_curve,
     reset_opacity,
     room_at,
     unchanged,
 )
 from splatpipe.pipeline.train.density import Density, DensityStep
 from splatpipe.pipeline.train.history import History
+from splatpipe.pipeline.train.memory import within_room
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.techniques import Techniques
@@ -64,12 +67,12 @@ class TrainState:
         """The state before the first iteration.
 
         Args:
-            start: The Gaussians to start with, as ``Start.within`` the plan's cap.
+            start: The Gaussians to start with, as ``Start.within`` the plan's cap, where they are trained.
             plan: The training's.
             techniques: The plan's, nothing of them trained.
         """
         columns = coefficient_count(plan.options.sh_degree)
-        sh = torch.zeros(len(start), columns, 3)
+        sh = torch.zeros(len(start), columns, 3, device=start.sh.device)
         shared = min(columns, start.sh.shape[1])
         sh[:, :shared] = start.sh[:, :shared]
         model = start.clone()
@@ -80,11 +83,15 @@ class TrainState:
     @staticmethod
     def of(gaussians: Gaussians, plan: Plan, history: History, techniques: Techniques) -> TrainState:
         """Gaussians with everything that the plan wants beside them, nothing of it trained."""
-        density = Density(len(gaussians), plan.options.density == "absolute")
+        density = Density(len(gaussians), plan.options.density == "absolute", gaussians.means.device)
         return TrainState(gaussians, Adam(gaussians.tensors()), density, history, techniques=techniques)
 
+    def screen_probe(self) -> Float[Tensor, "n 2"]:
+        """Zeros whose gradient is that of the Gaussians' places on the screen, once the parameters are stepped."""
+        return torch.zeros(len(self.gaussians), 2, device=self.gaussians.means.device, requires_grad=True)
+
     def step(self, gradient_rows: Bool[Tensor, " n"], now: Moment, plan: Plan) -> None:
-        """Step the parameters against their gradients, which are dropped.
+        """Step the parameters against their gradients, which are dropped; those that ``buffers`` hold, too.
 
         Args:
             gradient_rows: The Gaussians that the photo saw.
@@ -100,13 +107,11 @@ class TrainState:
             "opacity_logits": given.opacity,
             "sh": sh_rates(self.gaussians.sh.shape[1], colour, colour / given.sh_rest_divisor),
         }
+        limits = {"log_scales": (math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))}
         tensors = self.gaussians.tensors()
-        rows = gradient_rows if given.sparse else None
-        self.adam.step(tensors, rates, rows)
-        self.history.skipped_gradients += self.adam.take_skipped()
+        self.adam.step(tensors, rates, gradient_rows if given.sparse else None, buffers=self.buffers, limits=limits)
         for tensor in tensors.values():
             tensor.grad = None
-        self.gaussians.log_scales.detach().clamp_(math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))
 
     def control_density(self, plan: Plan, iteration: int) -> None:
         """Grow, prune and reset where this iteration is one for it; only prune and reset once growth has ended.
@@ -118,8 +123,11 @@ class TrainState:
         density = plan.schedule.density
         with torch.no_grad():
             if density.is_step(iteration):
-                growing = not self.history.growth_ended
-                limit = room_at(density, plan.initial_gaussians, iteration) if growing else 0
+                limit = 0
+                if not self.history.growth_ended:
+                    wanted = room_at(density, plan.initial_gaussians, iteration)
+                    limit = within_room(wanted, self.gaussians)
+                    self.history.growth_ended = iteration if limit < wanted else 0
                 self._densify(plan, limit, iteration)
             elif not self.history.flat_at:
                 self._clear(iteration)
@@ -131,29 +139,49 @@ class TrainState:
     def _densify(self, plan: Plan, limit: int, iteration: int) -> None:
         """Give the model the rows that density control chooses, at most ``limit`` where it adds any."""
         self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
-        gaussians = self.gaussians.detach()
-        gone = self.techniques.unwanted(gaussians, iteration)
-        if gone is None:
-            gone = torch.zeros(len(gaussians), dtype=torch.bool)
-        step = DensityStep(plan.schedule.density, plan.extent, limit, iteration, gone)
-        growth, counts = self.density.control(gaussians, step)
+        try:
+            growth, counts = self._growth(plan, limit, iteration)
+        except torch.OutOfMemoryError:  # of a device: not even room to look for what to grow
+            self.history.growth_ended = self.history.growth_ended or iteration
+            return
         self._become(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
 
-    def _clear(self, iteration: int) -> None:
-        """Remove what a technique does not want, after the last step of density control, too."""
+    def _growth(self, plan: Plan, limit: int, iteration: int) -> tuple[Growth, dict[str, int]]:
+        """The rows that density control chooses, and its counts; nothing is changed."""
         gaussians = self.gaussians.detach()
         gone = self.techniques.unwanted(gaussians, iteration)
+        if gone is None:
+            gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+        step = DensityStep(plan.schedule.density, plan.extent, limit, iteration, gone)
+        growth, counts = self.density.control(gaussians, step)
+        return along_curve(growth), counts
+
+    def _clear(self, iteration: int) -> None:
+        """Remove what a technique does not want, after the last step of density control, too."""
+        gone = self.techniques.unwanted(self.gaussians.detach(), iteration)
         if gone is not None and bool(gone.any()) and not bool(gone.all()):
-            self._become(unchanged(gaussians, ~gone))
-            pruned = int(gone.sum())
-            self.history.add_density(DensityEvent(iteration, 0, 0, pruned, 0, gaussians=len(self.gaussians)))
+            self._remove(gone, iteration)
+
+    def keep_most_opaque(self, count: int) -> None:
+        """Remove all Gaussians but so many, between two iterations."""
+        order = torch.argsort(self.gaussians.opacity_logits.detach().cpu(), descending=True, stable=True)
+        gone = torch.ones(len(order), dtype=torch.bool)
+        gone[order[:count]] = False
+        with torch.no_grad():
+            self._remove(gone.to(self.gaussians.means.device), self.iteration)
+
+    def _remove(self, gone: Bool[Tensor, " n"], iteration: int) -> None:
+        self._become(unchanged(self.gaussians.detach(), ~gone))
+        self.history.add_density(DensityEvent(iteration, 0, 0, int(gone.sum()), 0, gaussians=len(self.gaussians)))
 
     def _become(self, growth: Growth) -> None:
-        """Take the rows of a growth, with their moments."""
+        """Take the rows of a growth, with their moments; one tensor after the other, for memory is tight."""
         self.buffers = GradientBuffers()
-        grown = self.gaussians.detach().select(growth.source)
-        grown.means, grown.log_scales, grown.opacity_logits = growth.means, growth.log_scales, growth.opacity_logits
+        rest = {name: getattr(self.gaussians, name).detach() for name in ("quats", "sh")}
+        self.gaussians = Gaussians.empty(0, 0)  # only `rest` holds the old ones now
+        take_rows(rest, growth.source)
+        grown = Gaussians(growth.means, growth.log_scales, rest["quats"], growth.opacity_logits, rest["sh"])
         self.gaussians = grown.requires_grad_()
         self.adam.select(growth.source)
         self.adam.zero_state(rows=growth.fresh)
@@ -166,6 +194,11 @@ class TrainState:
         model.quats = model.quats / torch.linalg.vector_norm(model.quats, dim=1, keepdim=True).clamp(min=1e-30)
         return model
 
+    def whole_history(self) -> History:
+        """The history with what the optimiser has counted; waits for the device."""
+        self.history.skipped_gradients += self.adam.take_skipped()
+        return self.history
+
     def checkpoint(self, instruction_set: str) -> Checkpoint:
         """All of it for a file; not copied.
 
@@ -176,25 +209,27 @@ class TrainState:
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
         tensors |= {_DENSITY + name: tensor for name, tensor in self.density.to_arrays().items()}
         tensors |= self.techniques.to_arrays()
-        facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.history.state()}
+        facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.whole_history().state()}
         facts["instruction_set"] = instruction_set
-        return Checkpoint({name: tensor.numpy() for name, tensor in tensors.items()}, facts)
+        return Checkpoint({name: tensor.cpu().numpy() for name, tensor in tensors.items()}, facts)
 
     @staticmethod
-    def restore(checkpoint: Checkpoint, plan: Plan, techniques: Techniques) -> TrainState:
+    def restore(checkpoint: Checkpoint, plan: Plan, techniques: Techniques, device: torch.device = CPU) -> TrainState:
         """The inverse of ``checkpoint``.
 
         Args:
             checkpoint: As it was written.
             plan: The training's.
             techniques: The plan's, which take what the checkpoint has of them; not to be used where that fails.
+            device: Where it goes on, whatever it was written on.
 
         Raises:
             BrokenCheckpointError: if something is missing or does not fit.
         """
         try:
             tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
-            gaussians = Gaussians.from_tensors({name: tensors[name] for name in PARAMETERS}).requires_grad_()
+            model = Gaussians.from_tensors({name: tensors[name] for name in PARAMETERS})
+            gaussians = model.to(device).requires_grad_()
             if gaussians.sh.shape[1] != coefficient_count(plan.options.sh_degree):
                 raise ValueError("another degree of spherical harmonics")
             state = TrainState.of(gaussians, plan, History(**checkpoint.facts["history"]), techniques)

@@ -19,6 +19,7 @@ from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.train.draws import permutation
 from splatpipe.pipeline.train.photo_cache import PhotoCache, stored_bytes
+from splatpipe.pipeline.train.upload import Upload, Uploader
 
 READ_AHEAD = 3  # photos in flight: hides a slow decode behind an iteration
 
@@ -31,11 +32,13 @@ class TrainingPhoto:
         camera: Its camera, at the size of ``colour``.
         colour: In [0, 1].
         mask: True where the photo counts; None where all of it does.
+        is_empty: Nothing of it counts; known without asking the device.
     """
 
     camera: Camera
     colour: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None
+    is_empty: bool = False
 
 
 class PhotoStream:
@@ -74,12 +77,18 @@ class PhotoStream:
         self._seed = seed
         self._next = first
         self._max_megapixels = max_megapixels
-        self._pending: deque[Future[TrainingPhoto]] = deque()
+        self._uploader = Uploader(torch.device("cpu"))
+        self._pending: deque[Future[tuple[Camera, Upload, bool]]] = deque()
         self._epoch = (-1, np.zeros(0, np.int64))
         wanted = Counter(self._key(iteration) for iteration in range(first, len(levels) + 1))
         self._wanted_again = {key for key, times in wanted.items() if times > 1}
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
+
+    def to(self, device: torch.device) -> PhotoStream:
+        """Itself, with photos on a device; before the first of them."""
+        self._uploader = Uploader(device)
+        return self
 
     def __enter__(self) -> PhotoStream:
         return self
@@ -97,7 +106,8 @@ class PhotoStream:
             self._next += 1
         if not self._pending:
             raise StopIteration
-        return self._pending.popleft().result()
+        camera, upload, is_empty = self._pending.popleft().result()
+        return TrainingPhoto(camera, *self._uploader.end(upload), is_empty)
 
     def view_index(self, iteration: int) -> int:
         """Which view an iteration (from 1) is trained on."""
@@ -128,14 +138,9 @@ class PhotoStream:
     def _key(self, iteration: int) -> tuple[int, int]:
         return self.view_index(iteration), self._levels[iteration - 1]
 
-    def _photo(self, iteration: int) -> TrainingPhoto:
-        key = self._key(iteration)
-        camera, pixels, mask = self._decoded(key)
-        # A fresh array each: as fast as a ring of buffers here, and none is overwritten while the trainer holds it.
-        colour = pixels.astype(np.float32)
-        colour *= np.float32(1.0 / 255.0)
-        counts = None if mask is None else torch.from_numpy(mask.copy())
-        return TrainingPhoto(camera, torch.from_numpy(colour), counts)
+    def _photo(self, iteration: int) -> tuple[Camera, Upload, bool]:
+        camera, pixels, mask = self._decoded(self._key(iteration))
+        return camera, self._uploader.begin(pixels, mask), mask is not None and not mask.any()
 
     def _decoded(self, key: tuple[int, int]) -> tuple[Camera, Pixels, Mask | None]:
         stored = self._cache.get(key)

@@ -32,7 +32,11 @@ Kind = TypeVar("Kind", bound=Technique)
 
 
 def make_techniques(
-    plan: Plan, sky: SkyModel | None = None, views: Sequence[View] = (), dataset: Path | None = None
+    plan: Plan,
+    sky: SkyModel | None = None,
+    views: Sequence[View] = (),
+    dataset: Path | None = None,
+    device: torch.device | None = None,
 ) -> Techniques:
     """Those that a plan asks for, nothing of them trained.
 
@@ -44,6 +48,7 @@ def make_techniques(
         sky: As it begins; copied.
         views: Those trained on.
         dataset: Theirs, with the sparse points; None for a training that is thrown away.
+        device: Where the model is trained; None for the CPU.
 
     Raises:
         StageError: if the dataset is broken.
@@ -64,6 +69,8 @@ def make_techniques(
         made.append(Distortion(options.distortion_weight, options.iterations))
     if options.prune_free_space and dataset is not None:
         made.append(Clearing(free_space_of(views, dataset), schedule))
+    for technique in made:
+        technique.move_to(device or torch.device("cpu"))
     return Techniques(tuple(made))
 
 
@@ -142,7 +149,7 @@ class Techniques:
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """Which Gaussians have to go after an iteration; None where it is not one to look."""
         found = [technique.unwanted(gaussians, iteration) for technique in self.each]
-        masks = [mask for mask in found if mask is not None]
+        masks = [mask.to(gaussians.means.device) for mask in found if mask is not None]
         return torch.stack(masks).any(dim=0) if masks else None
 
     def summary(self) -> dict[str, int | float]:

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 import torch
 
-from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError
 from splatpipe.pipeline.engine.run_folder import Contents
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
 from splatpipe.pipeline.photos.images import reduced_view
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.device import choose_device, cpu
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.render.rendering import as_trained, render_pixels
+from splatpipe.pipeline.render.rendering import as_trained, placed, render_pixels
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama, read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
@@ -135,12 +136,18 @@ def held_out_of(opened: Contents) -> Sequence[str]:
 def pictures(shown: Shown, view: View, threads: int) -> tuple[bytes, bytes]:
     """JPEGs of a render and of its photo, both of the size that is trained on.
 
+    Rendered on the graphics card where there is one, and what trains on it leaves room.
+
     Raises:
         SplatpipeError: if the photo cannot be read.
     """
     camera, photo, _ = reduced_view(view, shown.megapixels)
+    model = (shown.gaussians, shown.sky)
     with same_bits(threads):
-        render = render_pixels((shown.gaussians, shown.sky), camera, shown.options)
+        try:
+            render = render_pixels(placed(model, choose_device("auto")), camera, shown.options)
+        except (torch.OutOfMemoryError, MachineError):
+            render = render_pixels(placed(model, cpu()), camera, shown.options)
     return _jpeg(render), _jpeg(photo)
 
 

@@ -1,0 +1,135 @@
+"""What a model is rendered and trained on: the CPU's native kernels, or a CUDA device's."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.raster import cuda_library, rasterizer
+
+CPU = torch.device("cpu")
+SAME_BITS = "the same bits for one seed"
+CUBLAS_WORKSPACE = ("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # with which cuBLAS adds in one order, as its manual says
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where the model is, and what computes on it.
+
+    Attributes:
+        name: ``cpu`` or ``cuda``.
+        tensors: Where they lie.
+    """
+
+    name: str
+    tensors: torch.device
+
+    @property
+    def kernels(self) -> str:
+        """The instruction set, or the architecture, device and driver: with others, the last bits differ."""
+        return rasterizer.kernels_name(self.tensors)
+
+    def facts(self) -> dict[str, JSON]:
+        """What a manifest says of it."""
+        return {"device": self.name, "instruction_set": self.kernels, "mode": SAME_BITS}
+
+    def wait(self) -> None:
+        """Until everything asked of the device is done; needed for nothing but clocks."""
+        if self.tensors.type == "cuda":
+            torch.cuda.synchronize(self.tensors)
+
+    def limit_memory(self, limit_bytes: int) -> None:
+        """Let tensors take no more of the device's own memory from now on.
+
+        Args:
+            limit_bytes: The most; 0 for all of it.
+        """
+        if self.tensors.type == "cuda":
+            whole = torch.cuda.get_device_properties(self.tensors).total_memory
+            torch.cuda.set_per_process_memory_fraction(min(1.0, limit_bytes / whole) if limit_bytes else 1.0)
+
+    def free_unused_memory(self) -> None:
+        """Give back what torch keeps for later: in pieces, it may be of no use for what is asked for next."""
+        if self.tensors.type == "cuda":
+            torch.cuda.empty_cache()
+
+    @contextmanager
+    def one_order(self) -> Iterator[None]:
+        """Let torch refuse whatever adds in another order each time; on the CPU nothing that is used does."""
+        if self.tensors.type != "cuda":
+            yield
+            return
+        torch.use_deterministic_algorithms(True)
+        # Kernels write all of what they are given.
+        torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+        try:
+            yield
+        finally:
+            torch.use_deterministic_algorithms(False)
+
+
+def cpu() -> Device:
+    """The CPU."""
+    return Device("cpu", CPU)
+
+
+def choose_device(wanted: str, unfit: str = "") -> Device:
+    """The device that is asked for; ``auto`` takes CUDA where it works.
+
+    Args:
+        wanted: ``auto``, ``cpu`` or ``cuda``.
+        unfit: Why the work cannot be done on a CUDA device; empty where it can.
+
+    Raises:
+        MachineError: for ``cuda`` where it does not work, with the reason.
+        UsageError: for ``cuda`` where the work cannot be done there.
+    """
+    if wanted == "cpu":
+        return cpu()
+    missing = cuda_library.why_not()
+    if wanted == "cuda" and missing is not None:
+        raise missing.error()
+    if wanted == "cuda" and unfit:
+        raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
+    if missing is not None or unfit:
+        return cpu()
+    os.environ.setdefault(*CUBLAS_WORKSPACE)  # read when its first product is computed
+    return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
+
+
+def free_bytes(tensors: torch.device) -> int | None:
+    """How much more tensors may take of a device's own memory; None for the CPU."""
+    if tensors.type != "cuda":
+        return None
+    free, whole = torch.cuda.mem_get_info(tensors)
+    taken = torch.cuda.memory_allocated(tensors)
+    allowed = int(whole * torch.cuda.get_per_process_memory_fraction(tensors))
+    return min(free + torch.cuda.memory_reserved(tensors), allowed) - taken
+
+
+def take_rows(tensors: dict[str, Tensor], rows: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> None:
+    """Put rows of each tensor in its place, one after the other: two of the largest are never there at once twice.
+
+    Args:
+        tensors: By name; changed.
+        rows: An index or a mask.
+    """
+    for name in tuple(tensors):
+        tensors[name] = _taken(tensors, name, rows)
+
+
+def _taken(tensors: dict[str, Tensor], name: str, rows: Tensor) -> Tensor:
+    try:
+        return tensors[name][rows]
+    except torch.OutOfMemoryError:  # old and new do not fit side by side: the old one waits in the host's memory
+        device = tensors[name].device
+        tensors[name] = tensors[name].cpu()
+    return tensors[name][rows.cpu()].to(device)

@@ -1,0 +1,83 @@
+"""What is done where a device's memory does not hold an iteration: less at a time, then fewer Gaussians, always told.
+
+An iteration changes nothing before its step, and what it takes the most memory for comes before that: so it is begun
+again with less. Growth that does not fit is no such case: it is foreseen (see ``memory.within_room``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.raster.cuda import kernels_of
+from splatpipe.pipeline.raster.rasterizer import GradientBuffers
+from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
+
+KEPT_SHARE = 0.9  # of the Gaussians each time, the most opaque: what is lost is what shows least
+HINT = "Lower undistort.max_megapixels or train.max_gaussians, or close what else uses the graphics card."
+
+Step = Callable[[TrainState, Plan, TrainingPhoto], None]
+
+
+def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporter) -> None:
+    """An iteration, begun again with less where the device's memory is too small for it.
+
+    Args:
+        step: The iteration.
+        state: As of ``iteration.iterate``.
+        plan: The training's.
+        photo: To train on.
+        report: Is told what there is less of.
+
+    Raises:
+        MachineError: if there is nothing left to make smaller.
+    """
+    while not _fits(step, state, plan, photo):
+        # Not while the error is handled: it holds on to all that the iteration had.
+        state.buffers = GradientBuffers()
+        for tensor in state.gaussians.tensors().values():
+            tensor.grad = None
+        if state.gaussians.means.device.type == "cuda":
+            torch.cuda.empty_cache()  # in pieces, what torch keeps may be of no use for what is asked for next
+        _take_less(state, report)
+
+
+def _fits(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto) -> bool:
+    steps = state.adam.step_count
+    try:
+        step(state, plan, photo)
+    except torch.OutOfMemoryError as error:
+        if state.adam.step_count == steps:
+            return False
+        raise MachineError(
+            f"The graphics card's memory does not hold {len(state.gaussians):,} Gaussians.", hint=HINT
+        ) from error
+    return True
+
+
+def _take_less(state: TrainState, report: Reporter) -> None:
+    """The next smaller thing: chunks of pairs first, then the model."""
+    kernels, count, now = kernels_of(state.gaussians.means.device), len(state.gaussians), state.iteration + 1
+    if kernels is not None and kernels.forecast.shrink():
+        report.warning(
+            f"The graphics card's memory is short in iteration {now:,}: each picture is worked off in smaller parts, "
+            "which is slower and gives the same bits.",
+            hint=HINT,
+        )
+        return
+    fewer = max(int(KEPT_SHARE * count), FEWEST_GAUSSIANS)
+    if fewer >= count:
+        raise MachineError(f"The graphics card's memory does not hold even {count:,} Gaussians.", hint=HINT)
+    state.history.growth_ended = state.history.growth_ended or max(1, state.iteration)
+    state.keep_most_opaque(fewer)
+    report.warning(
+        f"The graphics card's memory does not hold {count:,} Gaussians: the training goes on with the "
+        f"{fewer:,} most opaque, and adds none from iteration {now:,} on.",
+        hint=HINT,
+    )

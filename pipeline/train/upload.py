@@ -1,0 +1,86 @@
+"""Decoded photos as the trainer's tensors: on the CPU at once, to a CUDA device beside what is computed there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from splatpipe.pipeline.photos.images import Mask, Pixels
+
+STEP = float(np.float32(1.0 / 255.0))  # of 8 bits: the same float32 wherever it is multiplied by
+
+
+@dataclass(frozen=True, eq=False)
+class Upload:
+    """A photo on its way.
+
+    Attributes:
+        colour: In [0, 1]; of 8 bits while it is sent.
+        mask: True where the photo counts; None where all of it does.
+        sent: Happens on the device when both are there; None on the CPU.
+    """
+
+    colour: Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"]
+    mask: Bool[Tensor, "h w"] | None
+    sent: torch.cuda.Event | None
+
+
+class Uploader:
+    """Takes photos to where they are trained on.
+
+    To a CUDA device they go from pinned memory, 8 bits a value, on a stream of their own: neither the host nor what is
+    computed meanwhile waits for them.
+
+    Args:
+        device: Where to.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None  # type: ignore[no-untyped-call]
+
+    def begin(self, pixels: Pixels, mask: Mask | None) -> Upload:
+        """Send a photo; from any thread, the arrays are not needed afterwards.
+
+        Args:
+            pixels: (h, w, 3).
+            mask: (h, w).
+        """
+        if self._stream is None:
+            # A fresh array each: as fast as a ring of buffers here, and none is overwritten while the trainer holds it.
+            colours = pixels.astype(np.float32)
+            colours *= np.float32(STEP)
+            return Upload(torch.from_numpy(colours), None if mask is None else torch.from_numpy(mask.copy()), None)
+        with torch.cuda.stream(self._stream):
+            colour = _pinned(pixels).to(self._device, non_blocking=True)
+            counts = None if mask is None else _pinned(mask).to(self._device, non_blocking=True)
+            sent = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            sent.record(self._stream)
+        return Upload(colour, counts, sent)
+
+    def end(self, upload: Upload) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"] | None]:
+        """A photo that is there when the device comes to it, its colours in [0, 1]; from the thread that computes."""
+        if upload.sent is None:
+            return upload.colour, upload.mask
+        current = torch.cuda.current_stream(self._device)
+        current.wait_event(upload.sent)
+        for tensor in (upload.colour, upload.mask):
+            if tensor is not None:
+                tensor.record_stream(current)  # its memory is the other stream's, and not to be had until then
+        return colours_of(upload.colour), upload.mask
+
+
+def colours_of(pixels: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Colours in [0, 1] of 8 bits, on their device: the values that the CPU has."""
+    return pixels.to(torch.float32).mul_(STEP)
+
+
+def _pinned(array: Pixels | Mask) -> Tensor:
+    """A copy in memory that the device reads by itself; torch keeps it until that is done."""
+    copy = torch.empty(array.shape, dtype=torch.bool if array.dtype == np.bool_ else torch.uint8, pin_memory=True)
+    np.copyto(copy.numpy(), array)
+    return copy
