@@ -1,6 +1,7 @@
 """The CUDA library's mirror for ctypes, how it is loaded, and what is told where it cannot be used."""
 
 import ctypes
+import os
 import re
 import subprocess
 import sys
@@ -8,10 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster import cuda_api, cuda_library
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, Installed, reason_of
+
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
+from building import build_on_cpu
 
 NATIVE = Path(__file__).parent.parent / "pipeline" / "raster" / "native" / "cuda"
 API = (NATIVE / "api.h").read_text()
@@ -127,6 +132,44 @@ print(found)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith(("NoCuda(reason=", "None"))
+
+
+@pytest.fixture(scope="module")
+def fake_driver(tmp_path_factory) -> Path:
+    """A folder with a driver's library that says what its environment tells it to."""
+    folder = tmp_path_factory.mktemp("driver")
+    source = """
+#include <cstdlib>
+extern "C" int cuDriverGetVersion(int* version) { *version = std::atoi(std::getenv("FAKE_VERSION")); return 0; }
+extern "C" int cuInit(unsigned) { return std::atoi(std::getenv("FAKE_INIT")); }
+"""
+    build(source, folder / "libcuda.so.1", "-shared", "-fPIC")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("version", "init", "has_kernels", "reason"),
+    [
+        (13000, 100, True, "no NVIDIA graphics card"),
+        (13000, 0, False, "built without CUDA kernels"),
+        (12080, 0, True, "too old: it knows CUDA 12.8, and the CUDA kernels were built with CUDA 13"),
+        (13000, 0, True, "torch does not find" if torch.version.cuda else "torch is a build for the CPU"),
+    ],
+)
+def test_what_the_system_says_leads_to_the_reason(fake_driver, version, init, has_kernels, reason):
+    library = build_on_cpu() if has_kernels else fake_driver / "libsplat_cuda.so"
+    code = f"""
+from pathlib import Path
+from splatpipe.pipeline.raster.cuda_library import why_not
+print(why_not(Path({str(library)!r})).reason)
+"""
+    environment = os.environ | {
+        "LD_LIBRARY_PATH": str(fake_driver),
+        "FAKE_VERSION": f"{version}",
+        "FAKE_INIT": f"{init}",
+    }
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert reason in done.stdout
 
 
 def test_a_device_is_described_with_what_may_change_its_bits():

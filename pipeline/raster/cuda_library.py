@@ -203,14 +203,18 @@ def reason_of(installed: Installed) -> NoCuda | None:
     return None
 
 
-def why_not() -> NoCuda | None:
-    """Why CUDA cannot be used here; None if it can. Asks the cheap things first, and torch last."""
+def why_not(path: Path = LIBRARY) -> NoCuda | None:
+    """Why CUDA cannot be used here; None if it can. Asks the cheap things first, and torch last.
+
+    Args:
+        path: Of the library.
+    """
     code, driver = _driver()
-    installed = Installed(driver, code, LIBRARY.exists())
+    installed = Installed(driver, code, path.exists())
     if reason := reason_of(installed):
         return reason
     try:
-        library = load().device(0)
+        library = load(path).device(0)
     except MachineError as error:
         return NoCuda(error.message, error.hint)
     installed = Installed(driver, code, True, library)
