@@ -5,13 +5,14 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import re
 import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-HARNESS = Path(__file__).parent
+HARNESS = Path(__file__).resolve().parent
 NATIVE = HARNESS.parents[1] / "pipeline" / "raster" / "native"
 KEPT = Path(tempfile.gettempdir()) / f"splatpipe-cuda-on-cpu-{os.getuid()}"
 
@@ -21,7 +22,8 @@ FORWARD, REVERSE, SHUFFLED = range(3)
 FLAGS = ("-std=c++17", "-O2", "-g0", "-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-DSPLAT_ON_CPU=1")
 _CPU = Path("/proc/cpuinfo")
 WARNINGS = ("-Wall", "-Wextra", "-Wno-unknown-pragmas", "-Wno-unused-parameter", "-Wno-psabi")
-_HEADERS = (".h", ".cuh")
+_SOURCES = (".h", ".cuh", ".cu")
+_INCLUDE = re.compile(r'^#include "(.+)"', re.MULTILINE)
 
 
 def kernel_sources() -> list[Path]:
@@ -32,16 +34,17 @@ def kernel_sources() -> list[Path]:
 def build_on_cpu(
     sources: Iterable[Path] | None = None,
     name: str = "splat_cuda",
-    changed: Mapping[Path, str] | None = None,
     flags: Iterable[str] = (),
+    changed: Mapping[Path, str] | None = None,
 ) -> Path:
     """Compile sources and link them with the harness.
 
     Args:
         sources: CUDA sources; None: the backend's own.
         name: Of the library.
-        changed: Other text for sources or headers in ``NATIVE``, by their paths there.
         flags: For the compiler, after the usual ones.
+        changed: Other text for sources or headers in ``NATIVE``, by their paths there; what depends on them is compiled
+            with less optimisation, which takes half the time.
 
     Returns:
         The shared library, ``lib<name>_on_cpu.so``.
@@ -49,13 +52,17 @@ def build_on_cpu(
     Raises:
         AssertionError: with what the compiler said, if it does not compile.
     """
-    chosen = kernel_sources() if sources is None else list(sources)
-    changed = dict(changed or {})
-    native = NATIVE if not changed else _copy_with(changed)
-    chosen = [native / path.relative_to(NATIVE) if path.is_relative_to(NATIVE) else path for path in chosen]
+    chosen = [HARNESS / "cuda_on_cpu.cpp", *(kernel_sources() if sources is None else sources)]
+    native = _copy_with(changed) if changed else NATIVE
     options = (*FLAGS, *_fused(), *WARNINGS, *flags)
+
+    def compiled(source: Path) -> Path:
+        if changed and not _depends(source, NATIVE).isdisjoint(changed):
+            return _compile(native / source.relative_to(NATIVE), native, (*options, "-O1"))
+        return _compile(source, NATIVE, options)
+
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        objects = list(pool.map(lambda path: _compile(path, native, options), [HARNESS / "cuda_on_cpu.cpp", *chosen]))
+        objects = list(pool.map(compiled, chosen))
     library = KEPT / _digest(path.name for path in objects) / f"lib{name}_on_cpu.so"
     if not library.exists():
         _write(library, ["-shared", *map(str, objects)])
@@ -89,7 +96,7 @@ def _digest(texts: Iterable[str]) -> str:
 
 def _copy_with(changed: Mapping[Path, str]) -> Path:
     """A copy of the native sources in which some files have other text."""
-    files = [path for path in sorted(NATIVE.rglob("*")) if path.suffix in (*_HEADERS, ".cu")]
+    files = [path for path in sorted(NATIVE.rglob("*")) if path.suffix in _SOURCES]
     texts = {path: changed.get(path, path.read_text()) for path in files}
     assert changed.keys() <= texts.keys(), "no such source"
     root = KEPT / "sources" / _digest(texts.values())
@@ -103,11 +110,24 @@ def _copy_with(changed: Mapping[Path, str]) -> Path:
     return root
 
 
+def _depends(source: Path, native: Path) -> set[Path]:
+    """A source and the headers that it includes, directly or not."""
+    found, left = set(), [source]
+    while left:
+        path = left.pop()
+        if path in found:
+            continue
+        found.add(path)
+        for name in _INCLUDE.findall(path.read_text()):
+            places = (path.parent / name, native / "cuda" / name, HARNESS / name)
+            left += [place.resolve() for place in places if place.exists()][:1]
+    return found
+
+
 def _compile(source: Path, native: Path, options: tuple[str, ...]) -> Path:
-    """The object of a source, which depends on it, on all headers and on the options."""
-    headers = [path for root in (native, HARNESS) for path in sorted(root.rglob("*")) if path.suffix in _HEADERS]
-    digest = _digest([source.name, *options, *(path.read_text() for path in (*headers, source))])
-    built = KEPT / "objects" / f"{source.stem}-{digest}.o"
+    """The object of a source, which depends on it, on its headers and on the options."""
+    texts = [path.read_text() for path in sorted(_depends(source, native))]
+    built = KEPT / "objects" / f"{source.stem}-{_digest([source.name, *options, *texts])}.o"
     if not built.exists():
         language = ("-x", "c++") if source.suffix == ".cu" else ()
         _write(built, [*options, f"-I{HARNESS}", f"-I{native / 'cuda'}", "-c", *language, str(source)])
