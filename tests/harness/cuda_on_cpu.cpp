@@ -88,15 +88,13 @@ class Fiber {
 };
 #endif
 
-struct Lane {
-    Request request;
-    uint64_t value, result;
-    int argument;
-};
-
 struct Warp {
     uint32_t ready, waiting, at_barrier, ended;
-    Lane lanes[kLanes];
+    bool alike;     // all that wait ask for the same
+    Request asked;  // by those that wait; where not alike, each lane's:
+    Request requests[kLanes];
+    uint64_t values[kLanes], results[kLanes];
+    int arguments[kLanes];
 };
 
 struct Piece {
@@ -233,7 +231,7 @@ void explain_deadlock() {
         waiting += __builtin_popcount(warp.waiting);
         if (!request && warp.waiting) {
             thread = w * kLanes + __builtin_ctz(warp.waiting);
-            request = &warp.lanes[thread % kLanes].request;
+            request = warp.alike ? &warp.asked : &warp.requests[thread % kLanes];
         }
     }
     if (request)
@@ -339,52 +337,87 @@ struct Permutation {
     uint64_t at(uint64_t i) const { return (begin + i * (step % count)) % count; }
 };
 
-// All lanes of a mask have met: what each gets.
+bool operator==(const Request& a, const Request& b) {
+    return a.operation == b.operation && a.mask == b.mask && a.width == b.width && a.place.line == b.place.line;
+}
+
+// The lane that another one's value comes from.
+int source(const Request& request, int lane, int argument) {
+    const int segment = lane & ~(request.width - 1), last = segment + request.width - 1;
+    switch (request.operation) {
+        case Operation::shuffle:
+            return segment + (argument & (request.width - 1));
+        case Operation::shuffle_up:
+            return lane - argument < segment ? lane : lane - argument;
+        case Operation::shuffle_down:
+            return lane + argument > last ? lane : lane + argument;
+        default:
+            return (lane ^ argument) > last ? lane : lane ^ argument;
+    }
+}
+
+uint32_t lanes_with(const Warp& warp, uint32_t mask, uint64_t value) {
+    uint32_t with = 0;
+    for (int lane = 0; lane < kLanes; ++lane) with |= static_cast<uint32_t>(warp.values[lane] == value) << lane;
+    return with & mask;
+}
+
+// All lanes of a mask have met: what each gets. Lanes beside the mask may wait for something else.
 void complete(Warp* warp, const Request& request) {
-    const auto lanes_of = [&](auto&& body) {
-        for (uint32_t left = request.mask; left; left &= left - 1) body(__builtin_ctz(left));
-    };
-    uint64_t ballot = 0;
-    lanes_of([&](int lane) { ballot |= (warp->lanes[lane].value & 1u) << lane; });
-    lanes_of([&](int lane) {
-        Lane& its = warp->lanes[lane];
-        const int segment = lane & ~(request.width - 1), last = segment + request.width - 1;
-        int from = lane;
-        switch (request.operation) {
-            case Operation::syncwarp:
-                its.result = 0;
-                return;
-            case Operation::ballot:
-                its.result = ballot;
-                return;
-            case Operation::any:
-                its.result = ballot != 0;
-                return;
-            case Operation::all:
-                its.result = ballot == request.mask;
-                return;
-            case Operation::match:
-                its.result = 0;
-                lanes_of([&](int other) {
-                    its.result |= static_cast<uint64_t>(warp->lanes[other].value == its.value) << other;
-                });
-                return;
-            case Operation::shuffle:
-                from = segment + (its.argument & (request.width - 1));
-                break;
-            case Operation::shuffle_up:
-                from = lane - its.argument < segment ? lane : lane - its.argument;
-                break;
-            case Operation::shuffle_down:
-                from = lane + its.argument > last ? lane : lane + its.argument;
-                break;
-            case Operation::shuffle_xor:
-                from = (lane ^ its.argument) > last ? lane : lane ^ its.argument;
-                break;
+    const auto give = [&](auto&& result) {
+        for (uint32_t left = request.mask; left; left &= left - 1) {
+            const int lane = __builtin_ctz(left);
+            warp->results[lane] = result(lane);
         }
-        const uint64_t nothing = uint64_t{kPoison} << 32 | kPoison;  // a lane that takes no part has no value
-        its.result = request.mask >> from & 1u ? warp->lanes[from].value : nothing;
-    });
+    };
+    const uint64_t nothing = uint64_t{kPoison} << 32 | kPoison;  // a lane that takes no part has no value
+    uint64_t ballot = 0;
+    switch (request.operation) {
+        case Operation::syncwarp:
+            return;
+        case Operation::ballot:
+        case Operation::any:
+        case Operation::all:
+            ballot = lanes_with(*warp, request.mask, 1);
+            if (request.operation == Operation::any) ballot = ballot != 0;
+            if (request.operation == Operation::all) ballot = ballot == request.mask;
+            return give([&](int) { return ballot; });
+        case Operation::match:
+            return give([&](int lane) { return lanes_with(*warp, request.mask, warp->values[lane]); });
+        default:
+            return give([&](int lane) {
+                const int from = source(request, lane, warp->arguments[lane]);
+                return request.mask >> from & 1u ? warp->values[from] : nothing;
+            });
+    }
+}
+
+// Whether all lanes of a request's mask ask for the same; told if not.
+bool agree(const Warp& warp, const Request& request) {
+    if (warp.alike) return true;
+    for (uint32_t left = request.mask; left; left &= left - 1) {
+        const Request& other = warp.requests[__builtin_ctz(left)];
+        if (other == request) continue;
+        fail(
+            "warp %u of block %u: threads meet in different places, %s at %s:%d (mask %08x) and %s at %s:%d (mask "
+            "%08x)",
+            threadIdx.x / kLanes, blockIdx.x, name_of(request.operation), base_name(request.place.file),
+            request.place.line, request.mask, name_of(other.operation), base_name(other.place.file), other.place.line,
+            other.mask);
+        return false;
+    }
+    return true;
+}
+
+// Keeps what a lane asks for: once for all as long as they ask for the same.
+void ask(Warp* warp, int lane, const Request& request) {
+    if (warp->waiting == 0) {
+        warp->asked = request, warp->alike = true;
+    } else if (warp->alike && !(warp->asked == request)) {
+        for (Request& each : warp->requests) each = warp->asked;
+        warp->alike = false;
+    }
+    if (!warp->alike) warp->requests[lane] = request;
 }
 
 }  // namespace
@@ -399,27 +432,16 @@ uint64_t at_warp(const Request& request, uint64_t value, int argument) {
              request.mask & bit ? "names threads that have returned" : "does not name the thread itself");
         abandon();
     }
-    warp.lanes[lane] = {request, value, 0, argument};
+    ask(&warp, lane, request);
+    warp.values[lane] = value, warp.arguments[lane] = argument;
     warp.ready &= ~bit, warp.waiting |= bit;
     if ((warp.waiting & request.mask) == request.mask) {
-        for (uint32_t left = request.mask; left; left &= left - 1) {
-            const Request& other = warp.lanes[__builtin_ctz(left)].request;
-            if (other.operation == request.operation && other.mask == request.mask && other.width == request.width &&
-                other.place.line == request.place.line)
-                continue;
-            fail(
-                "warp %u of block %u: threads meet in different places, %s at %s:%d (mask %08x) and %s at %s:%d (mask "
-                "%08x)",
-                threadIdx.x / kLanes, blockIdx.x, name_of(request.operation), base_name(request.place.file),
-                request.place.line, request.mask, name_of(other.operation), base_name(other.place.file),
-                other.place.line, other.mask);
-            abandon();
-        }
+        if (!agree(warp, request)) abandon();
         complete(&warp, request);
         warp.waiting &= ~request.mask, warp.ready |= request.mask;
     }
     go_on();
-    return warp.lanes[lane].result;
+    return warp.results[lane];
 }
 
 int at_barrier(Barrier barrier, int predicate, Place place) {

@@ -1,0 +1,138 @@
+"""The checks of the CUDA kernels that planted faults have to face: the same that the kernels pass. Without torch.
+
+As a program, it makes the checks on each fault of a library in a process of its own: what is broken may crash.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from agreement import gradient_complaints, picture_complaints
+from frames import ORDERS, Case, Memory, Outcome, controls, pointer, run
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+
+PATIENCE_S = 60
+"""Far more than all checks of one fault take: what loops for ever is found, too."""
+LOSS_RTOL = 1e-5
+LOSS_GRADIENT_RTOL = 5e-5
+"""Both as in test_loss.py."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """A loss, and what it is by its definition.
+
+    Attributes:
+        render: (h, w, 3).
+        photo: (h, w, 3).
+        mask: (h, w), zero where a pixel does not count.
+        weight: Of SSIM.
+        value: The loss.
+        gradient: By the render, (h, w, 3).
+    """
+
+    render: np.ndarray
+    photo: np.ndarray
+    mask: np.ndarray
+    weight: float
+    value: float
+    gradient: np.ndarray
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Frames with their pictures and gradients by the definition, a loss, and larger frames with their pictures."""
+
+    frames: list[tuple[Case, Outcome]]
+    loss: Pictures
+    large: list[tuple[Case, Outcome]]
+
+
+def complaints(library: CudaLibrary, truth: Truth) -> Iterator[str]:
+    """In what way the kernels are not right, one after another; nothing if they are."""
+    harness = controls(library)
+    firsts: list[Outcome] = []
+    for order in ORDERS:
+        harness.harness_order(*order)
+        for number, (case, exact) in enumerate(truth.frames):
+            ours = run(library, case)
+            yield from picture_complaints(ours, exact)
+            yield from gradient_complaints(ours, exact)
+            if order is ORDERS[0]:
+                firsts.append(ours)
+            yield from (f"{name} differs by order" for name in ours.differs(firsts[number]))
+        yield from loss_complaints(library, truth.loss)
+        for case, exact in truth.large:
+            yield from picture_complaints(run(library, case), exact)
+    for (case, _), first in zip(truth.frames, firsts, strict=True):
+        pairs = first.facts[0]
+        for capacity, passes in ((pairs // 3, 1), (pairs // 3, 2), (pairs - 1, 3)):
+            again = run(library, case, capacity, passes)
+            yield from (f"{name} differs by chunks" for name in again.differs(first))
+
+
+def loss_complaints(library: CudaLibrary, truth: Pictures) -> Iterator[str]:
+    height, width = truth.mask.shape
+    at = Memory()
+    size = library.size("splat_loss_bytes", width, height)
+    memory = at.empty("memory", (size,), np.uint8)
+    render, photo, mask = (at.put(name, getattr(truth, name)) for name in ("render", "photo", "mask"))
+    gradient, value = at.empty("gradient", render.shape), at.empty("value", (1,), np.float64)
+    pictures = (pointer(render), pointer(photo), pointer(mask), width, height, truth.weight)
+    library.call("splat_photo_loss", *pictures, pointer(gradient), pointer(value), pointer(memory), size, None)
+    if at.overrun():
+        yield f"written beside {at.overrun()}"
+    if not abs(value[0] - truth.value) <= LOSS_RTOL * truth.value:
+        yield f"the loss is {value[0]}, not {truth.value}"
+    error = np.linalg.norm(gradient.astype(np.float64) - truth.gradient) / np.linalg.norm(truth.gradient)
+    if not error <= LOSS_GRADIENT_RTOL:
+        yield f"gradient of the loss: {error:.1e}"
+
+
+def first_complaint(library: CudaLibrary, truth: Truth) -> str:
+    """The first of ``complaints``, also where the kernels do not even run; empty if there is none."""
+    np.seterr(all="ignore")  # poison is signalling NaN
+    try:
+        return next(complaints(library, truth), "")
+    except (MachineError, AssertionError) as error:
+        return str(error)
+
+
+def in_a_process(library: CudaLibrary, truth: Truth, fault: int) -> str:
+    """``first_complaint`` with a fault alive, or how the process ended."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(PATIENCE_S)
+        controls(library).harness_fault(fault)
+        os.write(writing, first_complaint(library, truth).encode()[:4000])
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading, "rb") as pipe:
+        said = pipe.read().decode()
+    _, status = os.waitpid(child, 0)
+    return f"ended by signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else said
+
+
+def main() -> None:
+    """Arguments: the library, the pickled truth, the number of faults. Prints what was found of each, none first."""
+    library = CudaLibrary(Path(sys.argv[1]))
+    truth = pickle.loads(Path(sys.argv[2]).read_bytes())
+    print(json.dumps([in_a_process(library, truth, fault) for fault in range(int(sys.argv[3]) + 1)]))
+
+
+if __name__ == "__main__":
+    sys.modules["checking"] = sys.modules["__main__"]  # where the pickled classes say that they are
+    main()

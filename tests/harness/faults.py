@@ -1,0 +1,238 @@
+"""Mistakes to plant in the CUDA kernels' sources, and their planting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from building import HARNESS, NATIVE, build_on_cpu, kernel_sources
+
+ALIVE = "FAULT"
+"""In a replacement: whether this fault is the one that is alive, so that one library has them all."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One mistake.
+
+    Attributes:
+        name: What is wrong with it.
+        file: In `native/cuda`.
+        snippet: What stands in the file, exactly once.
+        instead: What is put there; the same as long as ``ALIVE`` is false.
+    """
+
+    name: str
+    file: str
+    snippet: str
+    instead: str
+
+
+FAULTS = (
+    Fault(
+        "no barrier between the warps' sums and their reading",
+        "scan.cuh",
+        "shared->warps[warp_index()] = inclusive;\n    __syncthreads();",
+        "shared->warps[warp_index()] = inclusive;\n    if (!FAULT) __syncthreads();",
+    ),
+    Fault(
+        "no barrier before the warps' sums are written again",
+        "scan.cuh",
+        "__syncthreads();  // before `shared` is used again",
+        "if (!FAULT) __syncthreads();",
+    ),
+    Fault(
+        "no barrier between a batch's staging and its blending",
+        "blend.cuh",
+        "stage(job, list, from, batch);\n        __syncthreads();",
+        "stage(job, list, from, batch);\n        if (!FAULT) __syncthreads();",
+    ),
+    Fault(
+        "no barrier between the warps' gradients and their sum",
+        "blend_back.cuh",
+        "&canvas, batch);\n        __syncthreads();",
+        "&canvas, batch);\n        if (!FAULT) __syncthreads();",
+    ),
+    Fault(
+        "no barrier before a batch is staged over the last one, backward",
+        "blend_back.cuh",
+        "put_slots(job, *batch, to - from);\n        __syncthreads();",
+        "put_slots(job, *batch, to - from);\n        if (!FAULT) __syncthreads();",
+    ),
+    Fault(
+        "no barrier between clearing and counting the digits of a block",
+        "sort.cuh",
+        "counts.of[threadIdx.x] = 0;\n        __syncthreads();",
+        "counts.of[threadIdx.x] = 0;\n        if (!FAULT) __syncthreads();",
+    ),
+    Fault(
+        "no meeting of the warp between reading and writing its counts",
+        "sort.cuh",
+        "const uint32_t counted = counts[digit];\n        __syncwarp(kWholeWarp);",
+        "const uint32_t counted = counts[digit];\n        if (!FAULT) __syncwarp(kWholeWarp);",
+    ),
+    Fault(
+        "half a warp does not come to the vote",
+        "blend.cuh",
+        "const unsigned pairs = __ballot_sync(kWholeWarp, touched >> sub & 1);",
+        "const unsigned pairs = FAULT && lane > 15 ? 0u : __ballot_sync(kWholeWarp, touched >> sub & 1);",
+    ),
+    Fault(
+        "rows and columns of tiles swapped in blending",
+        "blend.cuh",
+        "return {tile, tile % job.view.tiles_x * kTile, tile / job.view.tiles_x * kTile,",
+        "const int swapped = FAULT ? job.tiles / job.view.tiles_x : job.view.tiles_x;\n"
+        "    return {tile, (FAULT ? tile / swapped : tile % swapped) * kTile,\n"
+        "            (FAULT ? tile % swapped : tile / swapped) * kTile,",
+    ),
+    Fault(
+        "rows and columns of tiles swapped in the lists",
+        "bin.cuh",
+        "const int left = row * view.tiles_x;",
+        "const int left = row * (FAULT ? (view.height + kTile - 1) / kTile : view.tiles_x);",
+    ),
+    Fault(
+        "the last warp lost from a gradient's sum",
+        "blend_back.cuh",
+        "for (int warp = 0; warp < kWarps; ++warp)\n                if (batch.summed",
+        "for (int warp = 0; warp < kWarps - FAULT; ++warp)\n                if (batch.summed",
+    ),
+    Fault(
+        "lanes sixteen apart not added up",
+        "blend_back.cuh",
+        "values[i] = kept + __shfl_xor_sync(kWholeWarp, given, kOffset);",
+        "const float opposite = __shfl_xor_sync(kWholeWarp, given, kOffset);\n"
+        "            values[i] = FAULT && kOffset == 16 ? kept : kept + opposite;",
+    ),
+    Fault(
+        "the first warp lost from the places of digits",
+        "sort.cuh",
+        "for (int warp = 0; warp < kWarps; ++warp) count += shared->warps[warp][digit];",
+        "for (int warp = FAULT; warp < kWarps; ++warp) count += shared->warps[warp][digit];",
+    ),
+    Fault(
+        "a chunk one tile too long",
+        "bin.cuh",
+        "return fits;",
+        "return fits + FAULT;",
+    ),
+    Fault(
+        "a splat's tiles go on behind the chunk's last",
+        "bin.cuh",
+        "end = min(left + span.last, tiles.end);",
+        "end = min(left + span.last, tiles.end + FAULT);",
+    ),
+    Fault(
+        "a chunk's list found from the view's first pair",
+        "blend.cuh",
+        "job.at.pair_values[0] + (begin - job.at.tile_begin[first_tile])",
+        "job.at.pair_values[0] + (begin - (FAULT ? 0 : job.at.tile_begin[first_tile]))",
+    ),
+    Fault(
+        "chunks that nobody foresaw are not worked off",
+        "frame.cu",
+        "bin_chunk(job, chunk);\n        blend_tiles<kDepth>",
+        "if (FAULT) return;\n        bin_chunk(job, chunk);\n        blend_tiles<kDepth>",
+    ),
+    Fault(
+        "the last Gaussian's slots end where they begin",
+        "blend_back.cuh",
+        "job.at.offsets[rank + 1] : header.chunk_pairs;",
+        "job.at.offsets[rank + 1] : FAULT ? begin : header.chunk_pairs;",
+    ),
+    Fault(
+        "the tiles' keys lose their upper bits",
+        "bin.cuh",
+        "static_cast<uint16_t>(tile - tiles.begin)",
+        "static_cast<uint16_t>((tile - tiles.begin) & (FAULT ? 255 : -1))",
+    ),
+    Fault(
+        "ranks of equal keys the wrong way round",
+        "sort.cuh",
+        "before = alike & before_me;",
+        "before = alike & (FAULT ? ~before_me & ~(1u << lane_index()) : before_me);",
+    ),
+    Fault(
+        "a pixel ends one Gaussian late",
+        "blend.cuh",
+        "canvas->alive = false, canvas->end = pair;\n        return;",
+        "canvas->alive = false, canvas->end = pair + FAULT;\n        if (!FAULT) return;",
+    ),
+    Fault(
+        "pixels beside the picture are blended",
+        "blend.cuh",
+        "x < view.width && y < view.height};",
+        "(x < view.width || FAULT) && y < view.height};",
+    ),
+    Fault(
+        "slots that no pixel looked at are not cleared",
+        "blend_back.cuh",
+        "clear_slots<Of::kFloats>(job, list, last);",
+        "if (!FAULT) clear_slots<Of::kFloats>(job, list, last);",
+    ),
+    Fault(
+        "sums of Gaussians do not start at zero",
+        "frame.cu",
+        "cudaMemsetAsync(job.back.sums, 0, bytes,",
+        "cudaMemsetAsync(job.back.sums, 0, FAULT ? 0 : bytes,",
+    ),
+    Fault(
+        "what is behind a pair counts with the wrong sign",
+        "blend_back.cuh",
+        "fmaf(-share, canvas->behind, light)",
+        "fmaf(FAULT ? share : -share, canvas->behind, light)",
+    ),
+    Fault(
+        "the background forgotten on the way back",
+        "blend_back.cuh",
+        "canvas.behind = (by_left - ",
+        "canvas.behind = ((FAULT ? 0.0f : by_left) - ",
+    ),
+    Fault(
+        "gradients of Gaussians that are not visible are left as they were",
+        "step.cu",
+        "stage_zero(staged.of[thread]);\n            means2d",
+        "if (!FAULT) stage_zero(staged.of[thread]);\n            means2d",
+    ),
+    Fault(
+        "no barrier between a block's gradients and the rows they go to",
+        "step.cu",
+        "mean2d[1];\n        }\n        __syncthreads();",
+        "mean2d[1];\n        }\n        if (!FAULT) __syncthreads();",
+    ),
+    Fault(
+        "one tap of the loss's window on the wrong side",
+        "loss.cu",
+        "p[(kRadius - d) * kChannels] + p[(kRadius + d) * kChannels]",
+        "p[(kRadius - d) * kChannels] + p[(kRadius + (FAULT && d == 2 ? -d : d)) * kChannels]",
+    ),
+    Fault(
+        "the loss's difference with the wrong sign",
+        "loss.cu",
+        "v > 0.0f ? 1.0f : (v < 0.0f ? -1.0f : 0.0f)",
+        "(FAULT ? -v : v) > 0.0f ? 1.0f : ((FAULT ? -v : v) < 0.0f ? -1.0f : 0.0f)",
+    ),
+    Fault(
+        "no barrier before the loss's rows are read",
+        "loss.cu",
+        "blur_pictures(job, tile, &shared.means);\n    __syncthreads();",
+        "blur_pictures(job, tile, &shared.means);\n    if (!FAULT) __syncthreads();",
+    ),
+)
+
+
+def planted() -> Path:
+    """The kernels with all faults in them, none of which is alive before ``harness_fault`` says its number, from 1.
+
+    Raises:
+        AssertionError: if a snippet is not in its file exactly once.
+    """
+    texts: dict[Path, str] = {}
+    for number, fault in enumerate(FAULTS, start=1):
+        path = NATIVE / "cuda" / fault.file
+        text = path.read_text()
+        assert text.count(fault.snippet) == 1, f"{fault.file} has '{fault.snippet}' {text.count(fault.snippet)} times"
+        changed = texts.get(path, text)
+        assert changed.count(fault.snippet) == 1, f"two faults in one place of {fault.file}: {fault.name}"
+        texts[path] = changed.replace(fault.snippet, fault.instead.replace(ALIVE, f"(::harness::fault() == {number})"))
+    return build_on_cpu([*kernel_sources(), HARNESS / "peek.cu"], "splat_cuda_with_faults", changed=texts)

@@ -1,0 +1,94 @@
+"""Mistakes planted in the CUDA kernels' sources are found, each, by the checks that the sources themselves pass."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline.raster.loss import photo_loss_reference
+
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from checking import Pictures, Truth
+from exact import case_of, exact_outcome
+from faults import FAULTS, planted
+from frames import Case
+from random_scene import random_camera, random_scene
+
+HARNESS = Path(__file__).parent / "harness"
+
+
+def ending() -> Case:
+    """Pixels end behind a few of many; equal depths; a grid of 3 x 2 tiles with parts of tiles."""
+    scene = random_scene(3, 220, 1, size=-0.8)
+    scene.opacity_logits += 2.5
+    scene.means[:, 2] = (scene.means[:, 2] * 4).round() / 4
+    camera = random_camera(3, 45, 19)
+    camera.cam_from_world[:] = np.eye(4)  # so that equal depths stay equal
+    return case_of(scene, camera, background=(0.9, 0.5, 0.1))
+
+
+def long() -> Case:
+    """Over more tile rows than a thread takes on by itself."""
+    scene = random_scene(13, 40, 0, size=-1.5)
+    scene.log_scales[:, 0] += 2.5
+    return case_of(scene, random_camera(13, 20, 150), depths=False, magnitudes=True)
+
+
+def many() -> Case:
+    """More than a block sorts at once, most of them out of sight."""
+    scene = random_scene(8, 9000, 0, size=-2.5)
+    scene.means[:, 0] = scene.means[:, 0].abs() * 20.0
+    scene.means[:, 2] = (scene.means[:, 2] * 8).round() / 8
+    camera = random_camera(8, 30, 20)
+    camera.cam_from_world[:] = np.eye(4)
+    return case_of(scene, camera).changed(upstream={})
+
+
+def many_tiles() -> Case:
+    """More tiles than a digit of their sort tells apart."""
+    scene = random_scene(6, 60, 0, size=-2.0)
+    scene.means[:, :2] *= 4.0
+    return case_of(scene, random_camera(6, 290, 240)).changed(upstream={})
+
+
+def loss() -> Pictures:
+    rng = np.random.default_rng(2)
+    render, photo = (rng.random((21, 37, 3)).astype(np.float32) for _ in range(2))
+    mask = rng.random((21, 37)) > 0.1
+    leaf = torch.from_numpy(render).double().requires_grad_()
+    value = photo_loss_reference(leaf, torch.from_numpy(photo).double(), 0.2, torch.from_numpy(mask))
+    value.backward()
+    assert leaf.grad is not None
+    return Pictures(render, photo, mask.astype(np.uint8), 0.2, value.item(), leaf.grad.numpy())
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """What was found with no fault alive, and with each."""
+    frames = [(case, exact_outcome(case)) for case in (ending(), long())]
+    large = [(case, exact_outcome(case, gradients=False)) for case in (many(), many_tiles())]
+    truth = Truth(frames, loss(), large)
+    path = tmp_path_factory.mktemp("faults") / "truth.pickle"
+    path.write_bytes(pickle.dumps(truth))
+    command = [sys.executable, str(HARNESS / "checking.py"), str(planted()), str(path), str(len(FAULTS))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    answers: list[str] = json.loads(done.stdout)
+    return answers
+
+
+def test_sources_without_a_fault_pass_every_check(found: list[str]) -> None:
+    assert found[0] == ""
+
+
+@pytest.mark.parametrize("number", range(len(FAULTS)), ids=[fault.name for fault in FAULTS])
+def test_fault_is_found(found: list[str], number: int) -> None:
+    assert found[1 + number], FAULTS[number]
