@@ -9,9 +9,8 @@ from torch import Tensor
 
 def upload(tensor: Shaped[Tensor, "*shape"], device: torch.device) -> Shaped[Tensor, "*shape"]:
     """A small tensor of the CPU's on a device: through pinned memory, for copies from any other wait for the device."""
-    if device.type != "cuda":
-        return tensor
-    return tensor.pin_memory().to(device, non_blocking=True)
+    pinned = tensor.pin_memory() if device.type == "cuda" else tensor
+    return pinned.to(device, non_blocking=True)
 
 
 def rgb_beside(colour: tuple[float, float, float], other: Tensor) -> Float[Tensor, " 3"]:

@@ -66,10 +66,11 @@ class Dropout(Technique):
 
 def _drawn(seed: int, iteration: int, gaussians: Gaussians) -> Float64[Tensor, " n"]:
     """A number in (0, 1) for each Gaussian, the same on every device."""
-    kernels = kernels_of(gaussians.opacity_logits.device)
+    device = gaussians.opacity_logits.device
+    kernels = kernels_of(device)
     if kernels is not None:
         return kernels.uniform(seed, iteration, DROPOUT, len(gaussians))
-    return torch.from_numpy(uniform(seed, iteration, DROPOUT, np.arange(len(gaussians))))
+    return torch.from_numpy(uniform(seed, iteration, DROPOUT, np.arange(len(gaussians)))).to(device)
 
 
 class _Dropped(torch.autograd.Function):
