@@ -22,7 +22,8 @@ struct AdamStep {
     float inverse_root_correction;
 };
 
-// Finds which of a block's rows step; counts those that would but for their gradients.
+// Finds which of a block's rows step; counts those that would but for their gradients. Its barriers are all that a
+// block's turns need.
 __device__ __forceinline__ bool find_stepping(const SplatAdam& adam, int64_t first, int rows, AdamShared* shared) {
     const int thread = threadIdx.x;
     shared->is_infinite[thread] = 0;
@@ -62,7 +63,6 @@ __global__ void __launch_bounds__(kThreads) adam_kernel(const AdamStep step) {
                     c, [=](int row, int column) { return gradients[row * width + column]; },
                     [=](int column) { return rates[column]; });
             }
-        __syncthreads();
     }
 }
 
