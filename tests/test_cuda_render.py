@@ -303,6 +303,24 @@ def test_short_memory_makes_chunks_smaller_then_is_told():
         assert not kernels.forecast.shrink()
 
 
+def test_an_iteration_begun_again_with_smaller_chunks_is_the_same_one(kernels):
+    expected = trained(kernels, sparse=True, dropout=False, steps=1)
+    short = ShortOfMemory(library_on_cpu(), torch.device("cpu"))
+    first = short.forecast.room(FrameSize(60, 20)).capacity
+    short.most_bytes = short.frame_bytes(shot_of(CAMERA, OPTIONS, 16), 60, first)  # and no more, on the way back
+    begun = 0
+    while True:
+        try:
+            ours = trained(short, sparse=True, dropout=False, steps=1)
+            break
+        except torch.OutOfMemoryError:
+            begun += 1
+            assert short.forecast.shrink()
+    assert begun > 0
+    assert torch.equal(ours[2], expected[2])
+    assert all(torch.equal(getattr(ours[0], name), tensor) for name, tensor in expected[0].tensors().items())
+
+
 def test_an_empty_model_is_the_background(kernels):
     nothing, buffers = Gaussians.empty(0, 3).requires_grad_(), GradientBuffers()
     with use_kernels(kernels):

@@ -134,6 +134,7 @@ class UnfinishedBackward:
         back: What each Gaussian has on the screen.
         visible: The Gaussians that it showed.
         probe: Gets its gradient when the pass is finished.
+        means2d: Memory for that, where there is a probe.
         logits_are_leaf: False where a function of the model's logits was rendered; those have the derivative of the
             rendered ones by them for a gradient, until the pass is finished.
     """
@@ -142,6 +143,7 @@ class UnfinishedBackward:
     back: Tensor
     visible: Bool[Tensor, " n"]
     probe: Float[Tensor, "n 2"] | None
+    means2d: Float[Tensor, "n 2"] | None
     logits_are_leaf: bool
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
@@ -165,10 +167,9 @@ class UnfinishedBackward:
             assert logits.grad is not None
             step.logit_gain = self.frame.kernels.at(logits.grad)
             step.logits = self.frame.kernels.at(self.frame.parameters[PARAMETERS.index("opacity_logits")])
-        means2d = None if self.probe is None else torch.empty_like(self.probe)
-        self.frame.step(self.back, step, means2d)
+        self.frame.step(self.back, step, self.means2d)
         if self.probe is not None:
-            self.probe.grad = means2d
+            self.probe.grad = self.means2d
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:
         """Finish the pass: add what it gives to the parameters' gradients, as any backward pass does."""
@@ -262,8 +263,9 @@ class _Rasterize(torch.autograd.Function):
         back = frame.blend_backward([None if grad is None else grad.contiguous() for grad in upstream])
         if ctx.buffers is not None and _can_wait(wanted[1:], ctx.leaves, ctx.probe):
             logits_are_leaf = ctx.leaves[PARAMETERS.index("opacity_logits")]
-            ctx.buffers.unfinished = UnfinishedBackward(frame, back, ctx.visible, ctx.probe, logits_are_leaf)
+            means2d = None if ctx.probe is None else torch.empty_like(ctx.probe)
             gain = None if logits_are_leaf else torch.ones_like(frame.parameters[PARAMETERS.index("opacity_logits")])
+            ctx.buffers.unfinished = UnfinishedBackward(frame, back, ctx.visible, ctx.probe, means2d, logits_are_leaf)
             given = {"opacity_logits": gain}
             return (None,) * 5 + tuple(given.get(name) for name in PARAMETERS)
         gradients, means2d = frame.project_backward(back)

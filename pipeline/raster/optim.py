@@ -103,12 +103,13 @@ class Adam:
             raise ValueError(f"parameters and rates are not those of {sorted(self.mean)}")
         unfinished = None if buffers is None else buffers.take_unfinished()
         self._check(parameters, visible, [*self.mean] if unfinished else _with_gradients(parameters))
+        fuses = unfinished is not None and _is_fused(rates, limits) and unfinished.can_step(parameters, visible)
+        if unfinished is not None and not fuses:
+            unfinished.finish(parameters)  # before anything is changed: it wants memory
         self.step_count += 1
-        if unfinished is not None and _is_fused(rates, limits) and unfinished.can_step(parameters, visible):
+        if unfinished is not None and fuses:
             self._step_fused(parameters, rates, unfinished, visible is not None, limits)
             return
-        if unfinished is not None:
-            unfinished.finish(parameters)
         self._step_rows(parameters, rates, visible)
         for name, (least, most) in (limits or {}).items():
             parameters[name].detach().clamp_(least, most)
