@@ -20,7 +20,7 @@ from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 
 BAD, TOO_LITTLE = -1, -2
 CULLED = 0xFFFFFFFF
-SORT_BLOCK = 4096
+SORT_BLOCK = 2048
 CHUNK_TILES = 1 << 16
 TILE = 16
 LOG2_ALPHA_MIN = -np.log2(255.0)

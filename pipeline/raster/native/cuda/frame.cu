@@ -14,35 +14,40 @@ namespace {
 constexpr int64_t kMaxPairs = (int64_t{1} << 31) - kSortBlock;  // of a chunk: they are counted in 32 bits with a sign
 constexpr int kDepthPasses = 32 / kDigitBits, kTilePasses = 16 / kDigitBits;
 static_assert(kDepthPasses % 2 == 0 && kTilePasses % 2 == 0, "what is sorted ends where it began");
-constexpr int64_t kTurns = 8;  // blocks a multiprocessor of work that is done in turns: what it holds at once
+constexpr int kScatterBlocks = 3;  // a multiprocessor: with more, registers are spilled
+constexpr int64_t kTurns = 8;      // blocks a multiprocessor of work that is done in turns: what it holds at once
 
-// Passes of the sorts. (Members of a kernel's argument are chosen, not indexed: it would be copied for that.)
-__device__ inline SortPass<uint32_t, int32_t> depth_pass(const Job& job, int pass) {
+// Passes of the sorts, from one half of the memory to the other and back; the first takes places for values.
+using DepthPass = SortPass<uint32_t, int32_t>;
+using TilePass = SortPass<uint16_t, uint32_t>;
+
+DepthPass depth_pass(const Job& job, int pass) {
     const FrameMemory& at = job.at;
-    const bool odd = pass % 2, first = pass == 0;
-    return {odd ? at.keys[1] : at.keys[0],
-            odd ? at.keys[0] : at.keys[1],
-            first ? nullptr
-            : odd ? at.order[1]
-                  : at.order[0],
-            odd ? at.order[0] : at.order[1],
-            first ? job.model.count : at.header->visible,
+    const int from = pass % 2, to = 1 - from;
+    int32_t* visible = &at.header->visible;
+    return {at.keys[from],
+            at.keys[to],
+            pass ? at.order[from] : nullptr,
+            at.order[to],
+            job.model.count,
+            pass ? visible : nullptr,
             pass * kDigitBits,
             at.digit_table,
             at.digit_sums,
-            first ? &at.header->visible : nullptr};
+            pass ? nullptr : visible};
 }
 
-__device__ inline SortPass<uint16_t, uint32_t> tile_pass(const Job& job, int pass) {
-    const FrameMemory& at = job.at;
-    const bool odd = pass % 2, first = pass == 0;
-    return {odd ? at.pair_keys[1] : at.pair_keys[0],
-            odd ? at.pair_keys[0] : at.pair_keys[1],
-            first ? nullptr
-            : odd ? at.pair_values[1]
-                  : at.pair_values[0],
-            odd ? at.pair_values[0] : at.pair_values[1],
-            at.header->sorted,
+// (Not by an index: for that, a kernel would copy its argument.)
+__host__ __device__ inline TilePass tile_pass(const FrameMemory& at, int pass) {
+    const bool odd = pass % 2;
+    uint16_t *keys = at.pair_keys[0], *other_keys = at.pair_keys[1];
+    uint32_t *values = at.pair_values[0], *other_values = at.pair_values[1];
+    return {odd ? other_keys : keys,
+            odd ? keys : other_keys,
+            odd ? other_values : (pass ? values : nullptr),
+            odd ? values : other_values,
+            0,
+            &at.header->sorted,
             pass * kDigitBits,
             at.digit_table,
             at.digit_sums,
@@ -51,11 +56,9 @@ __device__ inline SortPass<uint16_t, uint32_t> tile_pass(const Job& job, int pas
 
 __global__ void __launch_bounds__(kThreads) project_kernel(Job job) { project_phase(job); }
 
-__global__ void __launch_bounds__(kThreads) count_depths(Job job, int pass) { count_digits(depth_pass(job, pass)); }
-__global__ void __launch_bounds__(kThreads) scan_depths(Job job, int pass) { scan_digits(depth_pass(job, pass)); }
-__global__ void __launch_bounds__(kThreads, 2) scatter_depths(Job job, int pass) {
-    scatter_digits(depth_pass(job, pass));
-}
+__global__ void __launch_bounds__(kThreads) count_depths(DepthPass pass) { count_digits(pass); }
+__global__ void __launch_bounds__(kThreads) scan_depths(DepthPass pass) { scan_digits(pass); }
+__global__ void __launch_bounds__(kThreads, kScatterBlocks) scatter_depths(DepthPass pass) { scatter_digits(pass); }
 
 __global__ void __launch_bounds__(kThreads) plan_kernel(Job job) { plan_phase(job); }
 
@@ -81,14 +84,14 @@ __global__ void __launch_bounds__(kThreads) scan_pairs_kernel(Job job, Turn turn
 __global__ void __launch_bounds__(kThreads) emit_pairs_kernel(Job job, Turn turn) {
     if (is_to_bin(job, turn)) emit_pairs(job, turn.chunk);
 }
-__global__ void __launch_bounds__(kThreads) count_tiles(Job job, Turn turn, int pass) {
-    if (is_to_bin(job, turn)) count_digits(tile_pass(job, pass));
+__global__ void __launch_bounds__(kThreads) count_tiles(Job job, Turn turn, TilePass pass) {
+    if (is_to_bin(job, turn)) count_digits(pass);
 }
-__global__ void __launch_bounds__(kThreads) scan_tiles(Job job, Turn turn, int pass) {
-    if (is_to_bin(job, turn)) scan_digits(tile_pass(job, pass));
+__global__ void __launch_bounds__(kThreads) scan_tiles(Job job, Turn turn, TilePass pass) {
+    if (is_to_bin(job, turn)) scan_digits(pass);
 }
-__global__ void __launch_bounds__(kThreads, 2) scatter_tiles(Job job, Turn turn, int pass) {
-    if (is_to_bin(job, turn)) scatter_digits(tile_pass(job, pass));
+__global__ void __launch_bounds__(kThreads, kScatterBlocks) scatter_tiles(Job job, Turn turn, TilePass pass) {
+    if (is_to_bin(job, turn)) scatter_digits(pass);
 }
 
 template <bool kDepth>
@@ -117,11 +120,11 @@ __device__ inline void bin_chunk(const Job& job, int chunk) {
     emit_pairs(job, chunk);
     for (int pass = 0; pass < kTilePasses; ++pass) {
         __syncthreads();
-        count_digits(tile_pass(job, pass));
+        count_digits(tile_pass(job.at, pass));
         __syncthreads();
-        scan_digits(tile_pass(job, pass));
+        scan_digits(tile_pass(job.at, pass));
         __syncthreads();
-        scatter_digits(tile_pass(job, pass));
+        scatter_digits(tile_pass(job.at, pass));
     }
     __syncthreads();
 }
@@ -165,9 +168,10 @@ int passes_of(const Job& job, const SplatFrame& frame) {
 void launch_sort_by_depth(const Job& job, SplatStream stream) {
     const int64_t blocks = blocks_for(sort_blocks(job.model.count));
     for (int pass = 0; pass < kDepthPasses; ++pass) {
-        SPLAT_LAUNCH(count_depths, blocks, stream, job, pass);
-        SPLAT_LAUNCH(scan_depths, kScanBlocks, stream, job, pass);
-        SPLAT_LAUNCH(scatter_depths, blocks, stream, job, pass);
+        const DepthPass of = depth_pass(job, pass);
+        SPLAT_LAUNCH(count_depths, blocks, stream, of);
+        SPLAT_LAUNCH(scan_depths, kScanBlocks, stream, of);
+        SPLAT_LAUNCH(scatter_depths, blocks, stream, of);
     }
 }
 
@@ -178,9 +182,10 @@ void launch_bin(const Job& job, const Turn& turn, SplatStream stream) {
     SPLAT_LAUNCH(scan_pairs_kernel, 1, stream, job, turn);
     SPLAT_LAUNCH(emit_pairs_kernel, ranks, stream, job, turn);
     for (int pass = 0; pass < kTilePasses; ++pass) {
-        SPLAT_LAUNCH(count_tiles, blocks, stream, job, turn, pass);
-        SPLAT_LAUNCH(scan_tiles, kScanBlocks, stream, job, turn, pass);
-        SPLAT_LAUNCH(scatter_tiles, blocks, stream, job, turn, pass);
+        const TilePass of = tile_pass(job.at, pass);
+        SPLAT_LAUNCH(count_tiles, blocks, stream, job, turn, of);
+        SPLAT_LAUNCH(scan_tiles, kScanBlocks, stream, job, turn, of);
+        SPLAT_LAUNCH(scatter_tiles, blocks, stream, job, turn, of);
     }
 }
 

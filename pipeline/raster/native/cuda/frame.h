@@ -27,7 +27,7 @@ struct alignas(16) Record {
 };
 static_assert(sizeof(Record) == 48, "three vectors of four");
 
-constexpr int kSortItems = 16;                     // a thread's keys in a pass of the radix sort
+constexpr int kSortItems = 8;  // a thread's keys in a pass of the radix sort: 100,000 keys are work for 49 blocks
 constexpr int kSortBlock = kThreads * kSortItems;  // a virtual block's
 constexpr int kDigitBits = 8, kDigits = 1 << kDigitBits;
 constexpr int64_t kChunkTiles = 1 << 16;  // a chunk has no more tiles: keys of pairs are 16 bits

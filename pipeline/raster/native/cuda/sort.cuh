@@ -19,12 +19,18 @@ struct SortPass {
     Key* keys_to;
     const Value* values_from;  // null: a key's value is its place
     Value* values_to;
-    int64_t count;
-    int shift;             // of the digit
-    uint32_t* table;       // (kDigits, blocks)
-    uint32_t* digit_sums;  // (kDigits)
-    int32_t* kept;         // how many keys were not left out, null where nobody asks
+    int64_t count;           // of keys
+    const int32_t* counted;  // the same where only the device knows, else null
+    int shift;               // of the digit
+    uint32_t* table;         // (kDigits, blocks)
+    uint32_t* digit_sums;    // (kDigits)
+    int32_t* kept;           // how many keys were not left out, null where nobody asks
 };
+
+template <class Key, class Value>
+__device__ inline int64_t keys_of(const SortPass<Key, Value>& pass) {
+    return pass.counted ? *pass.counted : pass.count;
+}
 
 __host__ __device__ inline int64_t sort_blocks(int64_t count) { return (count + kSortBlock - 1) / kSortBlock; }
 
@@ -45,13 +51,13 @@ struct DigitCounts {
 template <class Key, class Value>
 __device__ void count_digits(const SortPass<Key, Value>& pass) {
     SPLAT_SHARED(DigitCounts, counts);
-    const int64_t blocks = sort_blocks(pass.count);
+    const int64_t count = keys_of(pass), blocks = sort_blocks(count);
     for (int64_t block = blockIdx.x; block < blocks; block += gridDim.x) {
         counts.of[threadIdx.x] = 0;
         __syncthreads();
         for (int i = 0; i < kSortItems; ++i) {
             const int64_t at = block * kSortBlock + i * kThreads + threadIdx.x;
-            if (at >= pass.count) break;
+            if (at >= count) break;
             const Key key = pass.keys_from[at];
             if (is_kept(key)) atomicAdd(&counts.of[digit_of(key, pass.shift)], 1u);
         }
@@ -63,7 +69,7 @@ __device__ void count_digits(const SortPass<Key, Value>& pass) {
 // A digit's counts become the places of each block's first one among those of the digit; by a warp a digit.
 template <class Key, class Value>
 __device__ void scan_digits(const SortPass<Key, Value>& pass) {
-    const int64_t blocks = sort_blocks(pass.count);
+    const int64_t blocks = sort_blocks(keys_of(pass));
     for (int digit = blockIdx.x * kWarps + warp_index(); digit < kDigits; digit += gridDim.x * kWarps) {
         const uint32_t sum = scan_array_by_warp(pass.table + digit * blocks, blocks);
         if (lane_index() == 0) pass.digit_sums[digit] = sum;
@@ -105,12 +111,12 @@ __device__ inline int64_t first_item(int64_t block) {
 
 // Places among the warp's keys of the same digit; the warp's digits are counted.
 template <class Key, class Value>
-__device__ inline void rank_items(const SortPass<Key, Value>& pass, int64_t block, uint16_t* counts,
+__device__ inline void rank_items(const SortPass<Key, Value>& pass, int64_t count, int64_t block, uint16_t* counts,
                                   SortItems<Key>* items) {
     const unsigned before_me = (1u << lane_index()) - 1;
     const int64_t first = first_item(block);
     const Key* keys = pass.keys_from + first;
-    const int left = static_cast<int>(pass.count - first < kSortBlock ? pass.count - first : kSortBlock);
+    const int left = static_cast<int>(count - first < kSortBlock ? count - first : kSortBlock);
     items->kept = 0;
     SPLAT_UNROLL
     for (int i = 0; i < kSortItems; ++i) {
@@ -151,13 +157,13 @@ __device__ inline uint32_t place_digits(const SortPass<Key, Value>& pass, int64_
 template <class Key, class Value>
 __device__ void scatter_digits(const SortPass<Key, Value>& pass) {
     SPLAT_SHARED(ScatterShared, shared);
-    const int64_t blocks = sort_blocks(pass.count);
+    const int64_t count = keys_of(pass), blocks = sort_blocks(count);
     for (int64_t block = blockIdx.x; block < blocks; block += gridDim.x) {
         for (int warp = 0; warp < kWarps; ++warp) shared.warps[warp][threadIdx.x] = 0;
         __syncthreads();
         uint16_t* of_warp = shared.warps[warp_index()];
         SortItems<Key> items;
-        rank_items(pass, block, of_warp, &items);
+        rank_items(pass, count, block, of_warp, &items);
         __syncthreads();
         const uint32_t kept = place_digits(pass, block, blocks, &shared);
         __syncthreads();
