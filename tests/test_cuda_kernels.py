@@ -255,3 +255,32 @@ def test_hostile_numbers_are_skipped_and_spare_the_others(library: CudaLibrary, 
     for name, gradient in outcome.gradients.items():
         assert gradient[keep].tobytes() == others.gradients[name].tobytes()
         assert not gradient[~keep].any()
+
+
+def test_more_tiles_than_a_chunk_may_have_are_two_chunks(library: CudaLibrary) -> None:
+    scene = random_scene(4, 60, 0, size=-3.0)
+    camera = replace(random_camera(4, 4100, 4100), fx=1500.0, fy=1500.0)
+    case = case_of(scene, camera).changed(upstream={}, depths=False)
+    assert tile_count(case) > 1 << 16
+    ours, native = run(library, case), exact_outcome(case, "native", gradients=False)
+    assert ours.facts[2] == 2
+    beyond = np.abs(ours.pictures["colour"] - native.pictures["colour"]) > 1e-3  # a pixel's place is rounded to 2e-4 px
+    assert beyond.any(2).sum() <= 10
+    assert all((ours.pictures["alpha"][part] > 0).any() for part in (slice(1000, 2000), slice(-1, None)))
+
+
+def test_what_makes_no_sense_is_refused(library: CudaLibrary) -> None:
+    case = case_of(random_scene(1, 20), random_camera(1))
+    for change in ({"size": (0, 5)}, {"sh_degree": 4}, {"sh_degree": -1}):
+        with pytest.raises(ValueError, match="splat_"):
+            run(library, case.changed(**change))
+    for field, value in (("bytes", -1), ("count", -1), ("capacity", 19), ("passes", 0), ("memory", None)):
+        frame = Frame(library, case)
+        setattr(frame.frame, field, value)
+        with pytest.raises(ValueError, match="splat_forward"):
+            frame.forward()
+    frame = Frame(library, case)
+    frame.forward()
+    frame.frame.back_bytes -= 256
+    with pytest.raises(ValueError, match="splat_blend_backward"):
+        frame.blend_backward()

@@ -94,8 +94,8 @@ FAULTS = (
     Fault(
         "the last warp lost from a gradient's sum",
         "blend_back.cuh",
-        "for (int warp = 0; warp < kWarps; ++warp)\n                if (batch.summed",
-        "for (int warp = 0; warp < kWarps - FAULT; ++warp)\n                if (batch.summed",
+        "for (int warp = 0; warp < kWarps; ++warp)",
+        "for (int warp = 0; warp < kWarps - FAULT; ++warp)",
     ),
     Fault(
         "lanes sixteen apart not added up",
