@@ -9,93 +9,24 @@
 #include <utility>
 #include <vector>
 
-#if !defined(__x86_64__) || defined(HARNESS_PORTABLE)
-#define HARNESS_UCONTEXT 1
-#include <ucontext.h>
-#endif
+#include "fiber.h"
+#include "warp.h"
 
 harness::Index threadIdx, blockIdx, blockDim, gridDim;
 
 namespace harness {
 namespace {
 
-constexpr int kLanes = 32, kMaxThreads = 1024, kMaxWarps = kMaxThreads / kLanes;
+constexpr int kMaxThreads = 1024, kMaxWarps = kMaxThreads / kLanes;
 constexpr size_t kStackBytes = 128 << 10;  // a thread's; kernels keep a few hundred floats
 constexpr size_t kPage = 4096;
 constexpr size_t kGuardBytes = 64;         // beside every piece of shared memory
 constexpr size_t kSharedBytes = 48 << 10;  // what a block has on every GPU without asking
 constexpr size_t kArenaBytes = 2 * kSharedBytes;
-constexpr uint32_t kPoison = 0x7fa5a5a5u;  // a float: signalling NaN; an index: out of any range
 constexpr int kCudaVersion = 13000;
 
 // Orders of threads and of blocks.
 enum Order { forward, reverse, shuffled_by_seed };
-
-#if !HARNESS_UCONTEXT
-// What a called function has to leave alone goes on the stack, and the other stack is taken.
-extern "C" HARNESS_LOCAL void harness_switch(void** from, void* to);
-asm(R"(
-    .text
-    .p2align 4
-    .hidden harness_switch
-    .globl harness_switch
-    .type harness_switch, @function
-harness_switch:
-    pushq %rbp
-    pushq %rbx
-    pushq %r12
-    pushq %r13
-    pushq %r14
-    pushq %r15
-    movq %rsp, (%rdi)
-    movq %rsi, %rsp
-    popq %r15
-    popq %r14
-    popq %r13
-    popq %r12
-    popq %rbx
-    popq %rbp
-    ret
-    .size harness_switch, .-harness_switch
-)");
-
-class Fiber {
-  public:
-    void start(char* stack, size_t bytes, void (*entry)()) {
-        void** top = reinterpret_cast<void**>(stack + bytes);  // aligned to 16
-        *--top = nullptr;                                      // where entry would return to
-        *--top = reinterpret_cast<void*>(entry);
-        for (int saved = 0; saved < 6; ++saved) *--top = nullptr;
-        at_ = top;
-    }
-    void go_to(const Fiber& other) { harness_switch(&at_, other.at_); }
-
-  private:
-    void* at_ = nullptr;
-};
-#else
-class Fiber {
-  public:
-    void start(char* stack, size_t bytes, void (*entry)()) {
-        getcontext(&at_);
-        at_.uc_stack.ss_sp = stack, at_.uc_stack.ss_size = bytes, at_.uc_link = nullptr;
-        makecontext(&at_, entry, 0);
-    }
-    void go_to(const Fiber& other) { swapcontext(&at_, &other.at_); }
-
-  private:
-    ucontext_t at_;
-};
-#endif
-
-struct Warp {
-    uint32_t ready, waiting, at_barrier, ended;
-    bool alike;     // all that wait ask for the same
-    Request asked;  // by those that wait; where not alike, each lane's:
-    Request requests[kLanes];
-    uint64_t values[kLanes], results[kLanes];
-    int arguments[kLanes];
-};
 
 struct Piece {
     const void* site;
@@ -337,87 +268,15 @@ struct Permutation {
     uint64_t at(uint64_t i) const { return (begin + i * (step % count)) % count; }
 };
 
-bool operator==(const Request& a, const Request& b) {
-    return a.operation == b.operation && a.mask == b.mask && a.width == b.width && a.place.line == b.place.line;
-}
-
-// The lane that another one's value comes from.
-int source(const Request& request, int lane, int argument) {
-    const int segment = lane & ~(request.width - 1), last = segment + request.width - 1;
-    switch (request.operation) {
-        case Operation::shuffle:
-            return segment + (argument & (request.width - 1));
-        case Operation::shuffle_up:
-            return lane - argument < segment ? lane : lane - argument;
-        case Operation::shuffle_down:
-            return lane + argument > last ? lane : lane + argument;
-        default:
-            return (lane ^ argument) > last ? lane : lane ^ argument;
-    }
-}
-
-uint32_t lanes_with(const Warp& warp, uint32_t mask, uint64_t value) {
-    uint32_t with = 0;
-    for (int lane = 0; lane < kLanes; ++lane) with |= static_cast<uint32_t>(warp.values[lane] == value) << lane;
-    return with & mask;
-}
-
-// All lanes of a mask have met: what each gets. Lanes beside the mask may wait for something else.
-void complete(Warp* warp, const Request& request) {
-    const auto give = [&](auto&& result) {
-        for (uint32_t left = request.mask; left; left &= left - 1) {
-            const int lane = __builtin_ctz(left);
-            warp->results[lane] = result(lane);
-        }
-    };
-    const uint64_t nothing = uint64_t{kPoison} << 32 | kPoison;  // a lane that takes no part has no value
-    uint64_t ballot = 0;
-    switch (request.operation) {
-        case Operation::syncwarp:
-            return;
-        case Operation::ballot:
-        case Operation::any:
-        case Operation::all:
-            ballot = lanes_with(*warp, request.mask, 1);
-            if (request.operation == Operation::any) ballot = ballot != 0;
-            if (request.operation == Operation::all) ballot = ballot == request.mask;
-            return give([&](int) { return ballot; });
-        case Operation::match:
-            return give([&](int lane) { return lanes_with(*warp, request.mask, warp->values[lane]); });
-        default:
-            return give([&](int lane) {
-                const int from = source(request, lane, warp->arguments[lane]);
-                return request.mask >> from & 1u ? warp->values[from] : nothing;
-            });
-    }
-}
-
 // Whether all lanes of a request's mask ask for the same; told if not.
 bool agree(const Warp& warp, const Request& request) {
-    if (warp.alike) return true;
-    for (uint32_t left = request.mask; left; left &= left - 1) {
-        const Request& other = warp.requests[__builtin_ctz(left)];
-        if (other == request) continue;
-        fail(
-            "warp %u of block %u: threads meet in different places, %s at %s:%d (mask %08x) and %s at %s:%d (mask "
-            "%08x)",
-            threadIdx.x / kLanes, blockIdx.x, name_of(request.operation), base_name(request.place.file),
-            request.place.line, request.mask, name_of(other.operation), base_name(other.place.file), other.place.line,
-            other.mask);
-        return false;
-    }
-    return true;
-}
-
-// Keeps what a lane asks for: once for all as long as they ask for the same.
-void ask(Warp* warp, int lane, const Request& request) {
-    if (warp->waiting == 0) {
-        warp->asked = request, warp->alike = true;
-    } else if (warp->alike && !(warp->asked == request)) {
-        for (Request& each : warp->requests) each = warp->asked;
-        warp->alike = false;
-    }
-    if (!warp->alike) warp->requests[lane] = request;
+    const Request* other = differing(warp, request);
+    if (!other) return true;
+    fail("warp %u of block %u: threads meet in different places, %s at %s:%d (mask %08x) and %s at %s:%d (mask %08x)",
+         threadIdx.x / kLanes, blockIdx.x, name_of(request.operation), base_name(request.place.file),
+         request.place.line, request.mask, name_of(other->operation), base_name(other->place.file), other->place.line,
+         other->mask);
+    return false;
 }
 
 }  // namespace
