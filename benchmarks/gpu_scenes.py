@@ -1,0 +1,112 @@
+"""What the parts of a day with a GPU share: packed captures, Gaussians in any number, and the device."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import load_split, load_views
+from splatpipe.pipeline.raster import cuda
+from splatpipe.pipeline.raster.cuda_library import load, why_not
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.sh import coefficient_count
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
+
+PACK = Path(os.environ.get("SPLATPIPE_PACK", ".gpu_day"))
+HARNESS = "SPLATPIPE_HARNESS"  # a libsplat_cuda built for the CPU, to try the parts themselves without a GPU
+PARTS = ("undistort.dataset", "split.views", "initialize.splat", "georef.frame", "georef.control", "georef.accuracy")
+# No technique beside the Gaussians: what every trainer does.
+PLAIN = {
+    "antialias": False,
+    "background": "black",
+    "sky": "off",
+    "prune_free_space": 0,
+    "dropout": 0.0,
+    "exposure": "off",
+    "densify": False,
+    "max_gaussians": 10**9,
+}
+PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
+
+
+@contextlib.contextmanager
+def device() -> Iterator[torch.device]:
+    """Where CUDA's kernels run: on a card, or under the harness where its library is named.
+
+    Raises:
+        MachineError: if neither is there.
+    """
+    if harness := os.environ.get(HARNESS):
+        with cuda.use_kernels(cuda.CudaKernels(load(Path(harness)), torch.device("cpu"))):
+            yield torch.device("cpu")
+        return
+    if missing := why_not():
+        raise missing.error()
+    yield torch.device("cuda", torch.cuda.current_device())
+
+
+def inputs(capture: str, device_name: str, threads: int = 2) -> Inputs:
+    """The stages' parts of a packed capture, by the line's names."""
+    folder = PACK / "captures" / capture
+    parts = {name: folder / name for name in PARTS if (folder / name).exists()}
+    return Inputs(parts, folder, machine=Machine(device_name, threads))
+
+
+def cameras(capture: str, megapixels: float | None = None) -> list[Camera]:
+    """Of a packed capture, scaled to a size."""
+    found = [view.camera for view in load_views(inputs(capture, "cpu")["undistort.dataset"])]
+    if megapixels is None:
+        return found
+    return [scaled(camera, math.sqrt(1e6 * megapixels / (camera.width * camera.height))) for camera in found]
+
+
+def scaled(camera: Camera, factor: float) -> Camera:
+    """A camera with more or fewer pixels."""
+    width, height = round(camera.width * factor), round(camera.height * factor)
+    x, y = width / camera.width, height / camera.height
+    focal = {"fx": camera.fx * x, "fy": camera.fy * y, "cx": camera.cx * x, "cy": camera.cy * y}
+    return replace(camera, width=width, height=height, **focal)
+
+
+def gaussians(capture: str, count: int, where: torch.device, seed: int = 0) -> Gaussians:
+    """As many as wanted: those of the capture's start, each several times beside itself, smaller the more there are.
+
+    Args:
+        capture: A packed one.
+        count: Gaussians.
+        where: Of the tensors.
+        seed: Of the places.
+    """
+    start = read_splat(inputs(capture, "cpu")["initialize.splat"])
+    generator = torch.Generator(where).manual_seed(seed)
+    rows = torch.arange(count, device=where) % len(start)
+    shrink = math.sqrt(min(1.0, len(start) / count))  # surfaces stay as covered as they were
+    scales = start.log_scales.to(where)[rows]
+    noise = torch.randn(count, 3, generator=generator, device=where)
+    sh = 0.05 * torch.randn(count, coefficient_count(3), 3, generator=generator, device=where)
+    sh[:, 0] = start.sh.to(where)[rows, 0]
+    return Gaussians(
+        means=start.means.to(where)[rows] + scales.exp() * noise,
+        log_scales=scales + math.log(shrink),
+        quats=torch.randn(count, 4, generator=generator, device=where),
+        opacity_logits=start.opacity_logits.to(where)[rows],
+        sh=sh,
+    )
+
+
+def plain_plan(capture: str, count: int, **options: object) -> Plan:
+    """Of a training that does what every trainer does, with all bands of colour from the first iteration."""
+    config = TrainConfig.model_validate({"iterations": PUBLISHED_ITERATIONS} | PLAIN | options)
+    given = inputs(capture, "cpu")
+    plan = make_plan(config, load_views(given["undistort.dataset"]), load_split(given["split.views"]), count)
+    return replace(plan, schedule=replace(plan.schedule, sh_every=1))
