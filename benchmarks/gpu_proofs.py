@@ -189,7 +189,7 @@ def every_kernel() -> None:
 
 
 def _trained(capture: str, where: torch.device, iterations: int) -> Gaussians:
-    """A model after a short training; where the harness stands for the device, the start of one, no longer of spheres."""
+    """A model after a short training; where the harness stands for the device, a start whose spheres are no longer."""
     if where.type == "cpu":
         model = read_splat(gpu_scenes.inputs(capture, "cpu")["initialize.splat"])
         model.log_scales += 0.5 * torch.randn(model.log_scales.shape, generator=torch.Generator().manual_seed(0))
