@@ -6,7 +6,7 @@ import ctypes
 from ctypes import POINTER, c_char, c_double, c_float, c_int32, c_int64, c_uint64, c_void_p
 from typing import Any
 
-ABI = 1
+ABI = 2
 """Of the interface that is mirrored here, SPLAT_CUDA_ABI."""
 NO_KERNEL = -3
 """SPLAT_NO_KERNEL: for this device in this binary."""
@@ -115,6 +115,23 @@ class SplatAdam(ctypes.Structure):
     )
 
 
+class SplatSky(ctypes.Structure):
+    _fields_ = (
+        ("width", c_int32),
+        ("height", c_int32),
+        ("rows", c_int32),
+        ("columns", c_int32),
+        ("step", c_int32),
+        ("background", c_float * 3),
+        ("colour", c_void_p),
+        ("alpha", c_void_p),
+        ("nodes", c_void_p),
+        ("elsewhere", c_void_p),
+        ("around", c_void_p),
+        ("mask", c_void_p),
+    )
+
+
 STRUCTURES = (
     SplatDevice,
     SplatShot,
@@ -125,6 +142,7 @@ STRUCTURES = (
     SplatFrameFacts,
     SplatStep,
     SplatAdam,
+    SplatSky,
 )
 
 _SHOT, _ROWS, _FRAME = POINTER(SplatShot), POINTER(SplatRows), POINTER(SplatFrame)
@@ -153,6 +171,8 @@ CALLS: dict[str, tuple[Any, ...]] = {
         *(c_void_p, c_void_p, c_void_p, c_int64),
         *(c_void_p, c_void_p, c_void_p, c_int64, c_void_p),
     ),
+    "splat_sky": (POINTER(SplatSky), c_void_p, c_void_p),
+    "splat_sky_backward": (POINTER(SplatSky), c_void_p, c_void_p, c_void_p, c_void_p),
     "splat_adam": (POINTER(SplatAdam), c_void_p),
     "splat_uniform": (*_DRAW, c_int64, c_void_p, c_void_p),
     "splat_split_offsets": (*_DRAW, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p),

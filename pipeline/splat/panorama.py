@@ -88,9 +88,15 @@ class Look:
         self, colours: Float[Tensor, "cells 3"], background: tuple[float, float, float]
     ) -> Float[Tensor, "h w 3"]:
         """What the camera sees of some cells' colours, and below the horizon of the background."""
+        return between_nodes(self.at_nodes(colours, background), self.camera)
+
+    def at_nodes(
+        self, colours: Float[Tensor, "cells 3"], background: tuple[float, float, float]
+    ) -> Float[Tensor, "rows columns 3"]:
+        """The same at the nodes alone."""
         below = rgb_beside(background, colours)
         seen = self.cells.mixed(colours).reshape(*self.share.shape[:2], 3)
-        return between_nodes(self.share * seen + (1.0 - self.share) * below, self.camera)
+        return self.share * seen + (1.0 - self.share) * below
 
 
 @dataclass(frozen=True)

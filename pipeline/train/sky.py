@@ -22,8 +22,10 @@ from torch import Tensor
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points
 from splatpipe.pipeline.photos.images import reduced_sky, reduced_view
+from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of, laid_over
+from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, STEP_PX, Panorama, between_nodes, cells_of, laid_over
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
 from splatpipe.pipeline.splat.upload import rgb_beside
 from splatpipe.pipeline.train.draws import ELSEWHERE
@@ -146,12 +148,19 @@ class SkyModel(SideModel, Technique):
             elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
         """
         look, colours = self.panorama.look(camera), self.panorama.colours
-        behind = look.behind(colours, background)
-        if seen is None:
+        nodes, flat = look.at_nodes(colours, background), None
+        if seen is not None:
+            flat = look.at_nodes(rgb_beside(elsewhere, colours).expand_as(colours), background)
+        kernels = kernels_of(colours.device)
+        if kernels is not None:
+            masks = (None, None) if seen is None else (seen.around, seen.mask)
+            how = Behind(STEP_PX, background, flat, *masks)
+            return laid_over_nodes(kernels, rendered.colour, rendered.alpha, nodes, how)
+        behind = between_nodes(nodes, camera)
+        if seen is None or flat is None:
             return laid_over(rendered.colour, rendered.alpha, background, behind.detach())
-        flat = look.behind(rgb_beside(elsewhere, colours).expand_as(colours), background)
         behind = torch.where(seen.mask[:, :, None], behind, behind.detach())
-        behind = torch.where(seen.around[:, :, None], behind, flat)
+        behind = torch.where(seen.around[:, :, None], behind, between_nodes(flat, camera))
         return laid_over(rendered.colour, rendered.alpha, background, behind)
 
     def loss(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None) -> Float[Tensor, ""]:

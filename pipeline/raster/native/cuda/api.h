@@ -15,7 +15,7 @@
 extern "C" {
 #endif
 
-#define SPLAT_CUDA_ABI 1 /* raised with every change of this file; the caller refuses another */
+#define SPLAT_CUDA_ABI 2 /* raised with every change of this file; the caller refuses another */
 #define SPLAT_API __attribute__((visibility("default")))
 
 enum {
@@ -120,6 +120,19 @@ typedef struct {
     int64_t* skipped;
 } SplatAdam;
 
+/* A render and what is to be behind it, interpolated bilinearly from nodes `step` pixels apart, at most 8; the first is
+ * at the first pixel, the last at the last one or outside. */
+typedef struct {
+    int32_t width, height;
+    int32_t rows, columns, step; /* of the nodes */
+    float background[3];         /* that the render has behind it */
+    const float *colour, *alpha; /* the render, (h, w, 3) and (h, w) */
+    const float* nodes;          /* (rows, columns, 3) */
+    const float* elsewhere;      /* (rows, columns, 3): seen instead where `around` is zero; null for nowhere */
+    const uint8_t* around;       /* (h, w), null without `elsewhere` */
+    const uint8_t* mask;         /* (h, w): where the nodes have a gradient, null for nowhere */
+} SplatSky;
+
 SPLAT_API int32_t splat_abi(void);
 SPLAT_API const char* splat_error(int32_t code);
 SPLAT_API int32_t splat_device(int32_t device, SplatDevice* out); /* the current CUDA version and device; host only */
@@ -155,6 +168,12 @@ SPLAT_API int32_t splat_affine_colour(const float* map, const float* in, int64_t
 SPLAT_API int32_t splat_affine_colour_backward(const float* map, const float* in, const float* upstream, int64_t pixels,
                                                float* gradient, float* map_gradient, void* memory, int64_t bytes,
                                                SplatStream stream);
+
+/* The render (h, w, 3) with the sky behind it, and the gradients by its alpha and by the nodes (null: not asked for);
+ * that by its colour is `upstream`. */
+SPLAT_API int32_t splat_sky(const SplatSky* sky, float* out, SplatStream stream);
+SPLAT_API int32_t splat_sky_backward(const SplatSky* sky, const float* upstream, float* alpha_gradient,
+                                     float* node_gradient, SplatStream stream);
 
 SPLAT_API int32_t splat_adam(const SplatAdam* adam, SplatStream stream);
 

@@ -1,0 +1,113 @@
+"""The sky behind a render by the CUDA backend's kernels, on the CPU through the harness, beside torch's products."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.rasterizer import Render
+from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
+from splatpipe.pipeline.splat.sky_mask import SkyMask
+from splatpipe.pipeline.train.seen_sky import SeenSky
+from splatpipe.pipeline.train.sky import SkyModel
+
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import skies
+from building import FORWARD, REVERSE, SHUFFLED, build_on_cpu, load
+
+ATOL = 2e-6  # of colours up to 1, and of sums over 15 x 15 pixels with weights up to 1
+BACKGROUND, ELSEWHERE = (0.2, 0.5, 0.1), (0.9, 0.3, 0.6)
+SIZES = [(81, 57), (82, 50), (33, 5), (1, 9)]  # a last node at the last pixel, outside, one row of cells, one column
+
+
+@pytest.fixture(scope="module")
+def kernels() -> Iterator[CudaKernels]:
+    yield CudaKernels(CudaLibrary(build_on_cpu()), torch.device("cpu"))
+
+
+def composed(camera: Camera, mask: Tensor | None) -> list[Tensor]:
+    """The composite, and the gradients by the render's colour and alpha and by the cells."""
+    generator = torch.Generator().manual_seed(camera.width)
+    sky = SkyModel(skies.UP, np.zeros((ROWS * COLUMNS, 3), np.float32), {})
+    with torch.no_grad():
+        sky.panorama.colours.copy_(torch.rand(ROWS * COLUMNS, 3, generator=generator))
+    shape = (camera.height, camera.width)
+    colour = torch.rand(*shape, 3, generator=generator).requires_grad_()
+    alpha = torch.rand(shape, generator=generator).requires_grad_()
+    weight = torch.rand(*shape, 3, generator=generator)
+    none = torch.zeros(0)
+    rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
+    seen = None if mask is None else SeenSky(mask, mask | mask.roll(1, 0))
+    picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
+    (weight * picture).sum().backward()
+    cells = sky.tensors["colours"].grad
+    assert colour.grad is not None and alpha.grad is not None
+    return [picture.detach(), colour.grad, alpha.grad, torch.zeros(()) if cells is None else cells]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("masked", [False, True])
+def test_sky_and_its_gradients_are_those_of_torch(kernels: CudaKernels, size: tuple[int, int], masked: bool) -> None:
+    camera = skies.look(heading_deg=160.0, pitch_deg=15.0).scaled(*size)
+    mask = None
+    if masked:
+        mask = torch.rand(size[1], size[0], generator=torch.Generator().manual_seed(1)) > 0.3
+        mask[:, size[0] // 2 + 1 :] = False
+    expected = composed(camera, mask)
+    with use_kernels(kernels):
+        found = composed(camera, mask)
+    for ours, right in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, right, rtol=1e-5, atol=ATOL)
+    assert masked == bool(found[3].any())
+
+
+def test_gradients_of_the_nodes_have_the_same_bits_in_every_order_of_threads(kernels: CudaKernels) -> None:
+    harness = load(build_on_cpu())
+    camera = skies.look(pitch_deg=15.0).scaled(40, 30)
+    mask = torch.rand(30, 40, generator=torch.Generator().manual_seed(1)) > 0.3
+    found = []
+    with use_kernels(kernels):
+        for order, seed in ((FORWARD, 0), (REVERSE, 0), (SHUFFLED, 3)):
+            harness.harness_order(order, seed)
+            found.append(composed(camera, mask))
+    harness.harness_order(FORWARD, 0)
+    assert all(torch.equal(one, other) for one, other in zip(found[0], found[1], strict=True))
+    assert all(torch.equal(one, other) for one, other in zip(found[0], found[2], strict=True))
+
+
+def test_sky_is_trained_by_the_kernels_as_without_them(kernels: CudaKernels) -> None:
+    camera = skies.look(pitch_deg=30.0).scaled(40, 30)
+    mask = np.zeros((30, 40), bool)
+    mask[:15] = True
+    learnt = []
+    for chosen in (None, kernels):
+        sky = SkyModel(skies.UP, np.full((ROWS * COLUMNS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
+        blank, none = torch.zeros(30, 40), torch.zeros(0)
+        rendered = Render(torch.zeros(30, 40, 3), blank, blank, blank, blank, none.bool(), none)
+        with use_kernels(chosen):
+            for number in range(5):
+                seen = sky.seen(camera)
+                picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
+                ((picture - 0.25).abs().mean() + sky.loss(blank, seen)).backward()
+                sky.step(number / 5)
+        learnt.append(sky.panorama.colours.detach().clone())
+    assert float((learnt[0] - 0.5).abs().max()) > 0.01
+    torch.testing.assert_close(learnt[1], learnt[0], rtol=0, atol=1e-4)
+
+
+def test_nodes_that_do_not_reach_the_last_pixel_are_refused(kernels: CudaKernels) -> None:
+    colour, alpha = torch.zeros(20, 20, 3), torch.zeros(20, 20)
+    behind = Behind(8, BACKGROUND)
+    for rows, step in ((3, 8), (20, 9)):
+        with pytest.raises(Exception, match="argument"):
+            laid_over_nodes(kernels, colour, alpha, torch.zeros(rows, 4, 3), replace(behind, step=step))
