@@ -37,7 +37,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = "tests/test_cuda_device.py"
+TESTS = ("tests/test_cuda_device.py", "tests/test_cuda_iterations.py", "tests/test_cuda_sky.py")
 LEAST_DB = 60.0  # between the CPU's render and the device's
 MOST_RELATIVE = 1e-3  # difference of a gradient, of its norm
 SHORT = 300  # iterations after which a model counts as trained
@@ -95,7 +95,7 @@ def marked_tests() -> Iterator[Row]:
     Raises:
         SystemExit: if one fails.
     """
-    words = ["-m", "pytest", "-q", "-m", "cuda", "--noconftest", "-p", "no:cacheprovider", TESTS]
+    words = ["-m", "pytest", "-q", "-m", "cuda", "--noconftest", "-p", "no:cacheprovider", *TESTS]
     done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False, cwd=ROOT)
     lines = done.stdout.strip().splitlines() or [""]
     yield {"tests": lines[-1], "failed": [line for line in lines if line.startswith(("FAILED", "ERROR"))]}

@@ -74,7 +74,7 @@ def everything(model: Gaussians, where: torch.device, depth: bool) -> dict[str, 
     options = RenderOptions(3, (0.1, 0.5, 0.9), antialias=not depth, depth=depth, magnitudes=not depth)
     render = rasterizer.render(leaves, camera(), options, means2d_probe=probe)
     mask = (torch.arange(HEIGHT)[:, None] + torch.arange(WIDTH) > 100).to(where)
-    loss = photo_loss(affine_colour(affine, render.colour), photo().to(where), SSIM_WEIGHT, mask)
+    loss = photo_loss(affine_colour(render.colour, affine), photo().to(where), SSIM_WEIGHT, mask)
     if depth:
         loss = loss + 0.01 * (render.depth_sum.mean() + render.depth_square_sum.mean())
     loss.backward()

@@ -1,4 +1,4 @@
-"""The sky behind a render by the CUDA backend's kernels, on the CPU through the harness, beside torch's products."""
+"""The sky behind a render by the CUDA backend's kernels: through the harness and on a device, beside torch on the CPU."""
 
 import sys
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda_library import why_not
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
@@ -24,50 +24,73 @@ sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
 from building import FORWARD, REVERSE, SHUFFLED, build_on_cpu, load
+from on_cpu import kernels_on_cpu
 
 ATOL = 2e-6  # of colours up to 1, and of sums over 15 x 15 pixels with weights up to 1
+DEVICE_ATOL = 2e-4  # there the place between two cells is float32, the CPU's is float64
+CPU = torch.device("cpu")
 BACKGROUND, ELSEWHERE = (0.2, 0.5, 0.1), (0.9, 0.3, 0.6)
 SIZES = [(81, 57), (82, 50), (33, 5), (1, 9)]  # a last node at the last pixel, outside, one row of cells, one column
 
 
 @pytest.fixture(scope="module")
-def kernels() -> Iterator[CudaKernels]:
-    yield CudaKernels(CudaLibrary(build_on_cpu()), torch.device("cpu"))
+def kernels() -> CudaKernels:
+    return kernels_on_cpu()
 
 
-def composed(camera: Camera, mask: Tensor | None) -> list[Tensor]:
-    """The composite, and the gradients by the render's colour and alpha and by the cells."""
+@pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
+def device(request: pytest.FixtureRequest, kernels: CudaKernels) -> Iterator[torch.device]:
+    """Where the kernels are found; on a real one, nothing may wait."""
+    if request.param == "harness":
+        with use_kernels(kernels):
+            yield torch.device("cpu")
+        return
+    if why_not() is not None:
+        pytest.skip("no CUDA device")
+    torch.cuda.set_sync_debug_mode("default")
+    yield torch.device("cuda", 0)
+    torch.cuda.set_sync_debug_mode("default")
+
+
+def composed(camera: Camera, mask: Tensor | None, device: torch.device = CPU) -> list[Tensor]:
+    """The composite, and the gradients by the render's colour and alpha and by the cells; brought to the CPU."""
     generator = torch.Generator().manual_seed(camera.width)
     sky = SkyModel(skies.UP, np.zeros((ROWS * COLUMNS, 3), np.float32), {})
     with torch.no_grad():
         sky.panorama.colours.copy_(torch.rand(ROWS * COLUMNS, 3, generator=generator))
+    sky.move_to(device)
     shape = (camera.height, camera.width)
-    colour = torch.rand(*shape, 3, generator=generator).requires_grad_()
-    alpha = torch.rand(shape, generator=generator).requires_grad_()
-    weight = torch.rand(*shape, 3, generator=generator)
-    none = torch.zeros(0)
+    colour = torch.rand(*shape, 3, generator=generator).to(device).requires_grad_()
+    alpha = torch.rand(shape, generator=generator).to(device).requires_grad_()
+    weight = torch.rand(*shape, 3, generator=generator).to(device)
+    none, mask = torch.zeros(0, device=device), None if mask is None else mask.to(device)
+    if device.type == "cuda":
+        torch.cuda.set_sync_debug_mode("error")
     rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
     seen = None if mask is None else SeenSky(mask, mask | mask.roll(1, 0))
     picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
     (weight * picture).sum().backward()
+    if device.type == "cuda":
+        torch.cuda.set_sync_debug_mode("default")
     cells = sky.tensors["colours"].grad
     assert colour.grad is not None and alpha.grad is not None
-    return [picture.detach(), colour.grad, alpha.grad, torch.zeros(()) if cells is None else cells]
+    found = [picture.detach(), colour.grad, alpha.grad, torch.zeros(()) if cells is None else cells]
+    return [tensor.cpu() for tensor in found]
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [False, True])
-def test_sky_and_its_gradients_are_those_of_torch(kernels: CudaKernels, size: tuple[int, int], masked: bool) -> None:
+def test_sky_and_its_gradients_are_those_of_torch(device: torch.device, size: tuple[int, int], masked: bool) -> None:
     camera = skies.look(heading_deg=160.0, pitch_deg=15.0).scaled(*size)
     mask = None
     if masked:
         mask = torch.rand(size[1], size[0], generator=torch.Generator().manual_seed(1)) > 0.3
         mask[:, size[0] // 2 + 1 :] = False
-    expected = composed(camera, mask)
-    with use_kernels(kernels):
-        found = composed(camera, mask)
+    with use_kernels(None):
+        expected = composed(camera, mask)
+    found = composed(camera, mask, device)
     for ours, right in zip(found, expected, strict=True):
-        torch.testing.assert_close(ours, right, rtol=1e-5, atol=ATOL)
+        torch.testing.assert_close(ours, right, rtol=1e-5, atol=ATOL if device == CPU else DEVICE_ATOL)
     assert masked == bool(found[3].any())
 
 
