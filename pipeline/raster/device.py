@@ -39,7 +39,10 @@ class Device:
 
     def facts(self) -> dict[str, JSON]:
         """What a manifest says of it."""
-        return {"device": self.name, "instruction_set": self.kernels, "mode": SAME_BITS}
+        told: dict[str, JSON] = {"device": self.name, "instruction_set": self.kernels, "mode": SAME_BITS}
+        if self.tensors.type == "cuda":
+            told["device_peak_memory_bytes"] = torch.cuda.max_memory_allocated(self.tensors)
+        return told
 
     def wait(self) -> None:
         """Until everything asked of the device is done; needed for nothing but clocks."""
@@ -55,11 +58,6 @@ class Device:
         if self.tensors.type == "cuda":
             whole = torch.cuda.get_device_properties(self.tensors).total_memory
             torch.cuda.set_per_process_memory_fraction(min(1.0, limit_bytes / whole) if limit_bytes else 1.0)
-
-    def free_unused_memory(self) -> None:
-        """Give back what torch keeps for later: in pieces, it may be of no use for what is asked for next."""
-        if self.tensors.type == "cuda":
-            torch.cuda.empty_cache()
 
     @contextmanager
     def one_order(self) -> Iterator[None]:

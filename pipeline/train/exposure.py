@@ -70,8 +70,7 @@ class Exposure(SideModel, Technique):
         deviations, row = self._deviations(), self._row[name]
         if deviations.grad is not None:
             deviations.grad[row] += self._decay * deviations.detach()[row]
-        rows = torch.zeros(len(deviations), dtype=torch.bool, device=deviations.device)
-        rows[row] = True
+        rows = torch.arange(len(deviations), device=deviations.device) == row
         self.descend({_NAME: self._first_rate * math.exp(math.log(LAST_RATE) * share)}, rows)
         self._centre()
 

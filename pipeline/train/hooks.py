@@ -74,6 +74,9 @@ class Technique:
         """What is added to the photo's loss."""
         return None
 
+    def drop_gradients(self) -> None:
+        """The iteration is begun again: forget what its backward pass has left so far."""
+
     def after_step(self, shot: Shot) -> None:
         """Step what is trained beside the Gaussians."""
 

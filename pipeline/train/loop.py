@@ -85,7 +85,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             report.note(
                 f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.options.iterations:,}"
             )
-        gaussians = state.finished().to("cpu")
+        gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     (out / "history.json").write_text(state.whole_history().to_json(), encoding="utf-8")
     write_side_models(out, state.techniques)

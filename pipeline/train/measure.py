@@ -104,8 +104,9 @@ def measure(plan: Plan, subject: Subject, step: Step, effort: Effort) -> Measure
     # Cost grows a little slower than size, so the line through two sizes is right near them only.
     megapixels = SMALLEST_MEGAPIXELS * max(2.0, effort.iteration_s / first.seconds)
     large, decode_s = _photos(chosen, megapixels, device)
-    _evaluation_seconds(states[-1].finished(), small[0], plan)  # pays for what is loaded once
-    evaluate_s = _evaluation_seconds(states[-1].finished(), large[0], plan)
+    finished = states[-1].finished().to(device.tensors)
+    _evaluation_seconds(finished, small[0], plan)  # pays for what is loaded once
+    evaluate_s = _evaluation_seconds(finished, large[0], plan)
     timings = [first]
     for photos in zip(small, large, strict=True):
         for state in states:

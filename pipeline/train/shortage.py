@@ -13,7 +13,6 @@ import torch
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.raster.cuda import kernels_of
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers
 from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.state import TrainState
@@ -40,9 +39,7 @@ def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: Trai
     """
     while not _fits(step, state, plan, photo):
         # Not while the error is handled: it holds on to all that the iteration had.
-        state.buffers = GradientBuffers()
-        for tensor in state.gaussians.tensors().values():
-            tensor.grad = None
+        state.drop_gradients()
         if state.gaussians.means.device.type == "cuda":
             torch.cuda.empty_cache()  # in pieces, what torch keeps may be of no use for what is asked for next
         _take_less(state, report)

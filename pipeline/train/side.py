@@ -44,6 +44,10 @@ class SideModel:
         """
         if all(tensor.grad is not None for tensor in self.tensors.values()):
             self.adam.step(self.tensors, rates, rows)
+        self.drop_gradients()
+
+    def drop_gradients(self) -> None:
+        """Forget the tensors' gradients."""
         for tensor in self.tensors.values():
             tensor.grad = None
 

@@ -113,6 +113,13 @@ class TrainState:
         for tensor in tensors.values():
             tensor.grad = None
 
+    def drop_gradients(self) -> None:
+        """Forget what a backward pass has left, whole or not: nothing was stepped by it."""
+        self.buffers = GradientBuffers()
+        for tensor in self.gaussians.tensors().values():
+            tensor.grad = None
+        self.techniques.drop_gradients()
+
     def control_density(self, plan: Plan, iteration: int) -> None:
         """Grow, prune and reset where this iteration is one for it; only prune and reset once growth has ended.
 
@@ -188,8 +195,8 @@ class TrainState:
         self.density.restart(len(grown))
 
     def finished(self) -> Gaussians:
-        """The trained model: finite, with unit quaternions."""
-        model = self.gaussians.detach()
+        """The trained model, on the CPU: finite, with unit quaternions."""
+        model = self.gaussians.detach().to(CPU)
         model = model.select(model.finite())
         model.quats = model.quats / torch.linalg.vector_norm(model.quats, dim=1, keepdim=True).clamp(min=1e-30)
         return model

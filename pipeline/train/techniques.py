@@ -136,6 +136,11 @@ class Techniques:
             loss = loss if penalty is None else loss + penalty
         return loss
 
+    def drop_gradients(self) -> None:
+        """The iteration is begun again."""
+        for technique in self.each:
+            technique.drop_gradients()
+
     def after_step(self, shot: Shot) -> None:
         """Step what is trained beside the Gaussians."""
         for technique in self.each:

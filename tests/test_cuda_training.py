@@ -1,0 +1,392 @@
+"""Training on CUDA, proven with the kernels' sources on the CPU: as there, the same bits always, in little memory."""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.raster import cuda_library
+from splatpipe.pipeline.raster import device as devices
+from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda_api import SplatShot
+from splatpipe.pipeline.raster.cuda_frame import shot_of
+from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
+from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop, memory, shortage, state
+from splatpipe.pipeline.train.checkpoint import load_checkpoint, save_checkpoint
+from splatpipe.pipeline.train.densify import Growth, along_curve
+from splatpipe.pipeline.train.history import History
+from splatpipe.pipeline.train.iteration import iterate
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.techniques import Techniques, make_techniques
+from splatpipe.pipeline.train.upload import colours_of
+from splatpipe.stages import evaluate, initialize, train
+
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+from building import FORWARD, SHUFFLED, build_on_cpu, load
+from on_cpu import kernels_on_cpu, library_on_cpu
+
+ON_CUDA = Device("cuda", torch.device("cpu"))  # as long as kernels of the harness are used
+QUICK = tiny_scene.plain(iterations=30, max_gaussians=400, exposure="affine", antialias=True)
+ALL = QUICK.model_copy(update={"iterations": 20, "max_gaussians": 250, "dropout": 0.2, "background": "random"})
+EARLY, LATE = 5, 17  # iterations before the first and after the last step of density control
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `dataset` and `init.ply`."""
+    folder = tmp_path_factory.mktemp("scene")
+    tiny_scene.write_dataset(folder / "dataset", masked="flight 1/photo_5.png")
+    parts = {"undistort.dataset": folder / "dataset"}
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    return folder
+
+
+def make_inputs(scene: Path) -> Inputs:
+    parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
+    return Inputs(parts | tiny_scene.split_part(scene / "dataset", 4), scene, machine=Machine("auto", 1))
+
+
+@contextmanager
+def on(device: Device, kernels: CudaKernels | None = None) -> Iterator[None]:
+    """Let stages choose a device; CUDA is the harness."""
+    with pytest.MonkeyPatch.context() as patch, use_kernels(kernels or kernels_on_cpu() if device is ON_CUDA else None):
+        for stage in (loop, evaluate):
+            patch.setattr(stage, "choose_device", lambda wanted, unfit="": device)
+        yield
+
+
+def trained(
+    scene: Path, out: Path, config: TrainConfig, device: Device = ON_CUDA, kernels: CudaKernels | None = None
+) -> tuple[dict[str, object], tiny_scene.Recorder]:
+    """A training's summary and what it told."""
+    out.mkdir(exist_ok=True)
+    recorder = tiny_scene.Recorder()
+    with on(device, kernels):
+        summary = train.run(config, make_inputs(scene), out, recorder)
+    return dict(summary), recorder
+
+
+@pytest.fixture(scope="module")
+def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training with everything, undisturbed."""
+    out = tmp_path_factory.mktemp("whole")
+    _, recorder = trained(scene, out, ALL)
+    assert not recorder.warnings and len(read_splat(out / "model.ply")) > 200
+    return out
+
+
+def history(out: Path) -> dict[str, list[dict[str, float]]]:
+    found: dict[str, list[dict[str, float]]] = json.loads((out / "history.json").read_text())
+    return found
+
+
+def parts_of(out: Path) -> dict[str, bytes]:
+    return {name: (out / name).read_bytes() for name in ("model.ply", "history.json", "exposures.json")}
+
+
+def losses(summaries: tiny_scene.Recorder) -> list[float]:
+    return [value for name, value, _ in summaries.metrics if name == "loss"]
+
+
+def test_a_training_is_the_cpus(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "CUDA_REPORT_EVERY", loop.REPORT_EVERY)
+    monkeypatch.setattr(state, "along_curve", lambda growth: growth)  # in another order other children are drawn
+    summaries, recorders = {}, {}
+    for name, device in (("cpu", cpu()), ("cuda", ON_CUDA)):
+        summaries[name], recorders[name] = trained(scene, tmp_path / name, QUICK, device)
+        assert summaries[name]["device"] == name and summaries[name]["mode"] == "the same bits for one seed"
+    ours, theirs = history(tmp_path / "cuda"), history(tmp_path / "cpu")
+    # Where a score is at the threshold, the last bit decides; so one or two of a hundred differ.
+    for event, expected in zip(ours["density"], theirs["density"], strict=True):
+        for count in ("cloned", "split", "pruned", "gaussians"):
+            assert abs(event[count] - expected[count]) <= max(2, 0.02 * expected[count]), (event, expected)
+    assert sum(event["split"] for event in ours["density"]) > 100
+    assert losses(recorders["cuda"]) == pytest.approx(losses(recorders["cpu"]), rel=0.01)
+    maps = [json.loads((tmp_path / name / "exposures.json").read_text())["views"] for name in ("cuda", "cpu")]
+    for name, expected in maps[1].items():
+        np.testing.assert_allclose(maps[0][name], expected, atol=1e-3)
+
+
+def test_it_has_the_same_bits_in_any_order_of_threads(scene: Path, whole: Path, tmp_path: Path) -> None:
+    library = load(build_on_cpu())
+    library.harness_order(SHUFFLED, 5)
+    try:
+        trained(scene, tmp_path, ALL)
+    finally:
+        library.harness_order(FORWARD, 0)
+    assert parts_of(tmp_path) == parts_of(whole)
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing of the trainer catches it."""
+
+
+@contextmanager
+def killed_at(when: int) -> Iterator[None]:
+    """Die before an iteration, with a checkpoint after each one before."""
+
+    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+        if state.iteration + 1 == when:
+            raise Killed
+        iterate(state, plan, photo)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
+        patch.setattr(loop, "iterate", dying)
+        yield
+
+
+def test_a_checkpoint_moves_between_devices_and_loses_no_bit(scene: Path, whole: Path, tmp_path: Path) -> None:
+    with killed_at(LATE):
+        trained(scene, tmp_path, ALL)
+    path, plan = tmp_path / loop.CHECKPOINT, Plan.from_json((tmp_path / "plan.json").read_text())
+    read = load_checkpoint(path, plan.digest())
+    moved = TrainState.restore(read, plan, make_techniques(plan)).checkpoint(read.facts["instruction_set"])
+    assert moved.facts == read.facts and moved.arrays.keys() == read.arrays.keys()
+    for name, array in read.arrays.items():
+        np.testing.assert_array_equal(moved.arrays[name], array, strict=True)
+    save_checkpoint(path, plan.digest(), moved)  # as the CPU's trainer leaves it
+    _, recorder = trained(scene, tmp_path, ALL)
+    assert not recorder.warnings
+    assert parts_of(tmp_path) == parts_of(whole)
+
+
+def test_going_on_with_another_device_is_told(scene: Path, tmp_path: Path) -> None:
+    for begun, other in ((ON_CUDA, cpu()), (cpu(), ON_CUDA)):
+        with killed_at(EARLY if begun is ON_CUDA else LATE):
+            trained(scene, tmp_path / begun.name, ALL, begun)
+        summary, recorder = trained(scene, tmp_path / begun.name, ALL, other)
+        assert len(recorder.warnings) == 1 and "not the same to the last bit" in recorder.warnings[0]
+        assert "sm_80" in recorder.warnings[0] and summary["device"] == other.name
+
+
+ASKED_OF_THE_CPU = {  # numbers that are the host's: learning rates, and what arrived from the device long ago
+    "optim.py:_step_fused",
+    "optim.py:_is_fused",
+    "cuda_forecast.py:facts",
+}
+
+
+def test_an_iteration_asks_the_device_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[str] = []
+
+    def note(what: str) -> None:
+        frame = sys._getframe(2)
+        while "splatpipe" not in frame.f_code.co_filename:
+            frame = frame.f_back
+        place = f"{Path(frame.f_code.co_filename).name}:{frame.f_code.co_name}"
+        if place not in ASKED_OF_THE_CPU:
+            waits.append(f"{what} in {place}")
+
+    class Watch(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, arguments=(), named=None):
+            if function.__name__.startswith(("_local_scalar_dense", "nonzero", "masked_select", "equal", "unique")):
+                note(function.__name__)
+            masks = arguments[1] if function.__name__.startswith("index") else ()
+            if any(isinstance(mask, Tensor) and mask.dtype == torch.bool for mask in masks):
+                note(function.__name__)  # looks how many are true
+            return function(*arguments, **(named or {}))
+
+    for name in ("tolist", "numpy", "cpu"):
+        usual = getattr(Tensor, name)
+
+        def watched(self: Tensor, *rest: object, usual=usual, name=name, **named: object) -> object:
+            note(name)
+            return usual(self, *rest, **named)
+
+        monkeypatch.setattr(Tensor, name, watched)
+    views = tiny_scene.cameras(4)
+    plan = make_small_plan(ALL)
+    photo = TrainingPhoto(views[0], torch.full((tiny_scene.HEIGHT, tiny_scene.WIDTH, 3), 0.5), None)
+    with use_kernels(kernels_on_cpu()):
+        training = TrainState.begin(tiny_scene.true_model(), plan, make_techniques(plan))
+        with Watch():
+            for _ in range(2):  # density control and the history come later
+                iterate(training, plan, photo)
+        assert not waits
+        assert training.iteration == 2 and len(training.history._unread) == 2
+        with Watch():
+            training.history.recent_loss()
+    assert waits
+
+
+def make_small_plan(config: TrainConfig) -> Plan:
+    views = [View(camera, Path(), None) for camera in tiny_scene.cameras(4)]
+    return make_plan(config, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
+
+
+def test_losses_read_in_bunches_add_up_as_one_by_one() -> None:
+    values = torch.rand(100, generator=torch.Generator().manual_seed(0))
+    values[7], values[31] = torch.nan, torch.inf
+    found = []
+    for bunch in (1, 9, 100):
+        read = History()
+        for number, value in enumerate(values, start=1):
+            read.add_loss(value)
+            if number % bunch == 0:
+                read.recent_loss()
+        found.append(read.state())
+    assert found[0] == found[1] == found[2] and found[0]["loss_count"] == 98
+
+
+class ShortOfMemory(CudaKernels):
+    """Kernels whose device has little memory for a backward pass."""
+
+    most_bytes = 1 << 40
+
+    def back_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+        size = super().back_bytes(shot, count, capacity)
+        if size > self.most_bytes:
+            raise torch.OutOfMemoryError("out of memory")
+        return size
+
+
+def test_short_memory_makes_chunks_smaller_then_the_model_and_then_is_told(
+    scene: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shortage, "FEWEST_GAUSSIANS", 120)
+    most = read_splat(whole / "model.ply")
+    shot = shot_of(tiny_scene.cameras()[0], RenderOptions(3, depth=False), 16)
+
+    # Chunks: as many Gaussians, the same bits.
+    kernels = ShortOfMemory(library_on_cpu(), torch.device("cpu"))
+    kernels.most_bytes = kernels.back_bytes(shot, len(most), 2 * len(most))
+    _, recorder = trained(scene, tmp_path / "chunks", ALL, kernels=kernels)
+    assert recorder.warnings and all("smaller parts" in warning for warning in recorder.warnings)
+    assert parts_of(tmp_path / "chunks") == parts_of(whole)
+
+    # Then fewer Gaussians, and no more of them.
+    kernels.most_bytes = kernels.back_bytes(shot, 200, 200)
+    fewer, recorder = trained(scene, tmp_path / "fewer", ALL, kernels=kernels)
+    assert any("most opaque" in warning for warning in recorder.warnings)
+    assert 120 <= fewer["gaussians"] < len(most) and fewer["iterations"] == ALL.iterations
+    assert kernels.back_bytes(shot, fewer["gaussians"], fewer["gaussians"]) <= kernels.most_bytes
+    told = history(tmp_path / "fewer")
+    assert told["growth_ended"] > 0 and sum(event["pruned"] for event in told["density"]) > 0
+
+    # Then the end.
+    kernels.most_bytes = 1000
+    with pytest.raises(MachineError, match="does not hold") as failure:
+        trained(scene, tmp_path / "end", ALL, kernels=kernels)
+    assert "max_megapixels" in failure.value.hint
+
+
+def test_rows_are_taken_where_old_and_new_do_not_fit_side_by_side() -> None:
+    class Tight(Tensor):
+        def __getitem__(self, rows: object) -> Tensor:
+            raise torch.OutOfMemoryError("out of memory")
+
+        def cpu(self) -> Tensor:
+            return self.as_subclass(Tensor)
+
+    values = torch.arange(12.0).reshape(4, 3)
+    tensors = {"a": values.clone(), "b": values.clone().as_subclass(Tight), "c": values.clone()}
+    take_rows(tensors, torch.tensor([3, 1]))
+    assert list(tensors) == ["a", "b", "c"]
+    for tensor in tensors.values():
+        assert type(tensor) is Tensor and torch.equal(tensor, values[[3, 1]])
+
+
+def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_scene.true_model(100)
+    each = memory.device_bytes_per_gaussian(3)
+    for free, room in ((None, 500), (10**9, 500), (100 * memory.DEVICE_PASSING_BYTES + 50 * each, 150), (0, 100)):
+        monkeypatch.setattr(memory, "free_bytes", lambda device, free=free: free)
+        assert memory.within_room(500, model) == room
+    monkeypatch.setattr(state, "within_room", lambda wanted, gaussians: len(gaussians) + 3)
+    plan = make_small_plan(ALL)
+    training = TrainState.begin(tiny_scene.true_model(), plan, Techniques())
+    training.density.statistics.add(torch.ones(len(training.gaussians)), torch.ones(len(training.gaussians)) > 0.0)
+    training.control_density(plan, plan.schedule.density.first)
+    assert training.history.growth_ended == plan.schedule.density.first
+    assert len(training.gaussians) == tiny_scene.GAUSSIANS + 3
+
+
+def test_a_limit_of_memory_is_the_devices_where_that_trains() -> None:
+    each, recorder = memory.device_bytes_per_gaussian(3), tiny_scene.Recorder()
+    limit = memory.FIXED_BYTES + 1_000_000 * memory.PIXEL_BYTES + 5000 * each
+    plan = make_small_plan(ALL.model_copy(update={"max_memory_bytes": limit, "max_gaussians": 1_000_000}))
+    assert memory.within_memory(plan, 1_000_000, 150, recorder, on_cuda=True).options.max_gaussians == 5000
+    # 236 bytes of parameters and 472 of moments, 12 of statistics; a tenth of a million more fit than on the CPU.
+    assert 708 + 12 < each < memory.bytes_per_gaussian(TrainConfig())
+
+
+def test_colours_are_the_same_numbers_on_a_device() -> None:
+    pixels = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
+    expected = pixels.astype(np.float32) * np.float32(1.0 / 255.0)
+    assert np.array_equal(colours_of(torch.from_numpy(pixels)).numpy(), expected)
+
+
+def test_rows_lie_along_a_curve_after_density_control() -> None:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(2000, 3, generator=generator)
+    rows = torch.arange(2000)
+    growth = Growth(rows, rows >= 1500, means, means + 1.0, means[:, 0])
+    assert along_curve(growth) is growth  # on the CPU
+    with use_kernels(kernels_on_cpu()):
+        sorted_ = along_curve(growth)
+    assert torch.equal(sorted_.source.sort().values, rows)
+    assert torch.equal(sorted_.means, means[sorted_.source]) and torch.equal(sorted_.fresh, sorted_.source >= 1500)
+
+    def step(points: Tensor) -> float:
+        return float((points[1:] - points[:-1]).norm(dim=1).mean())
+
+    assert step(sorted_.means) < 0.25 * step(means)
+
+
+def test_held_out_photos_are_measured_the_same(scene: Path, whole: Path, tmp_path: Path) -> None:
+    parts = dict(make_inputs(scene).parts)
+    parts |= {"train.model": whole / "model.ply", "train.rendering": whole / "rendering.json"}
+    parts |= {"train.sky": whole / "sky.npz"}
+    found = []
+    for device in (cpu(), ON_CUDA):
+        out = tmp_path / device.name
+        out.mkdir()
+        with on(device):
+            summary = evaluate.run(
+                EvaluateConfig(), Inputs(parts, scene, machine=Machine("auto", 1)), out, tiny_scene.Recorder()
+            )
+        assert summary["device"] == device.name
+        found.append(json.loads((out / "metrics.json").read_text()))
+    for name in ("psnr", "psnr_cc", "ssim"):
+        assert found[1]["mean"][name] == pytest.approx(found[0]["mean"][name], rel=1e-3)
+    theirs, ours = (one["floaters"] for one in found)
+    assert ours["veil"]["mean"] == pytest.approx(theirs["veil"]["mean"], abs=1e-4)
+    assert ours["free_space_rendered"] == pytest.approx(theirs["free_space_rendered"], abs=1e-4)
+
+
+def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    kornia = TrainConfig(loss="kornia").unfit_for_cuda()
+    assert "kornia" in kornia and not TrainConfig().unfit_for_cuda()
+    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("There is none.", "Buy one."))
+    assert choose_device("cpu").name == choose_device("auto").name == "cpu"
+    with pytest.raises(MachineError, match="There is none") as failure:
+        choose_device("cuda")
+    assert failure.value.hint == "Buy one."
+    monkeypatch.setattr(cuda_library, "why_not", lambda: None)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setenv(devices.CUBLAS_WORKSPACE[0], "kept")
+    assert choose_device("auto") == choose_device("cuda") == Device("cuda", torch.device("cuda", 0))
+    assert choose_device("auto", kornia).name == choose_device("cpu").name == "cpu"
+    with pytest.raises(UsageError, match="kornia"):
+        choose_device("cuda", kornia)
