@@ -13,16 +13,21 @@ import pytest
 import torch
 
 from splatpipe.pipeline.raster.loss import photo_loss_reference
+from splatpipe.pipeline.train.densify import _split_offsets
+from splatpipe.pipeline.train.draws import SPLIT_POSITION, uniform
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from checking import Pictures, Truth
+from checking import Truth
 from exact import case_of, exact_outcome
 from faults import FAULTS, planted
 from frames import Case
 from random_scene import random_camera, random_scene
+from training import KEY, Draws, Loss
 
 HARNESS = Path(__file__).parent / "harness"
+MORTON_BITS = 21  # an axis
+assert KEY[2] == SPLIT_POSITION
 
 
 def ending() -> Case:
@@ -59,7 +64,7 @@ def many_tiles() -> Case:
     return case_of(scene, random_camera(6, 290, 240)).changed(upstream={})
 
 
-def loss() -> Pictures:
+def loss() -> Loss:
     rng = np.random.default_rng(2)
     render, photo = (rng.random((21, 37, 3)).astype(np.float32) for _ in range(2))
     mask = rng.random((21, 37)) > 0.1
@@ -67,7 +72,25 @@ def loss() -> Pictures:
     value = photo_loss_reference(leaf, torch.from_numpy(photo).double(), 0.2, torch.from_numpy(mask))
     value.backward()
     assert leaf.grad is not None
-    return Pictures(render, photo, mask.astype(np.uint8), 0.2, value.item(), leaf.grad.numpy())
+    return Loss(render, photo, mask.astype(np.uint8), 0.2, value.item(), leaf.grad.numpy())
+
+
+def draws() -> Draws:
+    scene = random_scene(4, 60, 0)
+    rows = torch.arange(1, 60, 2)
+    offsets = _split_offsets(scene, rows, *KEY[:2]).numpy()
+    means = np.random.default_rng(1).random((300, 3)).astype(np.float32)
+    cells = [[format(int(place * 2**MORTON_BITS), f"0{MORTON_BITS}b") for place in row] for row in means]
+    keys = [int("".join(z + y + x for x, y, z in zip(*row, strict=True)), 2) for row in cells]
+    return Draws(
+        uniform(*KEY, np.arange(300)),
+        rows.numpy(),
+        scene.log_scales.numpy(),
+        scene.quats.numpy(),
+        offsets,
+        means,
+        np.array(keys, np.int64),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +98,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """What was found with no fault alive, and with each."""
     frames = [(case, exact_outcome(case)) for case in (ending(), long())]
     large = [(case, exact_outcome(case, gradients=False)) for case in (many(), many_tiles())]
-    truth = Truth(frames, loss(), large)
+    truth = Truth(frames, loss(), draws(), large)
     path = tmp_path_factory.mktemp("faults") / "truth.pickle"
     path.write_bytes(pickle.dumps(truth))
     command = [sys.executable, str(HARNESS / "checking.py"), str(planted()), str(path), str(len(FAULTS))]

@@ -18,45 +18,23 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from agreement import gradient_complaints, picture_complaints
-from frames import ORDERS, Case, Memory, Outcome, controls, pointer, run
+from frames import ORDERS, Case, Outcome, controls, run
+from training import Draws, Loss, step_complaints
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 
 PATIENCE_S = 60
 """Far more than all checks of one fault take: what loops for ever is found, too."""
-LOSS_RTOL = 1e-5
-LOSS_GRADIENT_RTOL = 5e-5
-"""Both as in test_loss.py."""
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """A loss, and what it is by its definition.
-
-    Attributes:
-        render: (h, w, 3).
-        photo: (h, w, 3).
-        mask: (h, w), zero where a pixel does not count.
-        weight: Of SSIM.
-        value: The loss.
-        gradient: By the render, (h, w, 3).
-    """
-
-    render: np.ndarray
-    photo: np.ndarray
-    mask: np.ndarray
-    weight: float
-    value: float
-    gradient: np.ndarray
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Frames with their pictures and gradients by the definition, a loss, and larger frames with their pictures."""
+    """By the definition: pictures and gradients of frames, a loss, draws, and pictures of larger frames."""
 
     frames: list[tuple[Case, Outcome]]
-    loss: Pictures
+    loss: Loss
+    draws: Draws
     large: list[tuple[Case, Outcome]]
 
 
@@ -72,8 +50,10 @@ def complaints(library: CudaLibrary, truth: Truth) -> Iterator[str]:
             yield from gradient_complaints(ours, exact)
             if order is ORDERS[0]:
                 firsts.append(ours)
+            yield from step_complaints(library, case, exact)
             yield from (f"{name} differs by order" for name in ours.differs(firsts[number]))
-        yield from loss_complaints(library, truth.loss)
+        yield from truth.loss.complaints(library)
+        yield from truth.draws.complaints(library)
         for case, exact in truth.large:
             yield from picture_complaints(run(library, case), exact)
     for (case, _), first in zip(truth.frames, firsts, strict=True):
@@ -81,24 +61,6 @@ def complaints(library: CudaLibrary, truth: Truth) -> Iterator[str]:
         for capacity, passes in ((pairs // 3, 1), (pairs // 3, 2), (pairs - 1, 3)):
             again = run(library, case, capacity, passes)
             yield from (f"{name} differs by chunks" for name in again.differs(first))
-
-
-def loss_complaints(library: CudaLibrary, truth: Pictures) -> Iterator[str]:
-    height, width = truth.mask.shape
-    at = Memory()
-    size = library.size("splat_loss_bytes", width, height)
-    memory = at.empty("memory", (size,), np.uint8)
-    render, photo, mask = (at.put(name, getattr(truth, name)) for name in ("render", "photo", "mask"))
-    gradient, value = at.empty("gradient", render.shape), at.empty("value", (1,), np.float64)
-    pictures = (pointer(render), pointer(photo), pointer(mask), width, height, truth.weight)
-    library.call("splat_photo_loss", *pictures, pointer(gradient), pointer(value), pointer(memory), size, None)
-    if at.overrun():
-        yield f"written beside {at.overrun()}"
-    if not abs(value[0] - truth.value) <= LOSS_RTOL * truth.value:
-        yield f"the loss is {value[0]}, not {truth.value}"
-    error = np.linalg.norm(gradient.astype(np.float64) - truth.gradient) / np.linalg.norm(truth.gradient)
-    if not error <= LOSS_GRADIENT_RTOL:
-        yield f"gradient of the loss: {error:.1e}"
 
 
 def first_complaint(library: CudaLibrary, truth: Truth) -> str:

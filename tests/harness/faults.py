@@ -201,6 +201,36 @@ FAULTS = (
         "mean2d[1];\n        }\n        if (!FAULT) __syncthreads();",
     ),
     Fault(
+        "no barrier between a block's gradients and its step",
+        "step.cu",
+        "if (__syncthreads_or(steps)) step_tensors(",
+        "if (FAULT || __syncthreads_or(steps)) step_tensors(",
+    ),
+    Fault(
+        "Gaussians that are not visible step, too",
+        "step.cu",
+        "bool steps = !step.sparse;",
+        "bool steps = !step.sparse || FAULT;",
+    ),
+    Fault(
+        "the constant band's rate for all bands",
+        "step.cu",
+        "return column < 3 ? step.rates[4]",
+        "return column < 3 || FAULT ? step.rates[4]",
+    ),
+    Fault(
+        "both halves of a split from the same draws",
+        "density.cu",
+        "2 * static_cast<uint64_t>(row) + (i >= count);",
+        "2 * static_cast<uint64_t>(row) + (i >= count && !FAULT);",
+    ),
+    Fault(
+        "axes of the Morton curve the wrong way round",
+        "density.cu",
+        "kLast))) << axis;",
+        "kLast))) << (FAULT ? 2 - axis : axis);",
+    ),
+    Fault(
         "one tap of the loss's window on the wrong side",
         "loss.cu",
         "p[(kRadius - d) * kChannels] + p[(kRadius + d) * kChannels]",
