@@ -1,4 +1,4 @@
-"""The sky behind a render by the CUDA backend's kernels: through the harness and on a device, beside torch on the CPU."""
+"""The sky by the CUDA backend's kernels, through the harness and on a device, beside torch on the CPU."""
 
 import sys
 from collections.abc import Iterator
