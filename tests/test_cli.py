@@ -48,6 +48,7 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
         (["run", "{photos}", "{tmp}/out", "--fast"], 2, "No such option"),
         (["run", "{photos}", "{tmp}/out", "--preset", "fast"], 2, "no preset"),
         (["run", "{photos}", "{tmp}/out", "--device", "tpu"], 2, "no device"),
+        (["run", "{photos}", "{tmp}/out", "--device", "cuda", "--set", "train.loss=kornia"], 2, "on a CUDA device"),
         (["run", "{photos}", "{tmp}/out", "--threads", "-1"], 2, "--threads"),
         (["run", "{photos}", "{tmp}/out", "--set", "train.iterations=0"], 2, "train.iterations = 0"),
         (["run", "{photos}", "{tmp}/out", "--set", "train.iteration=9"], 2, "Did you mean train.iterations?"),

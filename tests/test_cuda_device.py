@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import cuda, cuda_library, rasterizer
 from splatpipe.pipeline.raster.colour import affine_colour
@@ -34,7 +35,6 @@ WIDTH, HEIGHT = 403, 299  # no whole tiles
 LEAST_DB = 60.0  # between renders: single pixels lie on a threshold of alpha
 MOST_RELATIVE = 1e-3  # of a gradient's norm: the same, and other orders of sums
 SSIM_WEIGHT = 0.2
-ALL_BUT_A_BIT = 1.0 - 1e-6
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def stepped(where: torch.device, steps: int = 3) -> dict[str, Tensor]:
 def test_pictures_losses_and_gradients_are_the_cpus(device: torch.device, depth: bool) -> None:
     here, there = everything(scene(), CPU, depth), everything(scene(), device, depth)
     assert metrics.psnr(there.pop("colour"), here.pop("colour")) > LEAST_DB
-    assert metrics.psnr(there.pop("alpha"), here.pop("alpha")) > LEAST_DB
+    assert (there.pop("alpha") - here.pop("alpha")).square().mean() < 10 ** (-LEAST_DB / 10)
     seen_by_one = here.pop("visible") != there.pop("visible")
     assert seen_by_one.float().mean() < 1e-4  # ellipses that touch the picture's edge
     assert set(here) == set(there)
@@ -164,25 +164,33 @@ def test_a_view_of_more_pairs_than_31_bits_count(device: torch.device) -> None:
 
 
 def test_short_memory_is_met_by_smaller_chunks_with_the_same_bits(device: torch.device) -> None:
-    model = scene(200_000).to(device)
-    options = RenderOptions(3, depth=False)
+    model, view, options = scene().to(device), camera(1600, 1200), RenderOptions(3, depth=False)
+    model.log_scales += 3.0  # hundreds of tiles each: nearly all of a frame's memory is for pairs
     with torch.no_grad():
-        before = torch.cuda.memory_allocated(device)
-        expected = rasterizer.render(model, camera(), options).colour
+        expected = rasterizer.render(model, view, options).colour
         torch.cuda.synchronize(device)
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        rasterizer.render(model, view, options)  # with the room that the first one asked for
+        wanted = torch.cuda.max_memory_allocated(device) - before
         kernels = cuda.kernels_of(device)
         assert kernels is not None
-        rasterizer.render(model, camera(), options)  # with the room that the first one asked for
-        wanted = torch.cuda.max_memory_allocated(device) - before
         full, most = torch.cuda.get_device_properties(device).total_memory, kernels.forecast.most_pairs
         torch.cuda.empty_cache()
-        torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved(device) + 0.6 * wanted) / full)
-        assert torch.equal(rasterizer.render(model, camera(), options).colour, expected)
+        torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved(device) + 0.75 * wanted) / full)
+        assert torch.equal(rasterizer.render(model, view, options).colour, expected)
         assert kernels.forecast.most_pairs < most
-        torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved(device)) * ALL_BUT_A_BIT / full)
-        torch.cuda.empty_cache()
-        with pytest.raises(torch.OutOfMemoryError):  # in training, which then lowers its cap
-            rasterizer.render(scene(2_000_000).to(device), camera(), options, buffers=GradientBuffers())
+
+
+def test_memory_that_is_never_enough_is_told(device: torch.device) -> None:
+    model, options = scene().to(device), RenderOptions(3, depth=False)
+    torch.cuda.empty_cache()
+    full = torch.cuda.get_device_properties(device).total_memory
+    torch.cuda.set_per_process_memory_fraction(torch.cuda.memory_reserved(device) / full)
+    with pytest.raises(MachineError, match="Not enough memory on the graphics card"):
+        rasterizer.render(model, camera(1600, 1200), options)
+    with pytest.raises(torch.OutOfMemoryError):  # in training, which then lowers its cap
+        rasterizer.render(model, camera(1600, 1200), options, buffers=GradientBuffers())
 
 
 def test_draws_are_those_of_train_draws(device: torch.device) -> None:

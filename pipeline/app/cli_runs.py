@@ -66,6 +66,8 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     if device == "cuda":  # told now, not when training begins; `auto` takes the CPU where CUDA does not work
         from splatpipe.pipeline.raster.cuda_library import why_not
 
+        if unfit := config.train.unfit_for_cuda():
+            raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
         if missing := why_not():
             raise missing.error()
         if unfit := config.train.unfit_for_cuda():
