@@ -10,10 +10,13 @@
 #if SPLAT_ON_CPU
 #include "cuda_on_cpu.h"
 #define SPLAT_UNROLL
+#define SPLAT_ONCE
+#define __grid_constant__
 #else
 #include <cuda_runtime.h>
 #define SPLAT_SHARED(Type, name) __shared__ Type name
 #define SPLAT_UNROLL _Pragma("unroll")  // a loop over an array that is to lie in registers
+#define SPLAT_ONCE __noinline__         // a function that is compiled once for all kernels that call it
 #define SPLAT_LAUNCH(kernel, blocks, stream, ...) \
     kernel<<<static_cast<unsigned>(blocks), splat::cuda::kThreads, 0, static_cast<cudaStream_t>(stream)>>>(__VA_ARGS__)
 #endif

@@ -112,7 +112,7 @@ __global__ void __launch_bounds__(kThreads) sum_kernel(Job job, int chunk, bool 
 }
 
 // All of a chunk's lists, by one block.
-__device__ inline void bin_chunk(const Job& job, int chunk) {
+__device__ SPLAT_ONCE void bin_chunk(const Job& job, int chunk) {
     count_pairs(job, chunk);
     __syncthreads();
     scan_pairs(job);
@@ -131,7 +131,7 @@ __device__ inline void bin_chunk(const Job& job, int chunk) {
 
 // What nobody foresaw, by one block.
 template <bool kDepth>
-__global__ void __launch_bounds__(kThreads, 1) rest_kernel(Job job, int first) {
+__global__ void __launch_bounds__(kThreads, 1) rest_kernel(const __grid_constant__ Job job, int first) {
     for (int chunk = first; is_chunk(job, chunk); ++chunk) {
         bin_chunk(job, chunk);
         blend_tiles<kDepth>(job, chunk);
@@ -140,7 +140,7 @@ __global__ void __launch_bounds__(kThreads, 1) rest_kernel(Job job, int first) {
 }
 
 template <bool kDepth, bool kMagnitudes>
-__global__ void __launch_bounds__(kThreads, 1) rest_back_kernel(Job job, int first) {
+__global__ void __launch_bounds__(kThreads, 1) rest_back_kernel(const __grid_constant__ Job job, int first) {
     if (job.at.header->facts.chunks == 1) return;
     for (int chunk = first; is_chunk(job, chunk); ++chunk) {
         bin_chunk(job, chunk);

@@ -185,11 +185,12 @@ __device__ void scatter_digits(const SortPass<Key, Value>& pass) {
         }
         __syncthreads();
         const int64_t first = first_item(block);
+        const Value* values = pass.values_from ? pass.values_from + first : nullptr;
         SPLAT_UNROLL
         for (int i = 0; i < kSortItems; ++i) {
             if (!(items.kept >> i & 1)) continue;
-            const int64_t at = first + i * kWarp;
-            shared.staged[items.place[i]] = static_cast<uint32_t>(pass.values_from ? pass.values_from[at] : at);
+            const uint32_t place = static_cast<uint32_t>(first) + i * kWarp;
+            shared.staged[items.place[i]] = values ? static_cast<uint32_t>(values[i * kWarp]) : place;
         }
         __syncthreads();
         SPLAT_UNROLL
