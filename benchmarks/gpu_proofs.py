@@ -37,7 +37,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = ("tests/test_cuda_device.py", "tests/test_cuda_iterations.py", "tests/test_cuda_sky.py")
+TESTS = tuple(f"tests/test_cuda_{what}.py" for what in ("device", "iterations", "sky", "trainer"))
 LEAST_DB = 60.0  # between the CPU's render and the device's
 MOST_RELATIVE = 1e-3  # difference of a gradient, of its norm
 SHORT = 300  # iterations after which a model counts as trained

@@ -380,6 +380,8 @@ def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.Mon
     assert "kornia" in kornia and not TrainConfig().unfit_for_cuda()
     monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("There is none.", "Buy one."))
     assert choose_device("cpu").name == choose_device("auto").name == "cpu"
+    with pytest.raises(UsageError, match='no device "gpu"'):
+        choose_device("gpu")
     with pytest.raises(MachineError, match="There is none") as failure:
         choose_device("cuda")
     assert failure.value.hint == "Buy one."

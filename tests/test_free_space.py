@@ -194,3 +194,18 @@ def test_answer_is_the_same_in_another_frame_and_by_parts(space: FreeSpace, monk
     differing = int((free_space_views(elsewhere, there) != here).sum())
     assert differing <= 2  # single precision at the edges of cells
     assert torch.equal(free_space_views(model, space), here)
+
+
+def test_gaussians_on_a_device_are_judged_alike(space: FreeSpace) -> None:
+    generator = torch.Generator().manual_seed(3)
+    model = gaussians_at([(0.0, 0.0, 1.0)] * 4000, 0.05)
+    model.means = torch.rand(4000, 3, generator=generator) * torch.tensor([14.0, 10.0, 16.0]) - torch.tensor(
+        [7, 5, 2.0]
+    )
+    model.log_scales = torch.log(0.02 + torch.rand(4000, 3, generator=generator))
+    model.quats = torch.randn(4000, 4, generator=generator)
+    model.means[17], model.quats[19] = torch.nan, torch.inf
+    expected, ours = module._judge(model, space), module._judge_on_device(model, space)
+    assert expected[0].max() > 1 and expected[1].any()
+    for one, other in zip(ours, expected, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -178,6 +178,7 @@ def render(
     seconds: SecondsOption = 10.0,
     fps: FpsOption = 25,
     target: TargetOption = None,
+    device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -186,7 +187,7 @@ def render(
         from splatpipe.pipeline.app.renders import Wanted, render_run
 
         wanted = Wanted(path, what, stills, size, seconds, fps, target)
-        done.told = {"render": render_run(out, wanted, threads or available_cores())}
+        done.told = {"render": render_run(out, wanted, threads or available_cores(), device)}
 
 
 @app.command()

@@ -15,6 +15,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.raster import cuda_library, rasterizer
 
+DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")
 SAME_BITS = "the same bits for one seed"
 CUBLAS_WORKSPACE = ("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # with which cuBLAS adds in one order, as its manual says
@@ -88,8 +89,10 @@ def choose_device(wanted: str, unfit: str = "") -> Device:
 
     Raises:
         MachineError: for ``cuda`` where it does not work, with the reason.
-        UsageError: for ``cuda`` where the work cannot be done there.
+        UsageError: for another name, and for ``cuda`` where the work cannot be done there.
     """
+    if wanted not in DEVICES:
+        raise UsageError(f'There is no device "{wanted[:20]}".', hint=f"Choose {', '.join(DEVICES)}.")
     if wanted == "cpu":
         return cpu()
     missing = cuda_library.why_not()

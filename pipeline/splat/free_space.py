@@ -33,6 +33,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.free_space_on_device import centres_before
 from splatpipe.pipeline.splat.gaussians import Gaussians, multiply_quats
 
 CELLS = 24  # along the longer side: some 30 pixels at half a megapixel, 4 % of the depth
@@ -108,7 +109,8 @@ def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = VIEWS) -> 
         views: Photos in which one has to hang in front of all that is observed there; beside a well-observed point none
             counts.
     """
-    through, near = _judge(gaussians, space)
+    judge = _judge if gaussians.means.device.type == "cpu" else _judge_on_device
+    through, near = judge(gaussians, space)
     return torch.from_numpy((through >= views) | near)
 
 
@@ -183,6 +185,19 @@ def _judge(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " 
             close = rows[depths < photo.near]
             distance = np.linalg.norm(means[close] - photo.camera.centre(), axis=1)
             near[chunk[close[distance < photo.near]]] = True
+    through[_supported(gaussians, np.flatnonzero(through), space)] = 0
+    return through, near
+
+
+def _judge_on_device(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """The same of Gaussians on a device."""
+    through, near = np.zeros(len(gaussians), np.int64), np.zeros(len(gaussians), np.bool_)
+    means, usable = gaussians.means.detach().to(torch.float64), _usable(gaussians)
+    for photo in space.photos:
+        before = centres_before(means, usable, photo, 1.0 - MARGIN, CELLS)
+        spread = spread_along(gaussians, before.rows, photo.camera.cam_from_world[2, :3])
+        through[before.rows[before.depths + spread < before.limits]] += 1
+        near[before.close] = True
     through[_supported(gaussians, np.flatnonzero(through), space)] = 0
     return through, near
 

@@ -47,7 +47,8 @@ class TrainConfig(StageConfig):
     time_budget_s: Annotated[float, Field(ge=0.0, le=LONGEST_BUDGET_S)] = 0.0
     """Seconds for the whole command: resolution, cap and iterations are planned to fill what is left. 0: none."""
     max_memory_bytes: Annotated[int, Field(ge=0, le=LARGEST_MEMORY)] = 0
-    """Most resident memory that training may take, its libraries included: caps the Gaussians. 0: no limit."""
+    """Most resident memory that training may take, its libraries included; on a CUDA device, most of the device's. Caps
+    the Gaussians. 0: no limit."""
     seed: NonNegativeInt = 0
     """Seed of the order of photos and of density control."""
     max_gaussians: PositiveInt = 1_000_000
