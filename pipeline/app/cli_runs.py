@@ -70,8 +70,6 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
             raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
         if missing := why_not():
             raise missing.error()
-        if unfit := config.train.unfit_for_cuda():
-            raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)

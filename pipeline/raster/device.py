@@ -95,11 +95,11 @@ def choose_device(wanted: str, unfit: str = "") -> Device:
         raise UsageError(f'There is no device "{wanted[:20]}".', hint=f"Choose {', '.join(DEVICES)}.")
     if wanted == "cpu":
         return cpu()
+    if wanted == "cuda" and unfit:
+        raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
     missing = cuda_library.why_not()
     if wanted == "cuda" and missing is not None:
         raise missing.error()
-    if wanted == "cuda" and unfit:
-        raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
     if missing is not None or unfit:
         return cpu()
     os.environ.setdefault(*CUBLAS_WORKSPACE)  # read when its first product is computed
