@@ -14,7 +14,8 @@ namespace {
 constexpr int64_t kMaxPairs = (int64_t{1} << 31) - kSortBlock;  // of a chunk: they are counted in 32 bits with a sign
 constexpr int kDepthPasses = 32 / kDigitBits, kTilePasses = 16 / kDigitBits;
 static_assert(kDepthPasses % 2 == 0 && kTilePasses % 2 == 0, "what is sorted ends where it began");
-constexpr int kScatterBlocks = 3;  // a multiprocessor: with more, registers are spilled
+constexpr int kProjectBlocks = 3;  // a multiprocessor: worth the three words that are spilled for it
+constexpr int kScatterBlocks = 3;  // with more, registers are spilled
 constexpr int64_t kTurns = 8;      // blocks a multiprocessor of work that is done in turns: what it holds at once
 
 // Passes of the sorts, from one half of the memory to the other and back; the first takes places for values.
@@ -54,7 +55,7 @@ __host__ __device__ inline TilePass tile_pass(const FrameMemory& at, int pass) {
             nullptr};
 }
 
-__global__ void __launch_bounds__(kThreads) project_kernel(Job job) { project_phase(job); }
+__global__ void __launch_bounds__(kThreads, kProjectBlocks) project_kernel(Job job) { project_phase(job); }
 
 __global__ void __launch_bounds__(kThreads) count_depths(DepthPass pass) { count_digits(pass); }
 __global__ void __launch_bounds__(kThreads) scan_depths(DepthPass pass) { scan_digits(pass); }

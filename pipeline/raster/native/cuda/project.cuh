@@ -101,7 +101,8 @@ __device__ __forceinline__ uint32_t project_one(const Job& job, int64_t i, Recor
     const lane::Projection p = lane::project_lanes(view, lanes);
     uint32_t rows = 0, key = kCulled;
     float radius = 0.0f;
-    if (p.usable) {
+    // Whether it is on the picture at all is known without its colour, most of what there is to read.
+    if (p.usable && lane::make_splats(view, p, {0.0f, 0.0f, 0.0f}).visible) {
         const lane::SplatLanes s = lane::make_splats(view, p, colour_of(view, job.model, i, lanes.mean));
         if (s.visible) {
             *record = {s.x,        s.y,        s.a,        s.b,     s.c,       s.log2_opacity,
