@@ -134,3 +134,12 @@ def test_nodes_that_do_not_reach_the_last_pixel_are_refused(kernels: CudaKernels
     for rows, step in ((3, 8), (20, 9)):
         with pytest.raises(Exception, match="argument"):
             laid_over_nodes(kernels, colour, alpha, torch.zeros(rows, 4, 3), replace(behind, step=step))
+
+
+def test_nothing_beyond_the_nodes_is_looked_at(kernels: CudaKernels) -> None:
+    colour, alpha = torch.zeros(17, 9, 3), torch.zeros(17, 9)  # the last nodes lie at the last pixels
+    guarded = torch.full((4, 2, 3), torch.nan)
+    guarded[:3] = torch.rand(3, 2, 3, generator=torch.Generator().manual_seed(2))
+    picture = laid_over_nodes(kernels, colour, alpha, guarded[:3], Behind(8, (0.0, 0.0, 0.0)))
+    torch.testing.assert_close(picture[::8, ::8], guarded[:3], rtol=0, atol=1e-6)
+    assert bool(picture.isfinite().all())
