@@ -386,9 +386,27 @@ def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.Mon
         choose_device("cuda")
     assert failure.value.hint == "Buy one."
     monkeypatch.setattr(cuda_library, "why_not", lambda: None)
+    monkeypatch.setattr(cuda_library, "cannot_compute", lambda: cuda_library.NoCuda("It is full.", "Wait."))
+    assert choose_device("auto").name == "cpu"
+    with pytest.raises(MachineError, match="It is full"):
+        choose_device("cuda")
+    monkeypatch.setattr(cuda_library, "cannot_compute", lambda: None)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setenv(devices.CUBLAS_WORKSPACE[0], "kept")
     assert choose_device("auto") == choose_device("cuda") == Device("cuda", torch.device("cuda", 0))
     assert choose_device("auto", kornia).name == choose_device("cpu").name == "cpu"
     with pytest.raises(UsageError, match="kornia"):
         choose_device("cuda", kornia)
+
+
+def test_a_checkpoint_that_the_device_has_no_room_for_is_not_called_broken(
+    scene: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_room(*_: object) -> None:
+        raise torch.OutOfMemoryError("out of memory")
+
+    plan = make_small_plan(ALL)
+    begun = TrainState.begin(tiny_scene.true_model(), plan, Techniques())
+    monkeypatch.setattr(state.Adam, "load_state_dict", no_room)
+    with pytest.raises(torch.OutOfMemoryError):  # "broken" would have it trained from the start again
+        TrainState.restore(begun.checkpoint("any"), plan, Techniques())

@@ -26,6 +26,7 @@ from splatpipe.pipeline.train.robust import (
     cell_residuals,
     share_at,
 )
+from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
@@ -189,6 +190,22 @@ def test_threshold_is_the_quantile_of_all_known_cells() -> None:
 def test_share_rises_from_the_begin_of_density_control() -> None:
     shares = [share_at(0.1, 200, iteration) for iteration in (1, 200, 300, 400, 1000)]
     assert shares == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1])
+
+
+def test_a_visit_that_is_begun_again_is_as_if_there_had_been_one(robust: Robust) -> None:
+    plain, camera = RenderOptions(sh_degree=3), cameras()[2]
+    now = Moment(1, 1, 0.0, 0, 3, (0.0, 0.0, 0.0), 0.0, True)
+    model = tiny_scene.true_model()
+    for number, colour in enumerate((true_photo(camera), painted(true_photo(camera), CARS[2]))):
+        before = {name: tensor.clone() for name, tensor in robust.to_arrays().items()}
+        robust.settings(plain, model, camera, now)
+        robust.begin_again()  # memory was short before the photo was looked at
+        assert all(torch.equal(tensor, before[name]) for name, tensor in robust.to_arrays().items()), number
+        looked(robust, camera, colour)
+        assert not torch.equal(robust.scores, before["scores"]), number
+        robust.begin_again()
+        assert all(torch.equal(tensor, before[name]) for name, tensor in robust.to_arrays().items()), number
+        looked(robust, camera, colour)
 
 
 def test_memory_goes_through_arrays_and_refuses_another_shape(robust: Robust) -> None:

@@ -13,9 +13,7 @@ from splatpipe.pipeline.engine.stage import JSON
 
 
 def examine() -> dict[str, JSON]:
-    """Versions, cores, memory, disk, the rasterizer's instruction set, the graphics card and what CUDA does with it."""
-    import torch
-
+    """Versions, cores, memory, disk, the rasterizer's instruction set, and whether CUDA is used."""
     from splatpipe.pipeline.raster.rasterizer import isa_name, isa_names
 
     return {
@@ -25,7 +23,6 @@ def examine() -> dict[str, JSON]:
         "free disk here": f"{shutil.disk_usage(Path.cwd()).free / 1e9:.0f} GB",
         **versions(),
         "rasterizer": f"native, {isa_name()} (of {', '.join(isa_names())})",
-        "graphics card": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none that torch sees",
         "CUDA": _cuda(),
         "open3d": _version("open3d-cpu") or _version("open3d") or "not installed (an extra; the line does not need it)",
     }
@@ -33,9 +30,9 @@ def examine() -> dict[str, JSON]:
 
 def _cuda() -> str:
     """Whether trainings take CUDA here; if not, why not and what to do about it."""
-    from splatpipe.pipeline.raster.cuda_library import load, why_not
+    from splatpipe.pipeline.raster.cuda_library import cannot_compute, load, why_not
 
-    if missing := why_not():
+    if missing := why_not() or cannot_compute():
         return f"not used. {missing.reason} {missing.hint}"
     _, device = load().device(0)
     return f"used: {device.described()}"

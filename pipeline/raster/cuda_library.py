@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import warnings
 from ctypes import c_char_p, c_int32, c_int64
 from dataclasses import dataclass
 from pathlib import Path
@@ -223,8 +224,25 @@ def why_not(path: Path = LIBRARY) -> NoCuda | None:
     import torch
 
     built_with = torch.version.cuda or ""
-    works = bool(built_with) and torch.cuda.is_available()
+    with warnings.catch_warnings():  # of an old driver torch warns at length: what is returned says it
+        warnings.simplefilter("ignore")
+        works = bool(built_with) and torch.cuda.is_available()
     return reason_of(Installed(driver, code, True, library, built_with, works))
+
+
+def cannot_compute() -> NoCuda | None:
+    """Why torch cannot compute on a card that nothing is in the way of; None if it can.
+
+    Tried, which leaves a context of some hundred MB on the card: for processes that will compute there.
+    """
+    import torch
+
+    try:
+        torch.ones(1, device="cuda").add_(1.0).cpu()
+    except RuntimeError as error:
+        said = str(error).strip().split("\n")[0].rstrip(".")
+        return NoCuda(f"torch cannot compute on the NVIDIA card: {said}.", "nvidia-smi shows what else uses it.")
+    return None
 
 
 def version_text(version: int) -> str:

@@ -93,16 +93,16 @@ def choose_device(wanted: str, unfit: str = "") -> Device:
     """
     if wanted not in DEVICES:
         raise UsageError(f'There is no device "{wanted[:20]}".', hint=f"Choose {', '.join(DEVICES)}.")
-    if wanted == "cpu":
-        return cpu()
     if wanted == "cuda" and unfit:
         raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
-    missing = cuda_library.why_not()
-    if wanted == "cuda" and missing is not None:
-        raise missing.error()
-    if missing is not None or unfit:
+    if wanted == "cpu" or unfit:
         return cpu()
     os.environ.setdefault(*CUBLAS_WORKSPACE)  # read when its first product is computed
+    missing = cuda_library.why_not() or cuda_library.cannot_compute()
+    if wanted == "cuda" and missing is not None:
+        raise missing.error()
+    if missing is not None:
+        return cpu()
     return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
 
 

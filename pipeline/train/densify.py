@@ -99,9 +99,9 @@ class Growth:
 def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> Growth:
     """The Gaussians of a mask, as they are."""
     source = torch.nonzero(rows).flatten()
-    kept = gaussians.select(source)
-    fresh = torch.zeros(len(kept), dtype=torch.bool, device=source.device)
-    return Growth(source, fresh, kept.means, kept.log_scales, kept.opacity_logits)
+    fresh = torch.zeros(len(source), dtype=torch.bool, device=source.device)
+    kept = (gaussians.means, gaussians.log_scales, gaussians.opacity_logits)  # not the harmonics, most of the memory
+    return Growth(source, fresh, *(tensor[source] for tensor in kept))
 
 
 def along_curve(growth: Growth) -> Growth:

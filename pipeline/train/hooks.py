@@ -74,8 +74,8 @@ class Technique:
         """What is added to the photo's loss."""
         return None
 
-    def drop_gradients(self) -> None:
-        """The iteration is begun again: forget what its backward pass has left so far."""
+    def begin_again(self) -> None:
+        """The iteration is begun again, for memory was short before its step: undo what its hooks have changed."""
 
     def after_step(self, shot: Shot) -> None:
         """Step what is trained beside the Gaussians."""

@@ -74,8 +74,8 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
 
         state = resume(out / CHECKPOINT, plan, techniques, device, report)
         if state is None:
-            begun = start.within(plan.options.max_gaussians).to(device.tensors)
-            state = TrainState.begin(begun, plan, techniques())
+            begun = start.within(plan.options.max_gaussians)
+            state = TrainState.begin(begun.to(device.tensors), plan, techniques())
         levels = plan.schedule.coarse_levels_to(ends_at(plan, state.history.flat_at))
         first, size = state.iteration + 1, plan.megapixels
         with PhotoStream(trained_on, levels, plan.options.seed, first, out, size).to(device.tensors) as photos:

@@ -81,6 +81,7 @@ class Robust(Technique):
         self.threshold = torch.full((1,), torch.inf)
         self.left_out = torch.zeros(len(names))
         self.witnesses: Witnesses | None = None
+        self._before: tuple[int, Tensor, Tensor] | None = None  # this iteration's row, and what it had until then
 
     def watch(self, cameras: Iterable[Camera]) -> None:
         """Say where the photos were taken, of any size; without it nothing is contradicted, so nothing left out."""
@@ -95,7 +96,15 @@ class Robust(Technique):
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
         """With depths, by which the photos' places are compared."""
+        self._before = None
         return replace(settings, depth=True)
+
+    def begin_again(self) -> None:
+        """Forget what was seen of the photo: it will be looked at again."""
+        if self._before is not None:
+            row, scores, left_out = self._before
+            self.scores[row], self.left_out[row] = scores, left_out
+            self._before = None
 
     def counted(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
         """The photo without what the others contradict."""
@@ -119,6 +128,7 @@ class Robust(Technique):
         """
         with torch.no_grad():
             row = self._row[photo.camera.name]
+            self._before = row, self.scores[row].clone(), self.left_out[row].clone()
             opaque = rendered.alpha >= LEAST_ALPHA
             counts = opaque if photo.mask is None else photo.mask & opaque
             before, now = self.scores[row], cell_residuals(shown, photo.colour, counts)

@@ -1,7 +1,8 @@
 """What is done where a device's memory does not hold an iteration: less at a time, then fewer Gaussians, always told.
 
-An iteration changes nothing before its step, and what it takes the most memory for comes before that: so it is begun
-again with less. Growth that does not fit is no such case: it is foreseen (see ``memory.within_room``).
+Before its step an iteration changes nothing that cannot be undone, and what it takes the most memory for comes before
+that: so it is begun again with less. Growth that does not fit is no such case: it is foreseen (see
+``memory.within_room``).
 """
 
 from __future__ import annotations
@@ -39,18 +40,18 @@ def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: Trai
     """
     while not _fits(step, state, plan, photo):
         # Not while the error is handled: it holds on to all that the iteration had.
-        state.drop_gradients()
+        state.begin_again()
         if state.gaussians.means.device.type == "cuda":
             torch.cuda.empty_cache()  # in pieces, what torch keeps may be of no use for what is asked for next
         _take_less(state, report)
 
 
 def _fits(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto) -> bool:
-    steps = state.adam.step_count
+    steps, model = state.adam.step_count, state.gaussians
     try:
         step(state, plan, photo)
     except torch.OutOfMemoryError as error:
-        if state.adam.step_count == steps:
+        if state.adam.step_count == steps and state.gaussians is model:
             return False
         raise MachineError(
             f"The graphics card's memory does not hold {len(state.gaussians):,} Gaussians.", hint=HINT

@@ -46,6 +46,10 @@ class SideModel:
             self.adam.step(self.tensors, rates, rows)
         self.drop_gradients()
 
+    def begin_again(self) -> None:
+        """Forget what a backward pass that came to no end has left."""
+        self.drop_gradients()
+
     def drop_gradients(self) -> None:
         """Forget the tensors' gradients."""
         for tensor in self.tensors.values():

@@ -113,12 +113,12 @@ class TrainState:
         for tensor in tensors.values():
             tensor.grad = None
 
-    def drop_gradients(self) -> None:
-        """Forget what a backward pass has left, whole or not: nothing was stepped by it."""
+    def begin_again(self) -> None:
+        """Forget an iteration that did not come to its step, and what its backward pass has left, whole or not."""
         self.buffers = GradientBuffers()
         for tensor in self.gaussians.tensors().values():
             tensor.grad = None
-        self.techniques.drop_gradients()
+        self.techniques.begin_again()
 
     def control_density(self, plan: Plan, iteration: int) -> None:
         """Grow, prune and reset where this iteration is one for it; only prune and reset once growth has ended.
@@ -232,6 +232,7 @@ class TrainState:
 
         Raises:
             BrokenCheckpointError: if something is missing or does not fit.
+            torch.OutOfMemoryError: if the device has no room for it; nothing is wrong with the checkpoint, then.
         """
         try:
             tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
@@ -244,6 +245,8 @@ class TrainState:
             state.iteration, state.seconds = int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"])
             state.density.load(_under(_DENSITY, tensors))
             techniques.load(tensors)
+        except torch.OutOfMemoryError:
+            raise
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
         return state

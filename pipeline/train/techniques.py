@@ -136,10 +136,10 @@ class Techniques:
             loss = loss if penalty is None else loss + penalty
         return loss
 
-    def drop_gradients(self) -> None:
+    def begin_again(self) -> None:
         """The iteration is begun again."""
         for technique in self.each:
-            technique.drop_gradients()
+            technique.begin_again()
 
     def after_step(self, shot: Shot) -> None:
         """Step what is trained beside the Gaussians."""

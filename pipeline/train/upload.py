@@ -21,7 +21,7 @@ class Upload:
     Attributes:
         colour: In [0, 1]; of 8 bits while it is sent.
         mask: True where the photo counts; None where all of it does.
-        sent: Happens on the device when both are there; None on the CPU.
+        sent: Happens on the device when both are there; None where they still are in the host's memory.
     """
 
     colour: Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"]
@@ -55,23 +55,34 @@ class Uploader:
             colours = pixels.astype(np.float32)
             colours *= np.float32(STEP)
             return Upload(torch.from_numpy(colours), None if mask is None else torch.from_numpy(mask.copy()), None)
-        with torch.cuda.stream(self._stream):
-            colour = _pinned(pixels).to(self._device, non_blocking=True)
-            counts = None if mask is None else _pinned(mask).to(self._device, non_blocking=True)
-            sent = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            sent.record(self._stream)
-        return Upload(colour, counts, sent)
+        colour, counts = _pinned(pixels), None if mask is None else _pinned(mask)
+        try:
+            with torch.cuda.stream(self._stream):
+                there = self._sent(colour, counts)
+                sent = torch.cuda.Event()  # type: ignore[no-untyped-call]
+                sent.record(self._stream)
+        except torch.OutOfMemoryError:  # beside an iteration; between two there is more
+            return Upload(colour, counts, None)
+        return Upload(*there, sent)
 
     def end(self, upload: Upload) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"] | None]:
         """A photo that is there when the device comes to it, its colours in [0, 1]; from the thread that computes."""
-        if upload.sent is None:
+        if self._stream is None:
             return upload.colour, upload.mask
+        if upload.sent is None:
+            colour, mask = self._sent(upload.colour, upload.mask)
+            return colours_of(colour), mask
         current = torch.cuda.current_stream(self._device)
         current.wait_event(upload.sent)
         for tensor in (upload.colour, upload.mask):
             if tensor is not None:
                 tensor.record_stream(current)  # its memory is the other stream's, and not to be had until then
         return colours_of(upload.colour), upload.mask
+
+    def _sent(self, colour: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Copies on the device, made in the order of the current stream."""
+        there = colour.to(self._device, non_blocking=True)
+        return there, None if mask is None else mask.to(self._device, non_blocking=True)
 
 
 def colours_of(pixels: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

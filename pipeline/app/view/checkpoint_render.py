@@ -136,7 +136,7 @@ def held_out_of(opened: Contents) -> Sequence[str]:
 def pictures(shown: Shown, view: View, threads: int) -> tuple[bytes, bytes]:
     """JPEGs of a render and of its photo, both of the size that is trained on.
 
-    Rendered on the graphics card where there is one, and what trains on it leaves room.
+    Rendered on the graphics card where there is one, and what trains on it leaves room; it has all of that again then.
 
     Raises:
         SplatpipeError: if the photo cannot be read.
@@ -148,6 +148,8 @@ def pictures(shown: Shown, view: View, threads: int) -> tuple[bytes, bytes]:
             render = render_pixels(placed(model, choose_device("auto")), camera, shown.options)
         except (torch.OutOfMemoryError, MachineError):
             render = render_pixels(placed(model, cpu()), camera, shown.options)
+        finally:
+            torch.cuda.empty_cache()  # does nothing where CUDA was not used
     return _jpeg(render), _jpeg(photo)
 
 
