@@ -207,6 +207,12 @@ FAULTS = (
         "if (FAULT || __syncthreads_or(steps)) step_tensors(",
     ),
     Fault(
+        "no barrier between a block's turns of gradients",
+        "step.cu",
+        "sh_count); });\n        __syncthreads();",
+        "sh_count); });\n        if (!FAULT) __syncthreads();",
+    ),
+    Fault(
         "Gaussians that are not visible step, too",
         "step.cu",
         "bool steps = !step.sparse;",
