@@ -55,6 +55,8 @@ def build_on_cpu(
     Raises:
         AssertionError: with what the compiler said, if it does not compile.
     """
+    KEPT.mkdir(mode=0o700, exist_ok=True)
+    assert KEPT.stat().st_uid == os.getuid(), f"{KEPT} is somebody else's: what lies there would be run"
     chosen = [HARNESS / "cuda_on_cpu.cpp", *(kernel_sources() if sources is None else sources)]
     native = _copy_with(changed) if changed else NATIVE
     options = (*FLAGS, *_fused(), *WARNINGS, *flags)
