@@ -153,16 +153,19 @@ class Robust(Technique):
 
     def _contradicted(self, row: int, cells: Bool[Tensor, "g g"], rendered: Render) -> Bool[Tensor, "g g"]:
         """Of some cells, those where more of the other photos that see the place agree with the model than not."""
-        result = torch.zeros_like(cells).flatten()
         if self.witnesses is None:
-            return result.view_as(cells)
+            return torch.zeros_like(cells)
         alpha, depth_sum = _pooled(torch.stack((rendered.alpha, rendered.depth_sum)), (GRID, GRID)).double()
         asked = (cells & (alpha >= SURFACE_ALPHA)).flatten()
         numbers = _worth_asking(asked)
         middles = (torch.stack((numbers % GRID, numbers // GRID), dim=1) + 0.5) / GRID
         depths = (depth_sum / alpha).flatten()[numbers]
         places = self.witnesses.places(row, middles.double(), depths)
-        result[numbers] = asked[numbers] & self.witnesses.agree(row, places, self.scores, self.threshold)
+        found = self.witnesses.agree(row, places, self.scores, self.threshold)
+        if len(found) == len(asked):
+            return torch.logical_and(asked, found).view_as(cells)
+        result = torch.zeros_like(asked)
+        result[numbers] = found
         return result.view_as(cells)
 
     def end_epoch(self, share: float) -> None:
