@@ -27,7 +27,7 @@ BENCHES = {  # name: dataset, its points, megapixels
     "speed": ("bench_sceaux", "sparse", 1.6),
 }
 LINES = {"demo": None, "ochota": "ochota/photos"}  # run up to initialize; None: the capture that ships
-QUALITY = 95  # of the JPEGs that travel: half of what PNG takes, and both devices train on the same
+QUALITY = 90  # of the JPEGs that travel: a third of what PNG takes, and both devices train on the same
 MEBIBYTE = 1 << 20
 MOST_MEBIBYTES = 64  # that the tree and what it carries may have
 WHEELS = ("pydantic", "pydantic-core", "annotated-types", "typing-inspection", "beartype")  # which that machine lacks

@@ -22,7 +22,7 @@ MADE_FOLDERS = ("dist", "node_modules", "__pycache__")
 UNCOUNTED = (".py", ".pyi", ".so", ".pyc", ".typed")  # Python's are read as modules, or say nothing of the answer
 RECORD = "versions.toml"  # lies in a package that all stages reach, and holds the digests
 UNSAID = ("ctx", "kind", "type_comment")  # of a syntax tree: they follow from the rest or from the formatting
-CPP = (".cpp", ".h", ".cu")
+CPP = (".cpp", ".h", ".cu", ".cuh")
 CPP_PIECES = re.compile(r"""(?P<text>"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|//[^\n]*|/\*.*?\*/""", re.DOTALL)
 BLANKS = re.compile(r"(?<=\w)\s+(?=\w)|(?P<needless>\s+)")
 
