@@ -250,9 +250,15 @@ def test_losses_read_in_bunches_add_up_as_one_by_one() -> None:
 
 
 class ShortOfMemory(CudaKernels):
-    """Kernels whose device has little memory for a backward pass."""
+    """Kernels whose device has little memory for a frame, or for its backward pass."""
 
-    most_bytes = 1 << 40
+    most_bytes, most_frame_bytes = 1 << 40, 1 << 40
+
+    def frame_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+        size = super().frame_bytes(shot, count, capacity)
+        if size > self.most_frame_bytes:
+            raise torch.OutOfMemoryError("out of memory")
+        return size
 
     def back_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
         size = super().back_bytes(shot, count, capacity)
@@ -274,6 +280,11 @@ def test_short_memory_makes_chunks_smaller_then_the_model_and_then_is_told(
     _, recorder = trained(scene, tmp_path / "chunks", ALL, kernels=kernels)
     assert recorder.warnings and all("smaller parts" in warning for warning in recorder.warnings)
     assert parts_of(tmp_path / "chunks") == parts_of(whole)
+    kernels = ShortOfMemory(library_on_cpu(), torch.device("cpu"))
+    kernels.most_frame_bytes = kernels.frame_bytes(shot, len(most), 2 * len(most))
+    _, recorder = trained(scene, tmp_path / "frames", ALL.model_copy(update={"iterations": 2}), kernels=kernels)
+    assert 1 <= len(recorder.warnings) <= 2  # once an iteration, however often something was halved
+    assert all("smaller parts" in warning for warning in recorder.warnings)
 
     # Then fewer Gaussians, and no more of them.
     kernels.most_bytes = kernels.back_bytes(shot, 200, 200)

@@ -13,7 +13,7 @@ import torch
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.raster.cuda import kernels_of
+from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.state import TrainState
@@ -38,12 +38,20 @@ def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: Trai
     Raises:
         MachineError: if there is nothing left to make smaller.
     """
+    kernels, now = kernels_of(state.gaussians.means.device), state.iteration + 1
+    pairs = 0 if kernels is None else kernels.forecast.most_pairs
     while not _fits(step, state, plan, photo):
         # Not while the error is handled: it holds on to all that the iteration had.
         state.begin_again()
         if state.gaussians.means.device.type == "cuda":
             torch.cuda.empty_cache()  # in pieces, what torch keeps may be of no use for what is asked for next
-        _take_less(state, report)
+        _take_less(state, kernels, report)
+    if kernels is not None and kernels.forecast.most_pairs < pairs:  # the rasterizer may have seen to it by itself
+        report.warning(
+            f"The graphics card's memory is short in iteration {now:,}: each picture is worked off in smaller parts, "
+            "which is slower and gives the same bits.",
+            hint=HINT,
+        )
 
 
 def _fits(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto) -> bool:
@@ -59,15 +67,10 @@ def _fits(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto) -> bo
     return True
 
 
-def _take_less(state: TrainState, report: Reporter) -> None:
+def _take_less(state: TrainState, kernels: CudaKernels | None, report: Reporter) -> None:
     """The next smaller thing: chunks of pairs first, then the model."""
-    kernels, count, now = kernels_of(state.gaussians.means.device), len(state.gaussians), state.iteration + 1
+    count, now = len(state.gaussians), state.iteration + 1
     if kernels is not None and kernels.forecast.shrink():
-        report.warning(
-            f"The graphics card's memory is short in iteration {now:,}: each picture is worked off in smaller parts, "
-            "which is slower and gives the same bits.",
-            hint=HINT,
-        )
         return
     fewer = max(int(KEPT_SHARE * count), FEWEST_GAUSSIANS)
     if fewer >= count:
