@@ -27,7 +27,7 @@ from building import FORWARD, REVERSE, SHUFFLED, build_on_cpu, load
 from on_cpu import kernels_on_cpu
 
 ATOL = 2e-6  # of colours up to 1, and of sums over 15 x 15 pixels with weights up to 1
-DEVICE_ATOL = 2e-4  # there the place between two cells is float32, the CPU's is float64
+DEVICE_ATOL = 1e-3  # there the place between two cells is float32, the CPU's is float64; of sums of hundreds
 CPU = torch.device("cpu")
 BACKGROUND, ELSEWHERE = (0.2, 0.5, 0.1), (0.9, 0.3, 0.6)
 SIZES = [(81, 57), (82, 50), (33, 5), (1, 9)]  # a last node at the last pixel, outside, one row of cells, one column
@@ -39,15 +39,14 @@ def kernels() -> CudaKernels:
 
 
 @pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
-def device(request: pytest.FixtureRequest, kernels: CudaKernels) -> Iterator[torch.device]:
+def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     """Where the kernels are found; on a real one, nothing may wait."""
     if request.param == "harness":
-        with use_kernels(kernels):
-            yield torch.device("cpu")
+        with use_kernels(kernels_on_cpu()):
+            yield CPU
         return
     if why_not() is not None:
         pytest.skip("no CUDA device")
-    torch.cuda.set_sync_debug_mode("default")
     yield torch.device("cuda", 0)
     torch.cuda.set_sync_debug_mode("default")
 
