@@ -12,7 +12,15 @@ from torch import Tensor
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_forecast import FIRST_PASSES, MARGIN, WINDOW, Forecast, FrameFacts, FrameSize
+from splatpipe.pipeline.raster.cuda_forecast import (
+    FIRST_PASSES,
+    MARGIN,
+    WINDOW,
+    Forecast,
+    FrameFacts,
+    FrameSize,
+    most_pairs_of,
+)
 from splatpipe.pipeline.raster.cuda_frame import shot_of
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
@@ -268,6 +276,11 @@ def test_forecast_keeps_the_most_of_late_and_forgets_it():
     for _ in range(2 * WINDOW):
         forecast.learn(facts(4000))
     assert 4000 < forecast.room(size).capacity < 1.5 * 4000
+
+
+def test_a_larger_device_holds_more_pairs_at_a_time_within_limits() -> None:
+    sizes = [most_pairs_of(memory << 30) for memory in (0, 1, 8, 24, 141, 4096)]
+    assert sizes == [1 << 22, 1 << 22, 1 << 23, 3 << 23, 141 << 20, 1 << 28]
 
 
 def test_forecast_grows_with_the_model_and_the_picture_and_keeps_to_its_limit():

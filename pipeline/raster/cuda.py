@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatRows, SplatShot
-from splatpipe.pipeline.raster.cuda_forecast import Forecast
+from splatpipe.pipeline.raster.cuda_forecast import Forecast, most_pairs_of
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, load, why_not
 from splatpipe.pipeline.splat.upload import upload
 
@@ -38,10 +38,10 @@ class CudaKernels:
     def __init__(self, library: CudaLibrary, device: torch.device) -> None:
         self._library = library
         self.device = device
-        self.forecast = Forecast()
         code, self.facts = library.device(device.index or 0)
         if code:
             raise MachineError(f"The CUDA kernels cannot use {self.facts.name or device}: {library.error(code)}.")
+        self.forecast = Forecast(most_pairs_of(self.facts.memory_bytes))
 
     def stream(self) -> int | None:
         """Torch's current stream, as a pointer."""

@@ -19,7 +19,9 @@ FIRST_PAIRS_A_TILE = 64  # and a start of few, large ones fills the tiles
 FIRST_PASSES = 8  # once, so that a wrong guess costs launches that find nothing, not one block's work on the rest
 MARGIN = 1.25  # over the most that was seen: between two looks views differ, and the model grows
 WINDOW = 512  # frames after which the most before them begins to be forgotten: more than most trainings have photos
-MOST_PAIRS = 1 << 22  # at a time: 64 bytes each; more in one chunk make no launch any fuller
+PAIR_BYTES = 64  # of the frame and its backward pass
+MEMORY_SHARE = 1 / 16  # of the device's for pairs: several chunks are binned twice, so one should do where it can
+FEWEST_PAIRS, MOST_PAIRS = 1 << 22, 1 << 28  # at a time: a small device's, which fill all of it; and 17 GB of them
 STEPS_AN_OCTAVE = 8  # capacities are rounded up to these, so that torch's allocator finds the last frame's memory again
 MOST_TILES = 1 << 16  # of a chunk, as in frame.h
 
@@ -103,7 +105,7 @@ class Forecast:
         most_pairs: At a time, of which a frame's memory depends; a view of more is worked off in chunks.
     """
 
-    def __init__(self, most_pairs: int = MOST_PAIRS) -> None:
+    def __init__(self, most_pairs: int = FEWEST_PAIRS) -> None:
         self.most_pairs = most_pairs
         self._readings: deque[Reading] = deque()
         self._recent: FrameFacts | None = None  # the most of this window's frames
@@ -160,6 +162,15 @@ class Forecast:
         """Pairs by a frame of another size: as many more as it has more tiles and Gaussians, never fewer."""
         grown = max(1.0, size.tiles / max(1, facts.size.tiles)) * max(1.0, size.count / max(1, facts.size.count))
         return int(MARGIN * facts.pairs * grown)
+
+
+def most_pairs_of(memory_bytes: int) -> int:
+    """Pairs that a device holds at a time; where memory is short after all, they become fewer.
+
+    Args:
+        memory_bytes: The device's.
+    """
+    return min(MOST_PAIRS, max(FEWEST_PAIRS, int(MEMORY_SHARE * memory_bytes) // PAIR_BYTES))
 
 
 def _rounded_up(pairs: int) -> int:
