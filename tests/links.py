@@ -31,6 +31,8 @@ def main(wheel: Path) -> None:
         link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         link.symlink_to(ROOT / source)
+    for library in (LINKS / "splatpipe" / "pipeline" / "raster").glob("lib*.so"):
+        library.unlink()  # CUDA's, which this wheel may be without
     with zipfile.ZipFile(wheel) as archive, tempfile.TemporaryDirectory() as scratch:
         for name in archive.namelist():
             if name.endswith(".so"):
