@@ -1,7 +1,8 @@
 // Blending the tiles of a chunk, backward: each pixel from its last contributor to its first, as raster_blend.cpp does.
 //
 // A warp takes a pair at a time, a lane a pixel. What the pair's gradient gets from the warp's pixels is summed by
-// shuffles, what it gets from the tile's warps in shared memory, in their order, and goes to the pair's slot: no atomic
+// shuffles, first along the rows of pixels, in each of which v is one number, so that its powers are not summed apart;
+// what it gets from the tile's warps is summed in shared memory, in their order, and goes to the pair's slot: no atomic
 // operation, so always the same bits.
 #pragma once
 
@@ -19,6 +20,23 @@ struct Fields {
     static constexpr int kFloats = kDepth ? kDepthSlotFloats : kSlotFloats;
     // Of the first; after them those of depth, which SplatGradient has apart.
     static constexpr int kSizes = kColourValues + (kDepth ? 1 : 0), kSlants = kSizes + (kMagnitudes ? 2 : 0);
+    // What is summed along a row of pixels: g, gu, guu and the colour's; of depth h and hu, of magnitudes both. All
+    // together are more than a row has lanes.
+    static constexpr bool kSizesApart = kDepth && kMagnitudes;
+    static constexpr int kRowValues = 6 + (kDepth ? 2 : 0) + (kMagnitudes && !kDepth ? 2 : 0);
+    static_assert(kRowValues <= kSubWidth, "a lane of a row each");
+
+    // The value that is a row's value times a power of v, negative for none.
+    static __device__ __forceinline__ int value_at(int row_value, int power) {
+        if (row_value == 0) return power == 0 ? 0 : 3 * power - 1;
+        if (row_value == 1) return power < 2 ? 1 + 3 * power : -1;
+        if (kDepth && row_value == 6 && power == 1) return kSlants + 1;
+        if (row_value < 0 || power != 0) return -1;
+        if (row_value == 2) return 3;
+        if (row_value < 6) return row_value + 3;
+        return kDepth ? (row_value == 6 ? kColourValues : kSlants) : kSizes + row_value - 6;
+    }
+
     // More pairs a batch are fewer barriers, but shared memory should leave room for other blocks.
     static constexpr int kBatch = kValues > kColourValues ? kWarp : 2 * kWarp;
 
@@ -31,11 +49,13 @@ struct Fields {
     }
 };
 
-// Sums each of kCount values over the warp. At every level a lane hands one half of its values to the lane opposite
-// and keeps the other half: 12 shuffles for nine values, not 45. Each sum ends up in one lane (see summed_by).
-template <int kCount, int kOffset, int kSize>
+// Sums each of kCount values over the lanes that are kOffset apart, half of it and so on until kEnd. At every level a
+// lane hands one half of its values to the lane opposite and keeps the other half. Each sum ends up in one lane of
+// those (see summed_by).
+template <int kCount, int kOffset, int kEnd, int kSize>
 __device__ __forceinline__ float sum_halving(float (&values)[kSize], int lane) {
-    if constexpr (kOffset == 0) {
+    if constexpr (kOffset == kEnd) {
+        static_assert(kCount == 1, "a sum a lane");
         return values[0];
     } else {
         constexpr int kKept = (kCount + 1) / 2;
@@ -49,18 +69,18 @@ __device__ __forceinline__ float sum_halving(float (&values)[kSize], int lane) {
             }
             values[i] = kept + __shfl_xor_sync(kWholeWarp, given, kOffset);
         }
-        return sum_halving<kKept, kOffset / 2>(values, lane);
+        return sum_halving<kKept, kOffset / 2, kEnd>(values, lane);
     }
 }
 
 // The value whose sum a lane has in the end, negative where another lane has it as well.
-template <int kCount, int kOffset>
+template <int kCount, int kOffset, int kEnd>
 __device__ __forceinline__ int summed_by(int lane) {
-    if constexpr (kOffset == 0) {
+    if constexpr (kOffset == kEnd) {
         return 0;
     } else {
         constexpr int kKept = (kCount + 1) / 2;
-        const int place = summed_by<kKept, kOffset / 2>(lane);
+        const int place = summed_by<kKept, kOffset / 2, kEnd>(lane);
         const int value = lane & kOffset ? place + kKept : place;
         return place < 0 || value >= kCount ? -1 : value;
     }
@@ -134,36 +154,37 @@ __device__ __forceinline__ void stage_back(const Job& job, const TileList& list,
     if (lane == 0) batch->touched[2 * band][group] = left, batch->touched[2 * band + 1][group] = right;
 }
 
-// What a pixel adds to a pair's gradient, in SplatGradient's order but for depth's (see Fields); all zeros where the
-// pixel did not meet it.
-template <bool kDepth, bool kMagnitudes, int kValues>
+// What a pixel adds to its row's values of a pair's gradient (see Fields), and to the magnitudes where those are apart;
+// all zeros where the pixel did not meet it.
+template <bool kDepth, bool kMagnitudes, int kRowValues>
 __device__ __forceinline__ void blend_back(const Whitened& splat, const float4& rest, float u, float v,
                                            float log2_alpha, bool met, float depth_origin, BackCanvas* canvas,
-                                           float (&values)[kValues]) {
-    using Of = Fields<kDepth, kMagnitudes>;
+                                           float (&values)[kRowValues], float (&sizes)[2]) {
     const float alpha = met ? fminf(power_of_two(log2_alpha), kAlphaMax) : 0.0f;
     const float inv_rest = met ? inverse(1.0f - alpha) : 1.0f;
     const float before = canvas->transmittance * inv_rest, weight = alpha * before;
     float value = fmaf(splat.start.z, canvas->red, fmaf(splat.start.w, canvas->green, rest.x * canvas->blue));
-    values[6] = weight * canvas->red, values[7] = weight * canvas->green, values[8] = weight * canvas->blue;
+    values[3] = weight * canvas->red, values[4] = weight * canvas->green, values[5] = weight * canvas->blue;
     if (kDepth) {
         const float depth = depth_at(rest, u, v), from_origin = depth - depth_origin;
         value = fmaf(depth, canvas->depth, value);
         value = fmaf(from_origin * from_origin, canvas->depth_square, value);
         const float g = weight * fmaf(from_origin + from_origin, canvas->depth_square, canvas->depth);
-        values[kColourValues] = g, values[Of::kSlants] = g * u, values[Of::kSlants + 1] = g * v;
+        values[6] = g, values[7] = g * u;
     }
     const float light = weight * value, share = alpha * inv_rest;
     // dL/d(ln alpha) = light - behind alpha / (1 - alpha), and no gradient where clamped.
     const float g = log2_alpha <= kLog2AlphaMax ? fmaf(-share, canvas->behind, light) : 0.0f;
     canvas->transmittance = before, canvas->behind += light;
-    const float gu = g * u, gv = g * v;
-    values[0] = g, values[1] = gu, values[2] = gv, values[3] = gu * u, values[4] = gu * v, values[5] = gv * v;
+    const float gu = g * u;
+    values[0] = g, values[1] = gu, values[2] = gu * u;
     if (kMagnitudes) {
-        values[Of::kSizes] = fabsf(gu);
-        values[Of::kSizes + 1] = fabsf(fmaf(splat.shape.y, gu, splat.shape.z * gv));
+        float* to = kDepth ? sizes : values + 6;
+        to[0] = fabsf(gu), to[1] = fabsf(fmaf(splat.shape.y, gu, splat.shape.z * (g * v)));
     }
 }
+
+constexpr int kPowers = 3;  // of v: 0, 1 and 2
 
 // The pairs of a batch, from far to near, as far as this warp's pixels looked at them: `looked`, counted from the
 // first.
@@ -172,7 +193,9 @@ __device__ __forceinline__ void walk_back(const Place& at, int32_t from, int32_t
                                           BackCanvas* canvas, BackBatch<kDepth, kMagnitudes>* batch) {
     using Of = Fields<kDepth, kMagnitudes>;
     const int warp = static_cast<int>(threadIdx.x) / kWarp, lane = static_cast<int>(threadIdx.x) % kWarp;
-    const int own = summed_by<Of::kValues, kWarp / 2>(lane);
+    const int own = Of::value_at(summed_by<Of::kRowValues, kSubWidth / 2, 0>(lane),
+                                 summed_by<kPowers, kWarp / 2, kSubWidth / 2>(lane));
+    const int own_size = Of::kSizesApart ? summed_by<2, kWarp / 2, 0>(lane) : -1;
 #pragma unroll 1  // not unrolled, as below: registers for four blocks are worth more
     for (int word = Of::kBatch / kWarp - 1; word >= 0; --word) {
         unsigned left = batch->pairs.touched[warp][word], summed = 0;
@@ -185,11 +208,17 @@ __device__ __forceinline__ void walk_back(const Place& at, int32_t from, int32_t
             const float u = splat.u(at), v = splat.v(at), log2_alpha = splat.log2_alpha(u, v);
             const bool met = kLog2AlphaMin <= log2_alpha && from + i < canvas->end;
             if (!__any_sync(kWholeWarp, met)) continue;
-            float values[Of::kValues];
+            float values[Of::kRowValues], sizes[2];
             blend_back<kDepth, kMagnitudes>(splat, batch->pairs.rest[i], u, v, log2_alpha, met, depth_origin, canvas,
-                                            values);
-            const float sum = sum_halving<Of::kValues, kWarp / 2>(values, lane);
+                                            values, sizes);
+            const float of_row = sum_halving<Of::kRowValues, kSubWidth / 2, 0>(values, lane), by_v = of_row * v;
+            float powers[kPowers] = {of_row, by_v, by_v * v};
+            const float sum = sum_halving<kPowers, kWarp / 2, kSubWidth / 2>(powers, lane);
             if (own >= 0) batch->sums[i][warp][own] = sum;
+            if (Of::kSizesApart) {
+                const float size = sum_halving<2, kWarp / 2, 0>(sizes, lane);
+                if (own_size >= 0) batch->sums[i][warp][Of::kSizes + own_size] = size;
+            }
             summed |= 1u << bit;
         }
         if (lane == 0) batch->summed[word][warp] = summed;
