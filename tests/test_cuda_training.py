@@ -2,6 +2,7 @@
 
 import json
 import sys
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -421,3 +422,22 @@ def test_a_checkpoint_that_the_device_has_no_room_for_is_not_called_broken(
     monkeypatch.setattr(state.Adam, "load_state_dict", no_room)
     with pytest.raises(torch.OutOfMemoryError):  # "broken" would have it trained from the start again
         TrainState.restore(begun.checkpoint("any"), plan, Techniques())
+
+
+def test_density_control_finds_nothing_left_of_the_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
+    left: list[object] = []
+    select = state.Adam.select
+
+    def watched(adam: state.Adam, rows: Tensor) -> None:
+        left.append(before())
+        select(adam, rows)
+
+    plan = make_small_plan(ALL)
+    photo = TrainingPhoto(tiny_scene.cameras(4)[0], torch.full((tiny_scene.HEIGHT, tiny_scene.WIDTH, 3), 0.5), None)
+    with use_kernels(kernels_on_cpu()):
+        training = TrainState.begin(tiny_scene.true_model(), plan, make_techniques(plan))
+        training.iteration = plan.schedule.density.first - 1
+        before = weakref.ref(training.gaussians)
+        monkeypatch.setattr(state.Adam, "select", watched)
+        shortage.iterate_within_memory(iterate, training, plan, photo, tiny_scene.Recorder())
+    assert left == [None] and len(training.history.density) == 1

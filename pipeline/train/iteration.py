@@ -33,35 +33,47 @@ def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     """
     now = plan.schedule.at(state.iteration + 1, state.history.flat_at)
     if not photo.is_empty:
-        techniques = state.techniques
-        # Render.
-        magnitudes = now.is_observed and state.density.magnitudes
-        settings = techniques.settings(render_options(plan, now, magnitudes), state.gaussians, photo.camera, now)
-        probe = state.screen_probe() if now.is_observed else None
-        model = techniques.before_render(state.gaussians, now)
-        rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
-        # Show.
-        shot = Shot(photo, rendered, settings, now)
-        picture = techniques.shown(shot)
-        # Loss.
-        counted = techniques.counted(picture, shot)
-        measure = photo_loss if plan.options.loss == "native" else photo_loss_reference
-        photometric = measure(picture, counted.colour, SSIM_WEIGHT, counted.mask)
-        loss = techniques.with_penalties(photometric, shot)
-        # Backward.
-        loss.backward()  # type: ignore[no-untyped-call]
-        # Step.
-        with torch.no_grad():
-            state.step(rendered.visible, now, plan)
-            if probe is not None and probe.grad is not None:
-                state.density.observe(rendered, probe.grad, plan.schedule.density)
-            techniques.after_step(shot)
-        state.history.add_loss(photometric.detach())
+        learn(state, plan, photo, now)
     # Density.
     if now.iteration % len(plan.train_views) == 0:
         state.techniques.after_epoch(now.iteration)
     state.control_density(plan, now.iteration)
     close(state, plan, photo, now)
+
+
+def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> None:
+    """Render, compare, step; what that makes is gone afterwards, for density control wants the memory.
+
+    Args:
+        state: Changed in place.
+        plan: The training's.
+        photo: What to compare with.
+        now: What the schedule says.
+    """
+    techniques = state.techniques
+    # Render.
+    magnitudes = now.is_observed and state.density.magnitudes
+    settings = techniques.settings(render_options(plan, now, magnitudes), state.gaussians, photo.camera, now)
+    probe = state.screen_probe() if now.is_observed else None
+    model = techniques.before_render(state.gaussians, now)
+    rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
+    # Show.
+    shot = Shot(photo, rendered, settings, now)
+    picture = techniques.shown(shot)
+    # Loss.
+    counted = techniques.counted(picture, shot)
+    measure = photo_loss if plan.options.loss == "native" else photo_loss_reference
+    photometric = measure(picture, counted.colour, SSIM_WEIGHT, counted.mask)
+    loss = techniques.with_penalties(photometric, shot)
+    # Backward.
+    loss.backward()  # type: ignore[no-untyped-call]
+    # Step.
+    with torch.no_grad():
+        state.step(rendered.visible, now, plan)
+        if probe is not None and probe.grad is not None:
+            state.density.observe(rendered, probe.grad, plan.schedule.density)
+        techniques.after_step(shot)
+    state.history.add_loss(photometric.detach())
 
 
 def render_options(plan: Plan, now: Moment, magnitudes: bool) -> rasterizer.RenderOptions:

@@ -7,6 +7,7 @@ that: so it is begun again with less. Growth that does not fit is no such case: 
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 
 import torch
@@ -55,11 +56,11 @@ def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: Trai
 
 
 def _fits(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto) -> bool:
-    steps, model = state.adam.step_count, state.gaussians
+    steps, model = state.adam.step_count, weakref.ref(state.gaussians)  # density control wants the old one's memory
     try:
         step(state, plan, photo)
     except torch.OutOfMemoryError as error:
-        if state.adam.step_count == steps and state.gaussians is model:
+        if state.adam.step_count == steps and state.gaussians is model():
             return False
         raise MachineError(
             f"The graphics card's memory does not hold {len(state.gaussians):,} Gaussians.", hint=HINT

@@ -166,7 +166,10 @@ class TrainState:
 
     def _clear(self, iteration: int) -> None:
         """Remove what a technique does not want, after the last step of density control, too."""
-        gone = self.techniques.unwanted(self.gaussians.detach(), iteration)
+        try:
+            gone = self.techniques.unwanted(self.gaussians.detach(), iteration)
+        except torch.OutOfMemoryError:  # of a device: the next look finds them
+            return
         if gone is not None and bool(gone.any()) and not bool(gone.all()):
             self._remove(gone, iteration)
 
