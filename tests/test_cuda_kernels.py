@@ -284,3 +284,13 @@ def test_what_makes_no_sense_is_refused(library: CudaLibrary) -> None:
     frame.frame.back_bytes -= 256
     with pytest.raises(ValueError, match="splat_blend_backward"):
         frame.blend_backward()
+
+
+@pytest.mark.parametrize("name", ["colour", "alpha", "depth_sum", "depth_square_sum"])
+def test_picture_without_a_gradient_is_one_of_zeros(library: CudaLibrary, name: str) -> None:
+    case = case_of(random_scene(9, 40, 1), random_camera(9, 33, 20), background=(0.3, 0.2, 0.1))
+    without = {other: weights for other, weights in case.upstream.items() if other != name}
+    zeros = without | {name: np.zeros_like(case.upstream[name])}
+    ours, same = (run(library, case.changed(upstream=upstream)) for upstream in (without, zeros))
+    assert all((ours.gradients[key] == gradient).all() for key, gradient in same.gradients.items())
+    assert ours.differs(run(library, case)) != []
