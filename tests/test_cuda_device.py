@@ -4,7 +4,6 @@ The kernels' numbers are proven without a device, by the harness; here, that the
 """
 
 import hashlib
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -145,22 +144,6 @@ def test_chunks_do_not_change_a_bit(device: torch.device, most_pairs: int) -> No
     for _ in range(2):  # not foreseen at first, so that one block does the rest; then foreseen
         assert digest(everything(scene(), device, depth=False)) == expected
         torch.cuda.synchronize(device)
-
-
-def test_a_view_of_more_pairs_than_31_bits_count(device: torch.device) -> None:
-    count, ending, size = 70_000, 2000, (3840, 2160)
-    assert count * math.ceil(size[0] / 16) * math.ceil(size[1] / 16) > 1 << 31
-    model = Gaussians.empty(count, 0).to(device)
-    model.means[:, 2] = 2.0 + 4.0 * torch.arange(count, device=device) / count
-    model.log_scales[:] = torch.tensor([5.0, 5.0, -6.0], device=device)
-    model.opacity_logits[:] = -4.6
-    model.sh[:, 0] = torch.rand(count, 3, device=device)
-    nearest = Gaussians(*(tensor[:ending].clone() for tensor in model.tensors().values()))
-    options = RenderOptions(0, depth=False)
-    with torch.no_grad():
-        expected = rasterizer.render(nearest, camera(*size), options)
-        assert expected.alpha.min() > 1.0 - 2e-4  # every pixel ends within them: what lies behind cannot show
-        assert torch.equal(rasterizer.render(model, camera(*size), options).colour, expected.colour)
 
 
 def test_short_memory_is_met_by_smaller_chunks_with_the_same_bits(device: torch.device) -> None:

@@ -8,6 +8,7 @@ import re
 import shutil
 import struct
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,9 @@ SYSTEM = re.compile(r"lib(stdc\+\+|gcc_s|c|m|dl|rt|pthread)\.so\.\d+|ld-linux.*"
 
 def devices_asked_for() -> set[int]:
     """What SPLATPIPE_CUDA asks for; with ``auto``, what this machine has and can compile for."""
-    asked = os.environ.get("SPLATPIPE_CUDA") or "auto"
+    stamp = Path(sys.prefix) / ".cuda"  # what `make` built for last
+    built = stamp.read_text().split()[:1] if stamp.exists() else []
+    asked = os.environ.get("SPLATPIPE_CUDA") or "".join(built) or "auto"
     if asked == "all":
         return EVERY_DEVICE
     if asked != "auto":
