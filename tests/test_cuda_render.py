@@ -22,6 +22,7 @@ from splatpipe.pipeline.raster.cuda_forecast import (
     most_pairs_of,
 )
 from splatpipe.pipeline.raster.cuda_frame import shot_of
+from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, RenderOptions, isa_name, kernels_name, render
@@ -281,6 +282,16 @@ def test_forecast_keeps_the_most_of_late_and_forgets_it():
 def test_a_larger_device_holds_more_pairs_at_a_time_within_limits() -> None:
     sizes = [most_pairs_of(memory << 30) for memory in (0, 1, 8, 24, 141, 4096)]
     assert sizes == [1 << 22, 1 << 22, 1 << 23, 3 << 23, 141 << 20, 1 << 28]
+
+
+def test_a_memory_limit_is_shared_as_a_smaller_device_is(kernels):
+    kernels.forecast.most_pairs = most_pairs_of(141 << 30)
+    with use_kernels(kernels):
+        cpu().limit_memory(0)
+        assert kernels.forecast.most_pairs == most_pairs_of(141 << 30)
+        for limit_bytes in (8 << 30, 24 << 30):  # what is less stays
+            cpu().limit_memory(limit_bytes)
+            assert kernels.forecast.most_pairs == most_pairs_of(8 << 30)
 
 
 def test_forecast_grows_with_the_model_and_the_picture_and_keeps_to_its_limit():

@@ -14,6 +14,8 @@ from torch import Tensor
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.raster import cuda_library, rasterizer
+from splatpipe.pipeline.raster.cuda import kernels_of
+from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
 
 DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")
@@ -56,6 +58,9 @@ class Device:
         Args:
             limit_bytes: The most; 0 for all of it.
         """
+        kernels = kernels_of(self.tensors)
+        if kernels is not None and limit_bytes:  # pairs get their share of the limit, not of the card
+            kernels.forecast.most_pairs = min(kernels.forecast.most_pairs, most_pairs_of(limit_bytes))
         if self.tensors.type == "cuda":
             whole = torch.cuda.get_device_properties(self.tensors).total_memory
             torch.cuda.set_per_process_memory_fraction(min(1.0, limit_bytes / whole) if limit_bytes else 1.0)
