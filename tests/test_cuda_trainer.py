@@ -11,7 +11,7 @@ import torch
 
 from splatpipe.pipeline.photos.dataset import Split, View
 from splatpipe.pipeline.raster import cuda, cuda_library
-from splatpipe.pipeline.raster.device import Device, choose_device, cpu, free_bytes
+from splatpipe.pipeline.raster.device import Device, choose_device, cpu, free_bytes, take_rows
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
@@ -101,6 +101,15 @@ def test_a_training_has_the_same_bits_twice_and_the_cpus_loss(device: Device, op
     for name, tensor in found[0][1].items():
         assert torch.equal(tensor, found[1][1][name]), name
     assert found[0][0] == found[1][0] == pytest.approx(found[2][0], rel=0.02)
+
+
+def test_rows_of_a_device_are_the_cpus(device: Device) -> None:
+    values, generator = torch.randn(1000, 16, 3), torch.Generator().manual_seed(4)
+    for count in (500, 950, 1000, 1500):
+        rows = torch.randint(0, 1000, (count,), generator=generator)
+        tensors = {"sh": values.to(device.tensors)}
+        take_rows(tensors, rows.to(device.tensors))
+        assert torch.equal(tensors["sh"].cpu(), values[rows])
 
 
 def test_an_iteration_waits_for_nothing(device: Device) -> None:

@@ -22,7 +22,7 @@ from splatpipe.pipeline.raster import device as devices
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.cuda_api import SplatShot
 from splatpipe.pipeline.raster.cuda_frame import shot_of
-from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows
+from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows, taken_in_place
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat.ply import read_splat
@@ -317,6 +317,15 @@ def test_rows_are_taken_where_old_and_new_do_not_fit_side_by_side() -> None:
     assert list(tensors) == ["a", "b", "c"]
     for tensor in tensors.values():
         assert type(tensor) is Tensor and torch.equal(tensor, values[[3, 1]])
+
+
+def test_rows_are_moved_within_their_memory() -> None:
+    generator = torch.Generator().manual_seed(2)
+    for shape in ((40,), (40, 3), (40, 16, 3)):
+        values = torch.randn(shape, generator=generator)
+        rows = torch.randint(0, 40, (37,), generator=generator)
+        moved = taken_in_place(tensor := values.clone(), rows)
+        assert torch.equal(moved, values[rows]) and moved.is_contiguous() and moved.data_ptr() == tensor.data_ptr()
 
 
 def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.MonkeyPatch) -> None:

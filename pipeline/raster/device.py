@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import UsageError
@@ -19,6 +19,8 @@ from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
 
 DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")
+COLUMNS = 8  # of float32 that are moved at a time: what a device reads of a row at least
+MOST = 0.9  # of the rows that stay at least, for the memory of the others to be left where it is
 SAME_BITS = "the same bits for one seed"
 CUBLAS_WORKSPACE = ("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # with which cuBLAS adds in one order, as its manual says
 
@@ -132,7 +134,24 @@ def take_rows(tensors: dict[str, Tensor], rows: Int[Tensor, " m"] | Bool[Tensor,
         tensors[name] = _taken(tensors, name, rows)
 
 
+def taken_in_place(tensor: Float[Tensor, n *width], rows: Int[Tensor, " m"]) -> Float[Tensor, m *width]:
+    """Rows of a tensor in its own memory, some columns at a time: at its cap, a model needs no second one.
+
+    Args:
+        tensor: Contiguous; overwritten.
+        rows: No more than it has.
+    """
+    flat = tensor.view(len(tensor), -1)
+    for first in range(0, flat.shape[1], COLUMNS):
+        columns = flat[:, first : first + COLUMNS]
+        columns[: len(rows)] = columns[rows]
+    return tensor[: len(rows)]
+
+
 def _taken(tensors: dict[str, Tensor], name: str, rows: Tensor) -> Tensor:
+    count = len(tensors[name])
+    if tensors[name].is_cuda and rows.dtype == torch.int64 and MOST * count <= len(rows) <= count:
+        return taken_in_place(tensors[name], rows)
     try:
         return tensors[name][rows]
     except torch.OutOfMemoryError:  # old and new do not fit side by side: the old one waits in the host's memory
