@@ -2,6 +2,7 @@
 
 import functools
 import math
+import weakref
 
 import pytest
 import torch
@@ -229,3 +230,20 @@ def test_what_cannot_be_stepped_in_place_is_refused():
         Adam({"a": torch.zeros(3), "b": torch.zeros(4)})
     with pytest.raises(ValueError, match="betas"):
         Adam({}, betas=(0.9, 1.0))
+
+
+def test_moments_are_loaded_one_after_the_other() -> None:
+    class Watched(torch.Tensor):
+        def to(self, *arguments: object, **named: object) -> torch.Tensor:
+            found.append([reference() is None for reference in old].count(True))
+            return self.as_subclass(torch.Tensor).clone()
+
+    found: list[int] = []
+    optimizer = Adam(parameters(5))
+    state = {name: tensor + 1.0 for name, tensor in optimizer.state_dict().items() if tensor.ndim}
+    given = {name: tensor.as_subclass(Watched) for name, tensor in state.items()} | {"step": torch.tensor(3)}
+    old = [weakref.ref(tensor) for moments in (optimizer.mean, optimizer.square) for tensor in moments.values()]
+    optimizer.load_state_dict(given)
+    assert found == list(range(1, len(old) + 1))  # each is gone before its successor comes
+    assert all(torch.equal(tensor, state[name]) for name, tensor in optimizer.state_dict().items() if tensor.ndim)
+    assert optimizer.step_count == 3

@@ -223,16 +223,20 @@ class Adam:
         Raises:
             ValueError: if the state is of other parameters.
         """
-        loaded: list[dict[str, Tensor]] = []
+        given: list[dict[str, Tensor]] = []
         for prefix in (_MEAN, _SQUARE):
             moments = {name: state.get(prefix + name, torch.empty(0)) for name in self.mean}
             for name, tensor in moments.items():
                 if tensor.shape[1:] != self.mean[name].shape[1:] or tensor.dtype != torch.float32:
                     raise ValueError(f"the state has no moments of {name} in its shape")
-            loaded.append({name: tensor.to(self.device, copy=True) for name, tensor in moments.items()})
-        if len({tensor.shape[0] for part in loaded for tensor in part.values()}) > 1 or _STEP not in state:
+            given.append(moments)
+        if len({tensor.shape[0] for part in given for tensor in part.values()}) > 1 or _STEP not in state:
             raise ValueError("the state's moments differ in their number of rows, or its step is missing")
-        self.mean, self.square = loaded
+        device = self.device
+        for moments, part in zip((self.mean, self.square), given, strict=True):
+            for name, tensor in part.items():
+                moments[name] = _zeros((0,), device)  # frees the old ones first: a device may not hold both
+                moments[name] = tensor.to(device, copy=True)
         self.step_count = int(state[_STEP])
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> None:
