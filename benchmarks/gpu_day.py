@@ -132,13 +132,16 @@ def machine() -> Row:
     """What all this was measured on."""
     ask = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total,clocks.sm,clocks.mem", "--format=csv,noheader"]
     told = subprocess.run(ask, capture_output=True, text=True, check=False).stdout if shutil.which(ask[0]) else ""
-    head = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False, cwd=ROOT)
+    commit = ""
+    if shutil.which("git"):
+        ask = ["git", "rev-parse", "HEAD"]
+        commit = subprocess.run(ask, capture_output=True, text=True, check=False, cwd=ROOT).stdout.strip()
     return {
         "gpu": told.strip() or "none",
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "commit": head.stdout.strip() or "unknown",
+        "commit": commit or "unknown",
     }
 
 
