@@ -175,7 +175,7 @@ __device__ __forceinline__ void blend_back(const Whitened& splat, const float4& 
     const float light = weight * value, share = alpha * inv_rest;
     // dL/d(ln alpha) = light - behind alpha / (1 - alpha), and no gradient where clamped.
     const float g = log2_alpha <= kLog2AlphaMax ? fmaf(-share, canvas->behind, light) : 0.0f;
-    canvas->transmittance = before, canvas->behind += light;
+    canvas->transmittance = before, canvas->behind = fmaf(weight, value, canvas->behind);
     const float gu = g * u;
     values[0] = g, values[1] = gu, values[2] = gu * u;
     if (kMagnitudes) {
