@@ -1,0 +1,146 @@
+"""What training does differently on a device, piece by piece: which one, rows, memory, colours, losses."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.raster import cuda_library
+from splatpipe.pipeline.raster import device as devices
+from splatpipe.pipeline.raster.cuda import use_kernels
+from splatpipe.pipeline.raster.device import Device, choose_device, take_rows, taken_in_place
+from splatpipe.pipeline.train import memory, state
+from splatpipe.pipeline.train.densify import Growth, along_curve
+from splatpipe.pipeline.train.history import History
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.techniques import Techniques
+from splatpipe.pipeline.train.upload import colours_of
+
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+from on_cpu import kernels_on_cpu
+
+ALL = tiny_scene.plain(iterations=20, max_gaussians=250)
+
+
+def make_small_plan(config: TrainConfig) -> Plan:
+    views = [View(camera, Path(), None) for camera in tiny_scene.cameras(4)]
+    return make_plan(config, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
+
+
+def test_losses_read_in_bunches_add_up_as_one_by_one() -> None:
+    values = torch.rand(100, generator=torch.Generator().manual_seed(0))
+    values[7], values[31] = torch.nan, torch.inf
+    found = []
+    for bunch in (1, 9, 100):
+        read = History()
+        for number, value in enumerate(values, start=1):
+            read.add_loss(value)
+            if number % bunch == 0:
+                read.recent_loss()
+        found.append(read.state())
+    assert found[0] == found[1] == found[2] and found[0]["loss_count"] == 98
+
+
+def test_rows_are_taken_where_old_and_new_do_not_fit_side_by_side() -> None:
+    class Tight(Tensor):
+        def __getitem__(self, rows: object) -> Tensor:
+            raise torch.OutOfMemoryError("out of memory")
+
+        def cpu(self) -> Tensor:
+            return self.as_subclass(Tensor)
+
+    values = torch.arange(12.0).reshape(4, 3)
+    tensors = {"a": values.clone(), "b": values.clone().as_subclass(Tight), "c": values.clone()}
+    take_rows(tensors, torch.tensor([3, 1]))
+    assert list(tensors) == ["a", "b", "c"]
+    for tensor in tensors.values():
+        assert type(tensor) is Tensor and torch.equal(tensor, values[[3, 1]])
+
+
+def test_rows_are_moved_within_their_memory() -> None:
+    generator = torch.Generator().manual_seed(2)
+    for shape in ((40,), (40, 3), (40, 16, 3)):
+        values = torch.randn(shape, generator=generator)
+        rows = torch.randint(0, 40, (37,), generator=generator)
+        moved = taken_in_place(tensor := values.clone(), rows)
+        assert torch.equal(moved, values[rows]) and moved.is_contiguous() and moved.data_ptr() == tensor.data_ptr()
+
+
+def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_scene.true_model(100)
+    each = memory.device_bytes_per_gaussian(3)
+    for free, room in ((None, 500), (10**9, 500), (100 * memory.DEVICE_PASSING_BYTES + 50 * each, 150), (0, 100)):
+        monkeypatch.setattr(memory, "free_bytes", lambda device, free=free: free)
+        assert memory.within_room(500, model) == room
+    monkeypatch.setattr(state, "within_room", lambda wanted, gaussians: len(gaussians) + 3)
+    plan = make_small_plan(ALL)
+    training = TrainState.begin(tiny_scene.true_model(), plan, Techniques())
+    training.density.statistics.add(torch.ones(len(training.gaussians)), torch.ones(len(training.gaussians)) > 0.0)
+    training.control_density(plan, plan.schedule.density.first)
+    assert training.history.growth_ended == plan.schedule.density.first
+    assert len(training.gaussians) == tiny_scene.GAUSSIANS + 3
+
+
+def test_a_limit_of_memory_is_the_devices_where_that_trains() -> None:
+    each, recorder = memory.device_bytes_per_gaussian(3), tiny_scene.Recorder()
+    limit = memory.FIXED_BYTES + 1_000_000 * memory.PIXEL_BYTES + 5000 * each
+    plan = make_small_plan(ALL.model_copy(update={"max_memory_bytes": limit, "max_gaussians": 1_000_000}))
+    assert memory.within_memory(plan, 1_000_000, 150, recorder, on_cuda=True).options.max_gaussians == 5000
+    # 236 bytes of parameters and 472 of moments, 12 of statistics; a tenth of a million more fit than on the CPU.
+    assert 708 + 12 < each < memory.bytes_per_gaussian(TrainConfig())
+
+
+def test_colours_are_the_same_numbers_on_a_device() -> None:
+    pixels = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
+    expected = pixels.astype(np.float32) * np.float32(1.0 / 255.0)
+    assert np.array_equal(colours_of(torch.from_numpy(pixels)).numpy(), expected)
+
+
+def test_rows_lie_along_a_curve_after_density_control() -> None:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(2000, 3, generator=generator)
+    rows = torch.arange(2000)
+    growth = Growth(rows, rows >= 1500, means, means + 1.0, means[:, 0])
+    assert along_curve(growth) is growth  # on the CPU
+    with use_kernels(kernels_on_cpu()):
+        sorted_ = along_curve(growth)
+    assert torch.equal(sorted_.source.sort().values, rows)
+    assert torch.equal(sorted_.means, means[sorted_.source]) and torch.equal(sorted_.fresh, sorted_.source >= 1500)
+
+    def step(points: Tensor) -> float:
+        return float((points[1:] - points[:-1]).norm(dim=1).mean())
+
+    assert step(sorted_.means) < 0.25 * step(means)
+
+
+def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    kornia = TrainConfig(loss="kornia").unfit_for_cuda()
+    assert "kornia" in kornia and not TrainConfig().unfit_for_cuda()
+    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("There is none.", "Buy one."))
+    assert choose_device("cpu").name == choose_device("auto").name == "cpu"
+    with pytest.raises(UsageError, match='no device "gpu"'):
+        choose_device("gpu")
+    with pytest.raises(MachineError, match="There is none") as failure:
+        choose_device("cuda")
+    assert failure.value.hint == "Buy one."
+    monkeypatch.setattr(cuda_library, "why_not", lambda: None)
+    monkeypatch.setattr(cuda_library, "cannot_compute", lambda: cuda_library.NoCuda("It is full.", "Wait."))
+    assert choose_device("auto").name == "cpu"
+    with pytest.raises(MachineError, match="It is full"):
+        choose_device("cuda")
+    monkeypatch.setattr(cuda_library, "cannot_compute", lambda: None)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setenv(devices.CUBLAS_WORKSPACE[0], "kept")
+    assert choose_device("auto") == choose_device("cuda") == Device("cuda", torch.device("cuda", 0))
+    assert choose_device("auto", kornia).name == choose_device("cpu").name == "cpu"
+    with pytest.raises(UsageError, match="kornia"):
+        choose_device("cuda", kornia)
