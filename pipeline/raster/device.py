@@ -134,7 +134,7 @@ def take_rows(tensors: dict[str, Tensor], rows: Int[Tensor, " m"] | Bool[Tensor,
         tensors[name] = _taken(tensors, name, rows)
 
 
-def taken_in_place(tensor: Float[Tensor, n *width], rows: Int[Tensor, " m"]) -> Float[Tensor, m *width]:
+def taken_in_place(tensor: Float[Tensor, "n ..."], rows: Int[Tensor, " m"]) -> Float[Tensor, "m ..."]:
     """Rows of a tensor in its own memory, some columns at a time: at its cap, a model needs no second one.
 
     Args:
