@@ -140,7 +140,9 @@ def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.Mon
     monkeypatch.setattr(cuda_library, "cannot_compute", lambda: None)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setenv(devices.CUBLAS_WORKSPACE[0], "kept")
+    torch.backends.cuda.matmul.allow_tf32 = True  # as TORCH_ALLOW_TF32_CUBLAS_OVERRIDE does
     assert choose_device("auto") == choose_device("cuda") == Device("cuda", torch.device("cuda", 0))
+    assert not torch.backends.cuda.matmul.allow_tf32
     assert choose_device("auto", kornia).name == choose_device("cpu").name == "cpu"
     with pytest.raises(UsageError, match="kornia"):
         choose_device("cuda", kornia)

@@ -110,6 +110,8 @@ def choose_device(wanted: str, unfit: str = "") -> Device:
         raise missing.error()
     if missing is not None:
         return cpu()
+    # NVIDIA's containers round what is multiplied to TF32's 10 bits (TORCH_ALLOW_TF32_CUBLAS_OVERRIDE); a sky has more.
+    torch.backends.cuda.matmul.allow_tf32 = False
     return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
 
 
