@@ -1,11 +1,11 @@
 """What is shipped of CUDA: one library with the C interface and nothing else, for every device that was asked for.
 
 Whether there is one follows from SPLATPIPE_CUDA, as in `pipeline/raster/native/cuda/CMakeLists.txt`: CI asks for all.
+Where the build was to find out for itself, it says what it found.
 """
 
 import os
 import re
-import shutil
 import struct
 import subprocess
 import sys
@@ -26,7 +26,7 @@ SYSTEM = re.compile(r"lib(stdc\+\+|gcc_s|c|m|dl|rt|pthread)\.so\.\d+|ld-linux.*"
 
 
 def devices_asked_for() -> set[int]:
-    """What SPLATPIPE_CUDA asks for; with ``auto``, what this machine has and can compile for."""
+    """What SPLATPIPE_CUDA asks for; with ``auto``, what the last build told of itself."""
     stamp = Path(sys.prefix) / ".cuda"  # what `make` built for last
     built = stamp.read_text().split()[:1] if stamp.exists() else []
     asked = os.environ.get("SPLATPIPE_CUDA") or "".join(built) or "auto"
@@ -34,11 +34,15 @@ def devices_asked_for() -> set[int]:
         return EVERY_DEVICE
     if asked != "auto":
         return {int(device) for device in re.findall(r"\d+", asked)}
-    if not (shutil.which("nvcc") and shutil.which("nvidia-smi")):
-        return set()
-    ask = ["nvidia-smi", "--query-gpu=compute_cap", "--format=csv,noheader"]
-    told = subprocess.run(ask, capture_output=True, text=True, check=False)
-    return {int(number.replace(".", "")) for number in re.findall(r"\d+\.\d+", told.stdout)}
+    builds = sorted(ROOT.glob("build/*/cuda.txt"), key=lambda told: told.stat().st_mtime)
+    return devices_told(builds[-1].read_text()) if builds else set()
+
+
+def devices_told(text: str) -> set[int]:
+    """What a build says that it has made a library for: cuda.txt in its folder."""
+    built = re.fullmatch(r"with CUDA for ([\d ]+) \(nvcc .*\)\n", text)
+    assert built or text.startswith("without CUDA: "), text
+    return {int(device) for device in built[1].split()} if built else set()
 
 
 def exports(library: Path) -> set[str]:
@@ -84,6 +88,13 @@ def strangers(library: Path) -> list[str]:
     interface = set(re.findall(r"^SPLAT_API .*?(splat_\w+)\(", API.read_text(), re.MULTILINE))
     missing = [f"{name} is missing" for name in interface - exports(library)]
     return sorted([*(exports(library) - interface), *missing, *(n for n in needed(library) if not SYSTEM.fullmatch(n))])
+
+
+def test_what_a_build_tells_is_read() -> None:
+    assert devices_told("with CUDA for 86 90 (nvcc 13.0.88)\n") == {86, 90}
+    assert devices_told("without CUDA: this machine has no NVIDIA GPU (nvidia-smi finds none)\n") == set()
+    with pytest.raises(AssertionError):
+        devices_told("with CUDA\n")
 
 
 def test_the_library_is_there_where_it_was_asked_for() -> None:
