@@ -5,7 +5,7 @@
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
-# SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all GPUs, for none; or for some: SPLATPIPE_CUDA="80;90"
+# SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or for some: "80;90"
 # A second call does not set up again.
 
 PYTHON ?= python3
@@ -13,7 +13,9 @@ PRESET ?= standard
 PHOTOS ?=
 OUT ?= $(if $(PHOTOS),out/$(notdir $(patsubst %/,%,$(PHOTOS))),out/demo)
 TORCH ?=
-SPLATPIPE_CUDA := $(or $(SPLATPIPE_CUDA),auto)
+# A wheel is for others: for every GPU, where there is a compiler.
+NVCC := $(firstword $(shell command -v nvcc) $(wildcard /usr/local/cuda/bin/nvcc))
+SPLATPIPE_CUDA := $(or $(SPLATPIPE_CUDA),$(if $(filter wheel,$(MAKECMDGOALS)),$(if $(NVCC),all,off),auto))
 export SPLATPIPE_CUDA
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
@@ -34,7 +36,7 @@ WITH_HEADERS = $(if $(FETCHED),CXXFLAGS="-I$(FETCHED) -I$(dir $(FETCHED))" SKBUI
 EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 
 # For whom CUDA kernels are compiled, as far as this machine decides it.
-CUDA_WANTED = '$(SPLATPIPE_CUDA)' $$(command -v nvcc) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
+CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
 .PHONY: run test test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
