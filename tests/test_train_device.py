@@ -1,6 +1,8 @@
 """What training does differently on a device, piece by piece: which one, rows, memory, colours, losses."""
 
+import json
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from splatpipe.pipeline.raster import device as devices
 from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import Device, choose_device, take_rows, taken_in_place
 from splatpipe.pipeline.train import memory, state
+from splatpipe.pipeline.train.checkpoint import HostArrays, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.densify import Growth, along_curve
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.options import TrainConfig
@@ -73,6 +76,31 @@ def test_rows_are_moved_within_their_memory() -> None:
         rows = torch.randint(0, 40, (37,), generator=generator)
         moved = taken_in_place(tensor := values.clone(), rows)
         assert torch.equal(moved, values[rows]) and moved.is_contiguous() and moved.data_ptr() == tensor.data_ptr()
+
+
+def test_a_checkpoint_fetches_one_array_at_a_time_and_is_the_file_of_all_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = TrainState.begin(tiny_scene.true_model(), make_small_plan(ALL), Techniques())
+    checkpoint = training.checkpoint("any")
+    header = {"format": 1, "plan": "digest", "facts": checkpoint.facts}
+    arrays = {"facts": np.frombuffer(json.dumps(header).encode(), np.uint8), **checkpoint.arrays}
+    np.savez(tmp_path / "whole.npz", allow_pickle=False, **arrays)
+    fetched: list[weakref.ref[np.ndarray]] = []
+    usual = HostArrays.__getitem__
+
+    def fetch(arrays: HostArrays, name: str) -> np.ndarray:
+        assert not any(reference() is not None for reference in fetched)
+        copy = usual(arrays, name).copy()  # as of a device
+        fetched.append(weakref.ref(copy))
+        return copy
+
+    monkeypatch.setattr(HostArrays, "__getitem__", fetch)
+    save_checkpoint(tmp_path / "single.npz", "digest", training.checkpoint("any"))
+    assert len(fetched) > 15
+    assert (tmp_path / "single.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+    again = load_checkpoint(tmp_path / "single.npz", "digest").arrays
+    assert list(again) == list(checkpoint.arrays)
 
 
 def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
+from torch import Tensor
 
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.splat.archives import read_archive
@@ -22,12 +24,36 @@ class BrokenCheckpointError(Exception):
     """A checkpoint that cannot be gone on from; the message says why."""
 
 
+class HostArrays(Mapping[str, npt.NDArray[Any]]):
+    """Tensors as arrays, not copied; one of a device is fetched when it is asked for: the host may not hold them all.
+
+    Args:
+        tensors: By name.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        self._tensors = tensors
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        array: npt.NDArray[Any] = self._tensors[name].cpu().numpy()
+        return array
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._tensors
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tensors)
+
+    def __len__(self) -> int:
+        return len(self._tensors)
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """What one holds.
 
     Attributes:
-        arrays: Every tensor of the state, by name.
+        arrays: Every tensor of the state, by name; asked for one after the other.
         facts: Counts and curves as JSON values.
     """
 
@@ -47,7 +73,19 @@ def save_checkpoint(path: Path, plan_digest: str, checkpoint: Checkpoint) -> Non
     facts = np.frombuffer(json.dumps(header).encode(), np.uint8)
     if _FACTS in checkpoint.arrays:
         raise ValueError(f"an array may not be called {_FACTS}")
-    write_durably(path, lambda file: np.savez(file, allow_pickle=False, **{_FACTS: facts, **checkpoint.arrays}))
+
+    def write(file: IO[bytes]) -> None:  # as np.savez, which wants all arrays at once
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            _add_array(archive, _FACTS, facts)
+            for name in checkpoint.arrays:
+                _add_array(archive, name, checkpoint.arrays[name])
+
+    write_durably(path, write)
+
+
+def _add_array(archive: zipfile.ZipFile, name: str, array: npt.NDArray[Any]) -> None:
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def load_checkpoint(path: Path, plan_digest: str) -> Checkpoint:

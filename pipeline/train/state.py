@@ -14,7 +14,7 @@ from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.sh import coefficient_count
-from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint
+from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint, HostArrays
 from splatpipe.pipeline.train.densify import (
     RESET_OPACITY,
     DensityEvent,
@@ -221,7 +221,7 @@ class TrainState:
         tensors |= self.techniques.to_arrays()
         facts = {"iteration": self.iteration, "seconds": self.seconds, "history": self.whole_history().state()}
         facts["instruction_set"] = instruction_set
-        return Checkpoint({name: tensor.cpu().numpy() for name, tensor in tensors.items()}, facts)
+        return Checkpoint(HostArrays(tensors), facts)
 
     @staticmethod
     def restore(checkpoint: Checkpoint, plan: Plan, techniques: Techniques, device: torch.device = CPU) -> TrainState:
