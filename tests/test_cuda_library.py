@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster import cuda_api, cuda_library
+from splatpipe.pipeline.raster import cuda_api, cuda_driver, cuda_library
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, Installed, reason_of
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
@@ -100,7 +100,21 @@ def test_nothing_is_in_the_way_of_a_good_installation():
         (Installed(12080, driver_code=100), "no NVIDIA graphics card", "nvidia-smi"),
         (Installed(12080, driver_code=803), "driver does not start .*803", "nvidia-smi"),
         (Installed(13000, has_library=False), "built without CUDA kernels", "nvcc"),
-        (replace(GOOD, driver=12080), "too old: it knows CUDA 12.8, and the CUDA kernels .* CUDA 13", "580.65.06"),
+        (
+            replace(GOOD, driver=12080),
+            r"too old: it knows CUDA 12.8, less than the CUDA kernels \(CUDA 13\) need",
+            "driver: 580.65.06 or newer.*you need splatpipe built here with CUDA 12's nvcc.$",
+        ),
+        (
+            replace(GOOD, driver=12080, torch_cuda="13.0", torch_works=False),
+            r"less than the CUDA kernels \(CUDA 13\) and the installed torch \(CUDA 13\) need",
+            "580.65.06 or newer.*CUDA 12's nvcc and a torch for CUDA 12",
+        ),
+        (
+            replace(GOOD, driver=11080, library=(0, replace(H200, runtime=12080)), torch_cuda="13.0"),
+            "CUDA 12",
+            "580.65",
+        ),
         (replace(GOOD, library=(-3, replace(H200, architecture=61))), r"not built for NVIDIA H200 \(sm_61\)", "sm_75"),
         (replace(GOOD, library=(999, H200)), "does not answer", "nvidia-smi"),
         (replace(GOOD, torch_cuda="", torch_works=False), "torch is a build for the CPU", "pytorch.org"),
@@ -108,8 +122,8 @@ def test_nothing_is_in_the_way_of_a_good_installation():
             replace(
                 GOOD, driver=12080, library=(0, replace(H200, runtime=12080)), torch_cuda="13.0", torch_works=False
             ),
-            "too old: it knows CUDA 12.8, and the installed torch .* CUDA 13",
-            "580.65.06",
+            r"too old: it knows CUDA 12.8, less than the installed torch \(CUDA 13\) need",
+            "580.65.06 or newer.*you need a torch for CUDA 12 ",
         ),
         (replace(GOOD, torch_works=False), "torch does not find", "torch.cuda.init"),
     ],
@@ -127,7 +141,7 @@ import sys
 from splatpipe.pipeline.raster import cuda_library
 assert "torch" not in sys.modules
 found = cuda_library.why_not()
-assert "torch" not in sys.modules or cuda_library._driver() != (0, 0)
+assert "torch" not in sys.modules or cuda_library.driver() != (0, 0)
 print(found)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -144,6 +158,16 @@ extern "C" int cuDriverGetVersion(int* version) { *version = std::atoi(std::gete
 extern "C" int cuInit(unsigned) { return std::atoi(std::getenv("FAKE_INIT")); }
 """
     build(source, folder / "libcuda.so.1", "-shared", "-fPIC")
+    source = """
+#include <cstdio>
+#include <cstdlib>
+extern "C" int nvmlInit_v2() { return 0; }
+extern "C" int nvmlSystemGetDriverVersion(char* text, unsigned bytes) {
+  return std::snprintf(text, bytes, "%s", std::getenv("FAKE_RELEASE")) < 0;
+}
+extern "C" int nvmlShutdown() { return 0; }
+"""
+    build(source, folder / "libnvidia-ml.so.1", "-shared", "-fPIC")
     return folder
 
 
@@ -152,7 +176,7 @@ extern "C" int cuInit(unsigned) { return std::atoi(std::getenv("FAKE_INIT")); }
     [
         (13000, 100, True, "no NVIDIA graphics card"),
         (13000, 0, False, "built without CUDA kernels"),
-        (12080, 0, True, "too old: it knows CUDA 12.8, and the CUDA kernels were built with CUDA 13"),
+        (12080, 0, True, "too old: it knows CUDA 12.8, less than the CUDA kernels (CUDA 13)"),
         (13000, 0, True, "torch does not find" if torch.version.cuda else "torch is a build for the CPU"),
     ],
 )
@@ -174,4 +198,60 @@ print(why_not(Path({str(library)!r})).reason)
 
 def test_a_device_is_described_with_what_may_change_its_bits():
     assert H200.described() == "cuda sm_90 NVIDIA H200, driver CUDA 13.0, kernels CUDA 13.0"
+    known = replace(H200, release="580.65.06").described()
+    assert known == "cuda sm_90 NVIDIA H200, driver 580.65.06 (CUDA 13.0), kernels CUDA 13.0"
     assert cuda_library.version_text(12080) == "12.8"
+
+
+@pytest.mark.parametrize(
+    ("content", "release"),
+    [
+        (
+            b"NVRM version: NVIDIA UNIX x86_64 Kernel Module  535.183.01  Sun May 12 19:39:15 UTC 2024\nGCC",
+            "535.183.01",
+        ),
+        (b"NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.65.06  Release Build  (dvs)\n", "580.65.06"),
+        (b"NVRM version: NVIDIA UNIX x86_64 Kernel Module  470.86  Tue Oct 26 21:55:45 UTC 2021\n", "470.86"),
+        (b"", ""),
+        (b"\xff\x00" * 100_000 + b"580.65.06", ""),
+        (b"GCC version\n580.65.06\n", ""),
+    ],
+)
+def test_the_drivers_own_version_is_the_kernels(tmp_path, monkeypatch, content, release):
+    monkeypatch.setattr(cuda_driver, "_nvml_version", lambda: "")
+    assert cuda_driver.driver_release(tmp_path) == ""
+    file = tmp_path / "proc" / "driver" / "nvidia" / "version"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(content)
+    assert cuda_driver.driver_release(tmp_path) == release
+
+
+@pytest.mark.parametrize(("text", "release"), [("577.00", "577.00"), ("580.65.06", "580.65.06"), ("\\xff?", "")])
+def test_without_the_kernels_word_nvml_tells_the_version(fake_driver, tmp_path, text, release):
+    code = f"""
+from pathlib import Path
+from splatpipe.pipeline.raster.cuda_driver import driver_release
+print(repr(driver_release(Path({str(tmp_path)!r}))))
+"""
+    environment = os.environ | {"LD_LIBRARY_PATH": str(fake_driver), "FAKE_RELEASE": text}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.strip() == repr(release)
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ({}, False),
+        ({"dev/nvidiactl": ""}, False),
+        ({"dev/nvidia0": ""}, True),
+        ({"proc/driver/nvidia/gpus/0000:01:00.0/information": ""}, True),
+        ({"sys/bus/pci/devices/0/vendor": "0x8086\n", "sys/bus/pci/devices/0/class": "0x030000\n"}, False),
+        ({"sys/bus/pci/devices/0/vendor": "0x10de\n", "sys/bus/pci/devices/0/class": "0x020700\n"}, False),
+        ({"sys/bus/pci/devices/0/vendor": "0x10de\n", "sys/bus/pci/devices/0/class": "0x030200\n"}, True),
+    ],
+)
+def test_a_card_is_seen_with_and_without_its_driver(tmp_path, files, expected):
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    assert cuda_driver.has_card(tmp_path) == expected

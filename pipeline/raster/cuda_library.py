@@ -14,6 +14,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.cuda_api import ABI, CALLS, NO_KERNEL, SIZES, SplatDevice
+from splatpipe.pipeline.raster.cuda_driver import driver, driver_release
 
 LIBRARY = Path(__file__).parent / "libsplat_cuda.so"
 NO_DEVICE = 100  # cudaErrorNoDevice, and the driver's code for it
@@ -32,6 +33,7 @@ class CudaDevice:
         driver: CUDA version that the driver knows, 1000 · major + 10 · minor; 0 without a driver.
         runtime: That the library was built with.
         memory_bytes: In all.
+        release: The driver's own version, e.g. "580.65.06"; "" where the system does not tell.
     """
 
     name: str
@@ -39,11 +41,13 @@ class CudaDevice:
     driver: int
     runtime: int
     memory_bytes: int
+    release: str = ""
 
     def described(self) -> str:
         """For manifests: what may change the last bits, and a report of a problem."""
-        versions = f"driver CUDA {version_text(self.driver)}, kernels CUDA {version_text(self.runtime)}"
-        return f"cuda sm_{self.architecture} {self.name}, {versions}"
+        known = f"CUDA {version_text(self.driver)}"
+        versions = f"{self.release} ({known})" if self.release else known
+        return f"cuda sm_{self.architecture} {self.name}, driver {versions}, kernels CUDA {version_text(self.runtime)}"
 
 
 class CudaLibrary:
@@ -109,7 +113,8 @@ class CudaLibrary:
         found = SplatDevice()
         code = int(self._functions.splat_device(index, ctypes.byref(found)))
         name = found.name.decode(errors="replace")
-        return code, CudaDevice(name, found.architecture, found.driver, found.runtime, found.memory_bytes)
+        versions = (found.driver, found.runtime)
+        return code, CudaDevice(name, found.architecture, *versions, found.memory_bytes, driver_release())
 
 
 @functools.cache
@@ -185,7 +190,7 @@ def reason_of(installed: Installed) -> NoCuda | None:
     if installed.library is not None:
         code, device = installed.library
         if installed.driver // 1000 < device.runtime // 1000:
-            return _too_old(installed.driver, device.runtime // 1000, "the CUDA kernels were")
+            return _too_old(installed)
         if code == NO_KERNEL:
             return NoCuda(
                 f"The CUDA kernels were not built for {device.name} (sm_{device.architecture}).",
@@ -197,9 +202,8 @@ def reason_of(installed: Installed) -> NoCuda | None:
     if installed.torch_cuda == "":
         return _TORCH_CPU
     if installed.torch_cuda is not None and not installed.torch_works:
-        major = int(installed.torch_cuda.split(".")[0])
-        if installed.driver // 1000 < major:
-            return _too_old(installed.driver, major, "the installed torch was")
+        if installed.driver // 1000 < _major(installed.torch_cuda):
+            return _too_old(installed)
         return NoCuda("torch does not find the NVIDIA card.", "python -c 'import torch; torch.cuda.init()' says why.")
     return None
 
@@ -210,24 +214,23 @@ def why_not(path: Path = LIBRARY) -> NoCuda | None:
     Args:
         path: Of the library.
     """
-    code, driver = _driver()
-    installed = Installed(driver, code, path.exists())
+    code, known = driver()
+    installed = Installed(known, code, path.exists())
     if reason := reason_of(installed):
         return reason
     try:
         library = load(path).device(0)
     except MachineError as error:
         return NoCuda(error.message, error.hint)
-    installed = Installed(driver, code, True, library)
-    if reason := reason_of(installed):
-        return reason
     import torch
 
     built_with = torch.version.cuda or ""
+    if reason := reason_of(Installed(known, code, True, library, built_with)):
+        return reason
     with warnings.catch_warnings():  # of an old driver torch warns at length: what is returned says it
         warnings.simplefilter("ignore")
-        works = bool(built_with) and torch.cuda.is_available()
-    return reason_of(Installed(driver, code, True, library, built_with, works))
+        works = torch.cuda.is_available()
+    return reason_of(Installed(known, code, True, library, built_with, works))
 
 
 def cannot_compute() -> NoCuda | None:
@@ -250,21 +253,24 @@ def version_text(version: int) -> str:
     return f"{version // 1000}.{version % 1000 // 10}"
 
 
-def _too_old(driver: int, major: int, built: str) -> NoCuda:
-    needed = DRIVERS.get(major)
-    newer = f"{needed} or newer" if needed else f"one for CUDA {major}"
+def _major(version: str) -> int:
+    """Of "13.0"; 0 of ""."""
+    return int(version.split(".")[0] or 0)
+
+
+def _too_old(installed: Installed) -> NoCuda:
+    """Told with the least driver that will do: for the kernels and for torch, which are not built alike."""
+    kernels = 0 if installed.library is None else installed.library[1].runtime // 1000
+    built = {"the CUDA kernels": kernels, "the installed torch": _major(installed.torch_cuda or "")}
+    known, most = installed.driver // 1000, max(built.values())
+    newer = " and ".join(f"{name} (CUDA {major})" for name, major in built.items() if major > known)
+    needed = f"{DRIVERS[most]} or newer" if most in DRIVERS else f"one for CUDA {most}"
+    others = {
+        "the CUDA kernels": f"splatpipe built here with CUDA {known}'s nvcc",
+        "the installed torch": f"a torch for CUDA {known} (https://pytorch.org/get-started tells the command)",
+    }
+    instead = " and ".join(other for name, other in others.items() if built[name] > known)
     return NoCuda(
-        f"The NVIDIA driver is too old: it knows CUDA {version_text(driver)}, and {built} built with CUDA {major}.",
-        f"Install a newer NVIDIA driver: {newer}.",
+        f"The NVIDIA driver is too old: it knows CUDA {version_text(installed.driver)}, less than {newer} need.",
+        f"Install a newer NVIDIA driver: {needed}. With the driver as it is, you need {instead}.",
     )
-
-
-def _driver() -> tuple[int, int]:
-    """What the system's driver says when it starts, and the CUDA version that it knows (0 without a driver)."""
-    try:
-        driver = ctypes.CDLL("libcuda.so.1")
-        version = c_int32()
-        driver.cuDriverGetVersion(ctypes.byref(version))
-        return int(driver.cuInit(0)), version.value
-    except (OSError, AttributeError):
-        return 0, 0

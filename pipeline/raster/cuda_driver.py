@@ -1,0 +1,71 @@
+"""NVIDIA's driver and cards as the system shows them, whether or not CUDA works."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import re
+from ctypes import c_int32
+from pathlib import Path
+
+ROOT = Path("/")
+MOST_BYTES = 4096  # of the driver's file: some 200 are usual
+NVML_VERSION_BYTES = 80  # NVML_SYSTEM_DRIVER_VERSION_BUFFER_SIZE
+RELEASE = re.compile(r"\b\d{3,4}\.\d{1,3}(\.\d{1,3})?\b")  # 580.65.06; years and times in the same line look otherwise
+CARDS = ("dev/nvidia[0-9]*", "proc/driver/nvidia/gpus/*", "usr/lib/wsl/lib/libcuda.so.1")  # the last: Windows' driver
+NVIDIA, DISPLAY = "0x10de", "0x03"  # the maker on the PCI bus, and how the classes of graphics cards begin
+
+
+def driver() -> tuple[int, int]:
+    """What the driver says when it starts, and the CUDA version that it knows (0 without a driver)."""
+    try:
+        library = ctypes.CDLL("libcuda.so.1")
+        version = c_int32()
+        library.cuDriverGetVersion(ctypes.byref(version))
+        return int(library.cuInit(0)), version.value
+    except (OSError, AttributeError):
+        return 0, 0
+
+
+def driver_release(root: Path = ROOT) -> str:
+    """The driver's own version, e.g. "580.65.06"; "" where neither the kernel nor NVML tells.
+
+    Args:
+        root: Of the file system.
+    """
+    first = _begin(root / "proc" / "driver" / "nvidia" / "version").split("\n")[0]
+    found = RELEASE.search(first) or RELEASE.search(_nvml_version())
+    return found[0] if found else ""
+
+
+def has_card(root: Path = ROOT) -> bool:
+    """Whether there is an NVIDIA graphics card, with or without a driver, as far as the system shows it.
+
+    Args:
+        root: Of the file system.
+    """
+    if any(next(root.glob(pattern), None) for pattern in CARDS):
+        return True
+    devices = root.glob("sys/bus/pci/devices/*")
+    return any(_begin(d / "vendor").strip() == NVIDIA and _begin(d / "class").startswith(DISPLAY) for d in devices)
+
+
+def _begin(path: Path) -> str:
+    """The first bytes of a file of the system's; "" if there is none."""
+    try:
+        with path.open("rb") as file:
+            return file.read(MOST_BYTES).decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def _nvml_version() -> str:
+    """What NVML says, which is there under Windows' driver, too; "" without it."""
+    text = ctypes.create_string_buffer(NVML_VERSION_BYTES)
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL("libnvidia-ml.so.1")
+        if library.nvmlInit_v2() == 0:
+            code = library.nvmlSystemGetDriverVersion(text, NVML_VERSION_BYTES)
+            library.nvmlShutdown()
+            return text.value.decode(errors="replace") if code == 0 else ""
+    return ""
