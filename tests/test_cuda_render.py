@@ -332,6 +332,9 @@ def test_short_memory_makes_chunks_smaller_then_is_told():
         kernels.forecast = Forecast()
         assert kernels.forecast.room(FrameSize(60, 20)).capacity > 200
         kernels.most_bytes = kernels.frame_bytes(shot_of(CAMERA, OPTIONS, 16), 60, 200)
+        with pytest.raises(torch.OutOfMemoryError):  # a training answers that itself, to tell it
+            render(scene.clone().requires_grad_(), CAMERA, OPTIONS, buffers=GradientBuffers())
+        assert kernels.forecast.most_pairs == Forecast().most_pairs
         assert torch.equal(render(scene, CAMERA, OPTIONS).colour, expected)
         assert 60 <= kernels.forecast.most_pairs <= 200
         kernels.most_bytes = 100

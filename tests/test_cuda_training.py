@@ -27,8 +27,10 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop, shortage, state
 from splatpipe.pipeline.train.checkpoint import load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.iteration import iterate
+from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.planning import Scene
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques, make_techniques
@@ -282,6 +284,26 @@ def test_short_memory_makes_chunks_smaller_then_the_model_and_then_is_told(
     with pytest.raises(MachineError, match="does not hold") as failure:
         trained(scene, tmp_path / "end", ALL, kernels=kernels)
     assert "max_megapixels" in failure.value.hint
+
+
+def test_a_trial_for_a_budget_has_smaller_chunks_where_memory_is_short_too(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, shot = tiny_scene.true_model(), shot_of(tiny_scene.cameras()[0], RenderOptions(3, depth=False), 16)
+    kernels = ShortOfMemory(library_on_cpu(), torch.device("cpu"))
+    kernels.most_frame_bytes = kernels.frame_bytes(shot, len(begun), 2 * len(begun))
+    photo = TrainingPhoto(tiny_scene.cameras(4)[0], torch.full((tiny_scene.HEIGHT, tiny_scene.WIDTH, 3), 0.5), None)
+
+    def tried(plan: Plan, given: Scene, step: Step, report: tiny_scene.Recorder) -> Plan:
+        pilot = make_small_plan(ALL)  # without density control so early
+        trial = TrainState.begin(begun, pilot, Techniques())
+        step(trial, pilot, photo)
+        assert trial.iteration == 1 and len(trial.gaussians) == len(begun)
+        return plan
+
+    monkeypatch.setattr(loop, "under_budgets", tried)
+    _, recorder = trained(scene, tmp_path, ALL.model_copy(update={"iterations": 1}), kernels=kernels)
+    assert recorder.warnings and all("smaller parts" in warning for warning in recorder.warnings)
 
 
 def test_held_out_photos_are_measured_the_same(scene: Path, whole: Path, tmp_path: Path) -> None:

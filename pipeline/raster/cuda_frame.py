@@ -53,14 +53,23 @@ class CudaFrame:
 
     @staticmethod
     def render(
-        kernels: CudaKernels, shot: SplatShot, parameters: tuple[Tensor, ...], outputs: Sequence[Tensor | None]
+        kernels: CudaKernels,
+        shot: SplatShot,
+        parameters: tuple[Tensor, ...],
+        outputs: Sequence[Tensor | None],
+        may_shrink: bool = True,
     ) -> CudaFrame:
         """Render to colour, alpha, the three depths or None, radii and visible (uint8); all contiguous.
 
-        Where memory is short, chunks are made smaller.
+        Args:
+            kernels: That do it.
+            shot: The camera and how.
+            parameters: The model's, in the order of ``PARAMETERS``.
+            outputs: As above.
+            may_shrink: Whether chunks are made smaller here where memory is short; a training does that itself, told.
 
         Raises:
-            torch.OutOfMemoryError: if that was not enough.
+            torch.OutOfMemoryError: if memory is short, and that was not enough or may not be done.
         """
         tiles = -(-shot.width // TILE_PX) * -(-shot.height // TILE_PX)
         size = FrameSize(len(parameters[0]), tiles)
@@ -70,7 +79,7 @@ class CudaFrame:
                 memory = kernels.empty(kernels.frame_bytes(shot, size.count, room.capacity))
                 break
             except torch.OutOfMemoryError:
-                if not kernels.forecast.shrink():
+                if not may_shrink or not kernels.forecast.shrink():
                     raise
         frame = CudaFrame(kernels, shot, parameters, memory, room.capacity, room.passes)
         *pictures, radii, visible = outputs
@@ -197,7 +206,7 @@ def render_cuda(
 
     Raises:
         ValueError: if a parameter is not float32 on the kernels' device.
-        torch.OutOfMemoryError: if memory is short in training, which can shrink the model.
+        torch.OutOfMemoryError: if memory is short in training, which can make chunks and then the model smaller.
         MachineError: if it is, else.
     """
     parameters = tuple(gaussians.tensors().values())
@@ -235,7 +244,8 @@ class _Rasterize(torch.autograd.Function):
         depths = tuple(alpha.new_empty(size) if options.depth else None for _ in range(3))
         visible = torch.empty(n, dtype=torch.uint8, device=colour.device)
         shot = shot_of(camera, options, parameters[-1].shape[1])
-        frame = CudaFrame.render(kernels, shot, parameters, (colour, alpha, *depths, radii, visible))
+        outputs = (colour, alpha, *depths, radii, visible)
+        frame = CudaFrame.render(kernels, shot, parameters, outputs, may_shrink=buffers is None)
         seen = visible.view(torch.bool)
         shown = tuple(alpha.new_zeros(()).expand(size) if depth is None else depth for depth in depths)
         ctx.set_materialize_grads(False)

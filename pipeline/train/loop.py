@@ -57,9 +57,12 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     free = make_plan(config, views, split, len(start.gaussians))
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine, device)
 
+    def step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+        iterate_within_memory(iterate, state, plan, photo, report)
+
     def make() -> Plan:
         decided = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
-        return under_budgets(free.of(decided), replace(scene, config=decided, sky=sky), iterate, report)
+        return under_budgets(free.of(decided), replace(scene, config=decided, sky=sky), step, report)
 
     with same_bits(inputs.machine.threads), device.one_order():
         device.limit_memory(config.max_memory_bytes)

@@ -47,7 +47,7 @@ def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: Trai
         if state.gaussians.means.device.type == "cuda":
             torch.cuda.empty_cache()  # in pieces, what torch keeps may be of no use for what is asked for next
         _take_less(state, kernels, report)
-    if kernels is not None and kernels.forecast.most_pairs < pairs:  # the rasterizer may have seen to it by itself
+    if kernels is not None and kernels.forecast.most_pairs < pairs:  # once, however often they were halved
         report.warning(
             f"The graphics card's memory is short in iteration {now:,}: each picture is worked off in smaller parts, "
             "which is slower and gives the same bits.",
