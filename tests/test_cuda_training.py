@@ -68,7 +68,7 @@ def on(device: Device, kernels: CudaKernels | None = None) -> Iterator[None]:
     """Let stages choose a device; CUDA is the harness."""
     with pytest.MonkeyPatch.context() as patch, use_kernels(kernels or kernels_on_cpu() if device is ON_CUDA else None):
         for stage in (loop, evaluate):
-            patch.setattr(stage, "choose_device", lambda wanted, unfit="": device)
+            patch.setattr(stage, "choose_device", lambda wanted, unfit="", note=None: device)
         yield
 
 

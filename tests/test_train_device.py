@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.stage import Inputs
+from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.raster import cuda_library
+from splatpipe.pipeline.raster import cuda_driver, cuda_library
 from splatpipe.pipeline.raster import device as devices
 from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import Device, choose_device, take_rows, taken_in_place
@@ -25,6 +27,7 @@ from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.techniques import Techniques
 from splatpipe.pipeline.train.upload import colours_of
+from splatpipe.stages import initialize, train
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -148,6 +151,32 @@ def test_rows_lie_along_a_curve_after_density_control() -> None:
         return float((points[1:] - points[:-1]).norm(dim=1).mean())
 
     assert step(sorted_.means) < 0.25 * step(means)
+
+
+def test_a_card_that_is_left_alone_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
+    notes: list[str] = []
+    monkeypatch.setattr(cuda_driver, "has_card", lambda: False)
+    assert choose_device("auto", "", notes.append).name == "cpu" and not notes
+    monkeypatch.setattr(cuda_driver, "has_card", lambda: True)
+    assert choose_device("cpu", "", notes.append).name == "cpu" and not notes
+    assert choose_device("auto", "", notes.append).name == "cpu"
+    assert notes == ["the CPU computes, not the NVIDIA graphics card: The driver is old. Install another."]
+    choose_device("auto", TrainConfig(loss="kornia").unfit_for_cuda(), notes.append)
+    assert len(notes) == 2 and "kornia" in notes[1] and notes[1] == notes[1].strip()
+
+
+def test_a_training_tells_of_the_card_that_it_leaves_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
+    monkeypatch.setattr(cuda_driver, "has_card", lambda: True)
+    tiny_scene.write_dataset(tmp_path / "dataset")
+    parts = {"undistort.dataset": tmp_path / "dataset"}
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())
+    parts |= {"initialize.splat": tmp_path / "init.ply", **tiny_scene.split_part(tmp_path / "dataset", 4)}
+    recorder = tiny_scene.Recorder()
+    summary = train.run(tiny_scene.plain(iterations=2), Inputs(parts, tmp_path), tmp_path, recorder)
+    assert summary["device"] == "cpu"
+    assert [note for note in recorder.notes if "The driver is old. Install another." in note] == recorder.notes[:1]
 
 
 def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:

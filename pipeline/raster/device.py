@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.raster import cuda_library, rasterizer
+from splatpipe.pipeline.raster import cuda_driver, cuda_library, rasterizer
 from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
 
@@ -23,6 +23,8 @@ COLUMNS = 8  # of float32 that are moved at a time: what a device reads of a row
 MOST = 0.9  # of the rows that stay at least, for the memory of the others to be left where it is
 SAME_BITS = "the same bits for one seed"
 CUBLAS_WORKSPACE = ("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # with which cuBLAS adds in one order, as its manual says
+
+Note = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -87,12 +89,13 @@ def cpu() -> Device:
     return Device("cpu", CPU)
 
 
-def choose_device(wanted: str, unfit: str = "") -> Device:
+def choose_device(wanted: str, unfit: str = "", note: Note | None = None) -> Device:
     """The device that is asked for; ``auto`` takes CUDA where it works.
 
     Args:
         wanted: ``auto``, ``cpu`` or ``cuda``.
         unfit: Why the work cannot be done on a CUDA device; empty where it can.
+        note: Is told why ``auto`` leaves a graphics card alone, where there is one.
 
     Raises:
         MachineError: for ``cuda`` where it does not work, with the reason.
@@ -102,17 +105,25 @@ def choose_device(wanted: str, unfit: str = "") -> Device:
         raise UsageError(f'There is no device "{wanted[:20]}".', hint=f"Choose {', '.join(DEVICES)}.")
     if wanted == "cuda" and unfit:
         raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
-    if wanted == "cpu" or unfit:
+    if wanted == "cpu":
         return cpu()
     os.environ.setdefault(*CUBLAS_WORKSPACE)  # read when its first product is computed
-    missing = cuda_library.why_not() or cuda_library.cannot_compute()
+    missing = _why_not(unfit)
     if wanted == "cuda" and missing is not None:
         raise missing.error()
     if missing is not None:
+        if note is not None and cuda_driver.has_card():
+            note(f"the CPU computes, not the NVIDIA graphics card: {missing.reason} {missing.hint}".rstrip())
         return cpu()
     # NVIDIA's containers round what is multiplied to TF32's 10 bits (TORCH_ALLOW_TF32_CUBLAS_OVERRIDE); a sky has more.
     torch.backends.cuda.matmul.allow_tf32 = False
     return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
+
+
+def _why_not(unfit: str) -> cuda_library.NoCuda | None:
+    if unfit:
+        return cuda_library.NoCuda(unfit, "")
+    return cuda_library.why_not() or cuda_library.cannot_compute()
 
 
 def free_bytes(tensors: torch.device) -> int | None:

@@ -47,7 +47,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         MachineError: if the device asked for is not there.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
-    device = choose_device(inputs.machine.device, config.unfit_for_cuda())
+    device = choose_device(inputs.machine.device, config.unfit_for_cuda(), report.note)
     dataset = inputs["undistort.dataset"]
     views = load_views(dataset)
     start = read_start(inputs["initialize.splat"])
