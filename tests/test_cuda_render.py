@@ -284,14 +284,14 @@ def test_a_larger_device_holds_more_pairs_at_a_time_within_limits() -> None:
     assert sizes == [1 << 22, 1 << 22, 1 << 23, 3 << 23, 141 << 20, 1 << 28]
 
 
-def test_a_memory_limit_is_shared_as_a_smaller_device_is(kernels):
-    kernels.forecast.most_pairs = most_pairs_of(141 << 30)
+def test_a_memory_limit_is_shared_as_a_smaller_device_is_as_long_as_it_lasts(kernels):
+    kernels.forecast.most_pairs = most_pairs_of(24 << 30)
     with use_kernels(kernels):
-        cpu().limit_memory(0)
-        assert kernels.forecast.most_pairs == most_pairs_of(141 << 30)
-        for limit_bytes in (8 << 30, 24 << 30):  # what is less stays
-            cpu().limit_memory(limit_bytes)
-            assert kernels.forecast.most_pairs == most_pairs_of(8 << 30)
+        for limit_bytes, least in ((0, 24 << 30), (8 << 30, 8 << 30), (141 << 30, 24 << 30)):  # what is less stays
+            with pytest.raises(MachineError), cpu().memory_limit(limit_bytes):
+                assert kernels.forecast.most_pairs == most_pairs_of(least)
+                raise MachineError("It fails.")
+            assert kernels.forecast.most_pairs == most_pairs_of(24 << 30)
 
 
 def test_forecast_grows_with_the_model_and_the_picture_and_keeps_to_its_limit():

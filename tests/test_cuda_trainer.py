@@ -130,10 +130,10 @@ def test_a_limit_of_memory_holds_and_is_answered_by_less_at_a_time(device: Devic
     torch.cuda.empty_cache()
     limit = torch.cuda.memory_allocated() + 96 * MEGABYTE
     torch.cuda.reset_peak_memory_stats()
-    device.limit_memory(limit)
-    free = free_bytes(device.tensors)
-    assert free is not None and 0 < free <= 96 * MEGABYTE
-    silent = Silent()
-    for photo in given:
-        iterate_within_memory(iterate, training, plan, photo, silent)
+    with device.memory_limit(limit):
+        free = free_bytes(device.tensors)
+        assert free is not None and 0 < free <= 96 * MEGABYTE
+        silent = Silent()
+        for photo in given:
+            iterate_within_memory(iterate, training, plan, photo, silent)
     assert training.iteration == 3 and torch.cuda.max_memory_reserved() <= limit + 2 * MEGABYTE

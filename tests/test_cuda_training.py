@@ -19,6 +19,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.cuda_api import SplatShot
+from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
 from splatpipe.pipeline.raster.cuda_frame import shot_of
 from splatpipe.pipeline.raster.device import Device, cpu
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
@@ -304,6 +305,26 @@ def test_a_trial_for_a_budget_has_smaller_chunks_where_memory_is_short_too(
     monkeypatch.setattr(loop, "under_budgets", tried)
     _, recorder = trained(scene, tmp_path, ALL.model_copy(update={"iterations": 1}), kernels=kernels)
     assert recorder.warnings and all("smaller parts" in warning for warning in recorder.warnings)
+
+
+def test_a_memory_limit_is_the_trainings_alone(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernels, seen = kernels_on_cpu(), []
+    kernels.forecast.most_pairs = most_pairs_of(24 << 30)
+
+    def watched(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+        seen.append(kernels.forecast.most_pairs)
+        if len(seen) == 3:
+            raise MachineError("It fails.")
+        iterate(state, plan, photo)
+
+    monkeypatch.setattr(loop, "iterate", watched)
+    limited = ALL.model_copy(update={"iterations": 2, "max_memory_bytes": 8 << 30})
+    trained(scene, tmp_path / "whole", limited, kernels=kernels)
+    assert kernels.forecast.most_pairs == most_pairs_of(24 << 30)
+    with pytest.raises(MachineError, match="It fails"):
+        trained(scene, tmp_path / "failed", limited, kernels=kernels)
+    assert kernels.forecast.most_pairs == most_pairs_of(24 << 30)
+    assert seen == [most_pairs_of(8 << 30)] * 3
 
 
 def test_held_out_photos_are_measured_the_same(scene: Path, whole: Path, tmp_path: Path) -> None:

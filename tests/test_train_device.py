@@ -4,6 +4,7 @@ import json
 import sys
 import weakref
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -128,6 +129,18 @@ def test_a_limit_of_memory_is_the_devices_where_that_trains() -> None:
     assert memory.within_memory(plan, 1_000_000, 150, recorder, on_cuda=True).options.max_gaussians == 5000
     # 236 bytes of parameters and 472 of moments, 12 of statistics; a tenth of a million more fit than on the CPU.
     assert 708 + 12 < each < memory.bytes_per_gaussian(TrainConfig())
+
+
+def test_a_devices_share_of_memory_is_the_whole_again_after_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares: list[float] = []
+    monkeypatch.setattr(devices, "kernels_of", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=8000))
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda share, device: shares.append(share))
+    device = Device("cuda", torch.device("cuda", 0))
+    for limit in (2000, 9000, 0):
+        with pytest.raises(MachineError), device.memory_limit(limit):
+            raise MachineError("It fails.")
+    assert shares == [0.25, 1.0, 1.0, 1.0]
 
 
 def test_colours_are_the_same_numbers_on_a_device() -> None:

@@ -56,18 +56,30 @@ class Device:
         if self.tensors.type == "cuda":
             torch.cuda.synchronize(self.tensors)
 
-    def limit_memory(self, limit_bytes: int) -> None:
-        """Let tensors take no more of the device's own memory from now on.
+    @contextmanager
+    def memory_limit(self, limit_bytes: int) -> Iterator[None]:
+        """Let tensors take no more of the device's own memory, as long as this lasts.
 
         Args:
             limit_bytes: The most; 0 for all of it.
         """
-        kernels = kernels_of(self.tensors)
-        if kernels is not None and limit_bytes:  # pairs get their share of the limit, not of the card
-            kernels.forecast.most_pairs = min(kernels.forecast.most_pairs, most_pairs_of(limit_bytes))
-        if self.tensors.type == "cuda":
+        if not limit_bytes:
+            yield
+            return
+        kernels, on_cuda = kernels_of(self.tensors), self.tensors.type == "cuda"
+        before = 0 if kernels is None else kernels.forecast.most_pairs
+        if kernels is not None:  # pairs get their share of the limit, not of the card
+            kernels.forecast.most_pairs = min(before, most_pairs_of(limit_bytes))
+        if on_cuda:
             whole = torch.cuda.get_device_properties(self.tensors).total_memory
-            torch.cuda.set_per_process_memory_fraction(min(1.0, limit_bytes / whole) if limit_bytes else 1.0)
+            torch.cuda.set_per_process_memory_fraction(min(1.0, limit_bytes / whole), self.tensors)
+        try:
+            yield
+        finally:
+            if kernels is not None:
+                kernels.forecast.most_pairs = before
+            if on_cuda:
+                torch.cuda.set_per_process_memory_fraction(1.0, self.tensors)
 
     @contextmanager
     def one_order(self) -> Iterator[None]:

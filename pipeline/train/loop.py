@@ -64,8 +64,8 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         decided = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
         return under_budgets(free.of(decided), replace(scene, config=decided, sky=sky), step, report)
 
-    with same_bits(inputs.machine.threads), device.one_order():
-        device.limit_memory(config.max_memory_bytes)
+    limit = device.memory_limit(config.max_memory_bytes)
+    with same_bits(inputs.machine.threads), device.one_order(), limit:
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
         plan = load_or_write_plan(out / "plan.json", make)
         write_durably(out / "rendering.json", plan.rendering().to_json())
