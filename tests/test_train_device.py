@@ -27,7 +27,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.techniques import Techniques
-from splatpipe.pipeline.train.upload import colours_of
+from splatpipe.pipeline.train.upload import QUEUED, Upload, Uploader, colours_of
 from splatpipe.stages import initialize, train
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
@@ -141,6 +141,30 @@ def test_a_devices_share_of_memory_is_the_whole_again_after_a_limit(monkeypatch:
         with pytest.raises(MachineError), device.memory_limit(limit):
             raise MachineError("It fails.")
     assert shares == [0.25, 1.0, 1.0, 1.0]
+
+
+def test_the_host_is_a_few_iterations_ahead_of_a_device_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    log: list[str] = []
+
+    class Event:
+        def __init__(self, **how: bool) -> None:
+            self.name = ""
+
+        def record(self, stream: object) -> None:
+            self.name = f"{len([line for line in log if line.startswith('queue')])}"
+
+        def synchronize(self) -> None:
+            log.append(f"wait {self.name}")
+
+    uploader = Uploader(torch.device("cpu"))
+    monkeypatch.setattr(uploader, "_stream", object())
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+    for number in range(QUEUED + 3):
+        uploader.end(Upload(torch.zeros(2, 2, 3, dtype=torch.uint8), None, None))
+        log.append(f"queue {number}")
+    begun = [f"queue {number}" for number in range(QUEUED)]
+    assert log == begun + [line for n in range(3) for line in (f"wait {n}", f"queue {n + QUEUED}")]
 
 
 def test_colours_are_the_same_numbers_on_a_device() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -11,6 +13,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.photos.images import Mask, Pixels
 
+QUEUED = 3  # iterations that wait for the device at most: enough for it never to wait, and few photos beside them
 STEP = float(np.float32(1.0 / 255.0))  # of 8 bits: the same float32 wherever it is multiplied by
 
 
@@ -33,7 +36,8 @@ class Uploader:
     """Takes photos to where they are trained on.
 
     To a CUDA device they go from pinned memory, 8 bits a value, on a stream of their own: neither the host nor what is
-    computed meanwhile waits for them.
+    computed meanwhile waits for them. Only where the host is ``QUEUED`` iterations ahead does it wait, for the oldest
+    of them: each holds its photo on the device, and the queue of launches has room for dozens.
 
     Args:
         device: Where to.
@@ -41,6 +45,7 @@ class Uploader:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
+        self._lead = Lead(QUEUED)
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def begin(self, pixels: Pixels, mask: Mask | None) -> Upload:
@@ -69,6 +74,11 @@ class Uploader:
         """A photo that is there when the device comes to it, its colours in [0, 1]; from the thread that computes."""
         if self._stream is None:
             return upload.colour, upload.mask
+        begun = torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
+        begun.record(
+            torch.cuda.current_stream(self._device)
+        )  # happens when the iterations before this photo's are done
+        self._lead.add(begun)
         if upload.sent is None:
             colour, mask = self._sent(upload.colour, upload.mask)
             return colours_of(colour), mask
@@ -83,6 +93,32 @@ class Uploader:
         """Copies on the device, made in the order of the current stream."""
         there = colour.to(self._device, non_blocking=True)
         return there, None if mask is None else mask.to(self._device, non_blocking=True)
+
+
+@runtime_checkable
+class Event(Protocol):
+    """As ``torch.cuda.Event``."""
+
+    def synchronize(self) -> None:
+        """Wait until it has happened."""
+
+
+class Lead:
+    """Keeps the host from running ahead of a device without end, and the device busy all the same.
+
+    Args:
+        most: Events that may not have happened yet.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._ahead: deque[Event] = deque()
+
+    def add(self, event: Event) -> None:
+        """Take what the device comes to later than all before; waits for the oldest where there are too many."""
+        self._ahead.append(event)
+        if len(self._ahead) > self._most:
+            self._ahead.popleft().synchronize()
 
 
 def colours_of(pixels: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
