@@ -18,7 +18,6 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_api import SplatShot
 from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
 from splatpipe.pipeline.raster.cuda_frame import shot_of
 from splatpipe.pipeline.raster.device import Device, cpu
@@ -41,7 +40,7 @@ sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 from building import FORWARD, SHUFFLED, build_on_cpu, load
-from on_cpu import kernels_on_cpu, library_on_cpu
+from on_cpu import ShortOfMemory, kernels_on_cpu, library_on_cpu
 
 ON_CUDA = Device("cuda", torch.device("cpu"))  # as long as kernels of the harness are used
 QUICK = tiny_scene.plain(iterations=30, max_gaussians=400, exposure="affine", antialias=True)
@@ -234,24 +233,6 @@ def make_small_plan(config: TrainConfig) -> Plan:
     return make_plan(config, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
 
 
-class ShortOfMemory(CudaKernels):
-    """Kernels whose device has little memory for a frame, or for its backward pass."""
-
-    most_bytes, most_frame_bytes = 1 << 40, 1 << 40
-
-    def frame_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
-        size = super().frame_bytes(shot, count, capacity)
-        if size > self.most_frame_bytes:
-            raise torch.OutOfMemoryError("out of memory")
-        return size
-
-    def back_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
-        size = super().back_bytes(shot, count, capacity)
-        if size > self.most_bytes:
-            raise torch.OutOfMemoryError("out of memory")
-        return size
-
-
 def test_short_memory_makes_chunks_smaller_then_the_model_and_then_is_told(
     scene: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +286,37 @@ def test_a_trial_for_a_budget_has_smaller_chunks_where_memory_is_short_too(
     monkeypatch.setattr(loop, "under_budgets", tried)
     _, recorder = trained(scene, tmp_path, ALL.model_copy(update={"iterations": 1}), kernels=kernels)
     assert recorder.warnings and all("smaller parts" in warning for warning in recorder.warnings)
+
+
+def test_memory_that_ends_while_the_model_changes_ends_the_training_at_the_checkpoint_before(
+    scene: Path, whole: Path, tmp_path: Path
+) -> None:
+    kernels = ShortOfMemory(library_on_cpu(), torch.device("cpu"))
+    begun: list[int] = []
+
+    def half(adam: state.Adam, rows: Tensor) -> None:
+        begun.append(len(rows))
+        adam.mean["means"] = adam.mean["means"][rows]
+        raise torch.OutOfMemoryError("out of memory")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
+        patch.setattr(state.Adam, "select", half)
+        with pytest.raises(MachineError, match="does not hold"):
+            trained(scene, tmp_path, ALL, kernels=kernels)
+        assert len(begun) == 1  # and not again
+        plan = Plan.from_json((tmp_path / "plan.json").read_text())
+        left = load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest())
+        assert left.facts["iteration"] == plan.schedule.density.first - 1
+        patch.setattr(shortage, "FEWEST_GAUSSIANS", 10)
+        kernels.most_bytes = 1000
+        with pytest.raises(MachineError, match="does not hold even"):
+            trained(scene, tmp_path, ALL, kernels=kernels)
+        assert len(begun) == 2
+        assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts == left.facts
+    trained(scene, tmp_path, ALL)
+    assert parts_of(tmp_path) == parts_of(whole)
 
 
 def test_a_memory_limit_is_the_trainings_alone(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,6 +107,37 @@ def test_a_checkpoint_fetches_one_array_at_a_time_and_is_the_file_of_all_at_once
     assert list(again) == list(checkpoint.arrays)
 
 
+def test_memory_that_ends_while_rows_are_moved_is_no_shortage_to_be_answered() -> None:
+    class Tight(Tensor):
+        looks = 0
+
+        def __getitem__(self, rows: object) -> Tensor:
+            if isinstance(rows, Tensor):
+                Tight.looks += 1
+                if Tight.looks == 3:
+                    raise torch.OutOfMemoryError("out of memory")
+            return super().__getitem__(rows)
+
+    values, rows = torch.randn(40, 48, generator=torch.Generator().manual_seed(3)), torch.arange(40).flip(0)
+    tensor = values.clone().as_subclass(Tight)
+    with pytest.raises(MachineError, match="40 Gaussians") as failure:  # which no part of a training answers
+        taken_in_place(tensor, rows)
+    assert not isinstance(failure.value, torch.OutOfMemoryError)
+    assert torch.equal(tensor.as_subclass(Tensor)[:, :16], values[rows, :16])  # two of six times
+    Tight.looks = 2
+    tensor = values.clone().as_subclass(Tight)
+    with pytest.raises(torch.OutOfMemoryError):  # before anything was moved
+        taken_in_place(tensor, rows)
+    assert torch.equal(tensor.as_subclass(Tensor), values)
+
+
+def test_the_cpus_rows_are_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(devices, "taken_in_place")
+    values, rows = torch.arange(120.0).reshape(40, 3), torch.arange(40).flip(0)
+    take_rows(tensors := {"a": values.clone()}, rows)
+    assert torch.equal(tensors["a"], values[rows])
+
+
 def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.MonkeyPatch) -> None:
     model = tiny_scene.true_model(100)
     each = memory.device_bytes_per_gaussian(3)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.raster import cuda_driver, cuda_library, rasterizer
 from splatpipe.pipeline.raster.cuda import kernels_of
@@ -154,6 +154,10 @@ def take_rows(tensors: dict[str, Tensor], rows: Int[Tensor, " m"] | Bool[Tensor,
     Args:
         tensors: By name; changed.
         rows: An index or a mask.
+
+    Raises:
+        torch.OutOfMemoryError: if memory ends; some of the tensors have the rows, and the others do not.
+        MachineError: if it ends within a tensor, which is lost.
     """
     for name in tuple(tensors):
         tensors[name] = _taken(tensors, name, rows)
@@ -162,23 +166,40 @@ def take_rows(tensors: dict[str, Tensor], rows: Int[Tensor, " m"] | Bool[Tensor,
 def taken_in_place(tensor: Float[Tensor, "n ..."], rows: Int[Tensor, " m"]) -> Float[Tensor, "m ..."]:
     """Rows of a tensor in its own memory, some columns at a time: at its cap, a model needs no second one.
 
+    Never to be tried again where it fails midway: then some columns have the new rows and the others the old ones. So
+    that is no OutOfMemoryError, which a training answers, but one that ends it, without a checkpoint of what is left.
+    The CPU does without this: there rows are copied.
+
     Args:
         tensor: Contiguous; overwritten.
         rows: No more than it has.
+
+    Raises:
+        torch.OutOfMemoryError: if memory is too short to begin; the tensor is as it was.
+        MachineError: if memory ends midway; the tensor is lost.
     """
     flat = tensor.view(len(tensor), -1)
     for first in range(0, flat.shape[1], COLUMNS):
         columns = flat[:, first : first + COLUMNS]
-        columns[: len(rows)] = columns[rows]
+        try:
+            moved = columns[rows]
+        except torch.OutOfMemoryError as error:
+            if first == 0:
+                raise
+            raise MachineError(
+                f"The graphics card's memory ended while {len(rows):,} Gaussians were moved in it.",
+                hint="Close what else uses the card, or lower train.max_gaussians; run again to go on from here.",
+            ) from error
+        columns[: len(rows)] = moved
+        del moved  # before the next ones
     return tensor[: len(rows)]
 
 
 def _taken(tensors: dict[str, Tensor], name: str, rows: Tensor) -> Tensor:
     count = len(tensors[name])
-    if tensors[name].is_cuda and rows.dtype == torch.int64 and MOST * count <= len(rows) <= count:
-        return taken_in_place(tensors[name], rows)
+    in_place = tensors[name].is_cuda and rows.dtype == torch.int64 and MOST * count <= len(rows) <= count
     try:
-        return tensors[name][rows]
+        return taken_in_place(tensors[name], rows) if in_place else tensors[name][rows]
     except torch.OutOfMemoryError:  # old and new do not fit side by side: the old one waits in the host's memory
         device = tensors[name].device
         tensors[name] = tensors[name].cpu()

@@ -56,15 +56,14 @@ def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: Trai
 
 
 def _fits(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto) -> bool:
-    steps, model = state.adam.step_count, weakref.ref(state.gaussians)  # density control wants the old one's memory
+    steps, count = state.adam.step_count, len(state.gaussians)
+    model = weakref.ref(state.gaussians)  # density control wants the old one's memory
     try:
         step(state, plan, photo)
     except torch.OutOfMemoryError as error:
         if state.adam.step_count == steps and state.gaussians is model():
             return False
-        raise MachineError(
-            f"The graphics card's memory does not hold {len(state.gaussians):,} Gaussians.", hint=HINT
-        ) from error
+        raise MachineError(f"The graphics card's memory does not hold {count:,} Gaussians.", hint=HINT) from error
     return True
 
 
@@ -77,7 +76,10 @@ def _take_less(state: TrainState, kernels: CudaKernels | None, report: Reporter)
     if fewer >= count:
         raise MachineError(f"The graphics card's memory does not hold even {count:,} Gaussians.", hint=HINT)
     state.history.growth_ended = state.history.growth_ended or max(1, state.iteration)
-    state.keep_most_opaque(fewer)
+    try:
+        state.keep_most_opaque(fewer)
+    except torch.OutOfMemoryError as error:  # the model may be half the old one
+        raise MachineError(f"The graphics card's memory does not hold even {fewer:,} Gaussians.", hint=HINT) from error
     report.warning(
         f"The graphics card's memory does not hold {count:,} Gaussians: the training goes on with the "
         f"{fewer:,} most opaque, and adds none from iteration {now:,} on.",

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from splatpipe.pipeline.raster.cuda import CudaKernels
+from splatpipe.pipeline.raster.cuda_api import SplatShot
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -24,3 +25,21 @@ def library_on_cpu() -> CudaLibrary:
 def kernels_on_cpu() -> CudaKernels:
     """For ``cuda.use_kernels``, with a forecast of its own."""
     return CudaKernels(library_on_cpu(), torch.device("cpu"))
+
+
+class ShortOfMemory(CudaKernels):
+    """Kernels whose device has little memory for a frame, or for its backward pass."""
+
+    most_bytes, most_frame_bytes = 1 << 40, 1 << 40
+
+    def frame_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+        size = super().frame_bytes(shot, count, capacity)
+        if size > self.most_frame_bytes:
+            raise torch.OutOfMemoryError("out of memory")
+        return size
+
+    def back_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+        size = super().back_bytes(shot, count, capacity)
+        if size > self.most_bytes:
+            raise torch.OutOfMemoryError("out of memory")
+        return size
