@@ -12,19 +12,22 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
-from splatpipe.pipeline.engine.stage import Inputs
+from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster import cuda_driver, cuda_library
 from splatpipe.pipeline.raster import device as devices
 from splatpipe.pipeline.raster.cuda import use_kernels
-from splatpipe.pipeline.raster.device import Device, choose_device, take_rows, taken_in_place
-from splatpipe.pipeline.train import memory, state
+from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows, taken_in_place
+from splatpipe.pipeline.train import memory, planning, state
 from splatpipe.pipeline.train.checkpoint import HostArrays, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.densify import Growth, along_curve
 from splatpipe.pipeline.train.history import History
+from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.planning import Scene, pilot
+from splatpipe.pipeline.train.start import Start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.techniques import Techniques
 from splatpipe.pipeline.train.upload import QUEUED, Upload, Uploader, colours_of
@@ -196,6 +199,34 @@ def test_the_host_is_a_few_iterations_ahead_of_a_device_and_no_more(monkeypatch:
         log.append(f"queue {number}")
     begun = [f"queue {number}" for number in range(QUEUED)]
     assert log == begun + [line for n in range(3) for line in (f"wait {n}", f"queue {n + QUEUED}")]
+
+
+def budgeted(seconds: float, device: Device) -> tuple[Plan, Scene]:
+    config = TrainConfig(time_budget_s=seconds)
+    views = [View(camera, Path(), None) for camera in tiny_scene.cameras(4)]
+    plan = make_plan(config, views, tiny_scene.split_of(views), 100)
+    return plan, Scene(config, Start(tiny_scene.true_model(100), 100), views, 1, Machine(), device)
+
+
+def test_a_budgets_forecast_is_measured_where_a_device_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    free: list[int | None] = [None]
+    monkeypatch.setattr(planning, "free_bytes", lambda device: free[0])
+    cuda = Device("cuda", torch.device("cuda", 0))
+    found = [pilot(*budgeted(60.0, device)).options.max_gaussians for device in (cpu(), cuda)]
+    assert found == [9_000, 900_000]
+    assert pilot(*budgeted(6000.0, cuda)).options.max_gaussians == TrainConfig().max_gaussians
+    free[0] = 2 * 20_000 * memory.device_bytes_per_gaussian(3)
+    assert pilot(*budgeted(60.0, cuda)).options.max_gaussians == 20_000
+
+
+def test_a_trial_that_a_device_does_not_hold_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def measure(*given: object) -> object:
+        raise torch.OutOfMemoryError("out of memory")
+
+    monkeypatch.setattr(planning, "measure", measure)
+    with pytest.raises(MachineError, match=r"does not hold the trial .* of 9,000 Gaussians") as failure:
+        planning.within_time(*budgeted(60.0, cpu()), iterate, tiny_scene.Recorder())
+    assert "undistort.max_megapixels" in failure.value.hint
 
 
 def test_colours_are_the_same_numbers_on_a_device() -> None:
