@@ -13,10 +13,11 @@ import torch
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError
 from splatpipe.pipeline.engine.run_folder import Contents
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
-from splatpipe.pipeline.photos.images import reduced_view
+from splatpipe.pipeline.photos.images import Pixels, reduced_view
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.raster.device import choose_device, cpu
+from splatpipe.pipeline.raster.device import Device, choose_device, cpu
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import as_trained, placed, render_pixels
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
@@ -30,6 +31,10 @@ from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, vi
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
 JPEG_QUALITY = 92
 SKY = "sky.colours"  # array of a checkpoint
+RENDER_BYTES = 1000  # of a card's for a Gaussian: 236 of parameters, 201 of a frame, 8 pairs of 64
+LEFT_SHARE = (
+    0.25  # of a card's memory for the training there, which goes on with less for good where it once lacks some
+)
 
 
 @dataclass(frozen=True)
@@ -133,24 +138,57 @@ def held_out_of(opened: Contents) -> Sequence[str]:
         return ()
 
 
-def pictures(shown: Shown, view: View, threads: int) -> tuple[bytes, bytes]:
+def device_of(opened: Contents, logged: str) -> str:
+    """The device that the training was given; where it is not done, that of the run.
+
+    Args:
+        opened: The run.
+        logged: What its last run was given, by its log.
+    """
+    done = opened.artifacts.get("train")
+    machine = None if done is None else done.manifest.get("machine")
+    return str(machine.get("device", logged)) if isinstance(machine, Mapping) else logged
+
+
+def pictures(shown: Shown, view: View, threads: int, device: str = "auto") -> tuple[bytes, bytes]:
     """JPEGs of a render and of its photo, both of the size that is trained on.
 
-    Rendered on the graphics card where there is one, and what trains on it leaves room; it has all of that again then.
+    Args:
+        shown: The model.
+        view: The photo.
+        threads: Of the CPU.
+        device: Of the run: on the CPU where that is ``cpu``, else on the graphics card where there is one that what
+            trains there leaves room on; it has all of that again then.
 
     Raises:
         SplatpipeError: if the photo cannot be read.
     """
     camera, photo, _ = reduced_view(view, shown.megapixels)
-    model = (shown.gaussians, shown.sky)
     with same_bits(threads):
-        try:
-            render = render_pixels(placed(model, choose_device("auto")), camera, shown.options)
-        except (torch.OutOfMemoryError, MachineError):
-            render = render_pixels(placed(model, cpu()), camera, shown.options)
-        finally:
-            torch.cuda.empty_cache()  # does nothing where CUDA was not used
+        render = None if device == "cpu" else _on_card(shown, camera)
+        if render is None:
+            render = _rendered(shown, camera, cpu())
     return _jpeg(render), _jpeg(photo)
+
+
+def _on_card(shown: Shown, camera: Camera) -> Pixels | None:
+    """A render by the graphics card; None where there is none, or too little memory is free."""
+    try:
+        device = choose_device("auto")
+        if device.name == "cpu":
+            return None
+        free, whole = torch.cuda.mem_get_info(device.tensors)
+        if free - RENDER_BYTES * len(shown.gaussians) < LEFT_SHARE * whole:
+            return None
+        return _rendered(shown, camera, device)
+    except (torch.OutOfMemoryError, MachineError):
+        return None
+    finally:
+        torch.cuda.empty_cache()  # does nothing where CUDA was not used
+
+
+def _rendered(shown: Shown, camera: Camera, device: Device) -> Pixels:
+    return render_pixels(placed((shown.gaussians, shown.sky), device), camera, shown.options)
 
 
 def viewer(shown: Shown, source: Source, opened: Contents, name: str) -> tuple[str, bytes]:

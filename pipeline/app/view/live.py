@@ -132,6 +132,7 @@ class Live:
 
         with self._lock:
             opened, views = self._look()
+            device = checkpoint_render.device_of(opened, self._log.device)
         source = checkpoint_render.newest(opened)
         if source is None or not 0 <= number < len(views):
             return None
@@ -140,7 +141,7 @@ class Live:
         shown = self._load(source, opened)
         if shown.megapixels is None:
             shown = replace(shown, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
-        made = checkpoint_render.pictures(shown, views[number], RENDER_THREADS)
+        made = checkpoint_render.pictures(shown, views[number], RENDER_THREADS, device)
         self._pictures[source.stamp, number] = made
         while len(self._pictures) > MOST_PICTURES:
             self._pictures.popitem(last=False)

@@ -113,6 +113,7 @@ class RunLog:
         self.stages: dict[str, StageState] = {}
         self.curves: dict[str, Curve] = {}
         self.notes: list[dict[str, JSON]] = []
+        self.device = "auto"  # as the run was given it
         self.started_s: float | None = None
         self.last_s: float | None = None
         self.finished = False
@@ -159,6 +160,8 @@ class RunLog:
             stages = {str(name): StageState(str(name)) for name in data["stages"]}
             self._begin()
             self.started_s, self.last_s, self.stages = time_s, time_s, stages
+            machine = data.get("machine")
+            self.device = str(machine.get("device", "auto")) if isinstance(machine, Mapping) else "auto"
         elif kind == "run_finished":
             self.finished = True
         elif kind == "metric":

@@ -1,0 +1,109 @@
+"""Where the live page's pictures are rendered: as the run says, and never at the cost of what trains on the card."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatpipe.pipeline.app.view import checkpoint_render
+from splatpipe.pipeline.app.view.checkpoint_render import LEFT_SHARE, RENDER_BYTES, Shown, Source, device_of, pictures
+from splatpipe.pipeline.app.view.live import Live
+from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
+from splatpipe.pipeline.engine.store import Artifact
+from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.raster.device import Device, cpu
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
+from splatpipe.pipeline.render.rendering import Model, placed
+from splatpipe.stages.line import LINE
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+CARD = Device("cuda", torch.device("cpu"))  # stands for one: the CPU renders on it
+WHOLE = 8 << 30
+
+
+@pytest.fixture
+def view(tmp_path: Path) -> View:
+    tiny_scene.write_dataset(tmp_path / "dataset")
+    return load_views(tmp_path / "dataset")[0]
+
+
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A machine with a card, all of it free; the devices that models are placed on."""
+    places: list[str] = []
+
+    def watched(model: Model, device: Device) -> Model:
+        places.append(device.name)
+        return placed(model, device)
+
+    monkeypatch.setattr(checkpoint_render, "choose_device", lambda wanted: CARD)
+    monkeypatch.setattr(checkpoint_render, "placed", watched)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (WHOLE, WHOLE))
+    return places
+
+
+def shown() -> Shown:
+    return Shown(tiny_scene.true_model(), None, RenderOptions(3, depth=False), None, 0)
+
+
+def test_pictures_are_rendered_on_the_runs_device_as_far_as_its_memory_is_free(
+    view: View, card: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = pictures(shown(), view, 1, "cpu")
+    assert card == ["cpu"]
+    least = int(LEFT_SHARE * WHOLE) + RENDER_BYTES * tiny_scene.GAUSSIANS
+    for asked, free, place in (("auto", least, "cuda"), ("cuda", WHOLE, "cuda"), ("auto", least - 1, "cpu")):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device, free=free: (free, WHOLE))
+        card.clear()
+        assert pictures(shown(), view, 1, asked) == expected
+        assert card == [place]
+    monkeypatch.setattr(checkpoint_render, "choose_device", lambda wanted: cpu())
+    assert pictures(shown(), view, 1, "auto") == expected
+    assert card == ["cpu", "cpu"]
+
+
+def test_a_card_that_is_full_after_all_leaves_the_picture_to_the_cpu(
+    view: View, card: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = pictures(shown(), view, 1, "cpu")
+    watched = checkpoint_render.placed
+
+    def full(model: Model, device: Device) -> Model:
+        there = watched(model, device)
+        if device.name == "cuda":
+            raise torch.OutOfMemoryError("out of memory")
+        return there
+
+    monkeypatch.setattr(checkpoint_render, "placed", full)
+    assert pictures(shown(), view, 1, "auto") == expected
+    assert card == ["cpu", "cuda", "cpu"]
+
+
+def test_the_device_is_that_of_the_training_then_that_of_the_run() -> None:
+    assert device_of(Contents(), "cpu") == "cpu"
+    done = Artifact(Path("train"), {"machine": {"device": "cpu", "threads": 1}})
+    assert device_of(Contents({"train": done}), "auto") == "cpu"
+    assert device_of(Contents({"train": Artifact(Path("train"), {})}), "cuda") == "cuda"
+
+
+def test_the_page_renders_as_the_run_at_work_was_told(
+    view: View, card: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = Source(tmp_path, "checkpoint", "stamp", None)
+    monkeypatch.setattr(checkpoint_render, "newest", lambda opened: source)
+    monkeypatch.setattr(checkpoint_render, "load", lambda source, opened: shown())
+    monkeypatch.setattr(Live, "_look", lambda live: (live._log.read(), (Contents(), (view,)))[1])
+    for asked, machine in (("cpu", {"device": "cpu"}), ("cuda", {"device": "auto"}), ("cuda", 3)):
+        event = {"kind": "run_started", "stage": "", "data": {"stages": ["train"], "machine": machine}, "time_s": 1.0}
+        (tmp_path / "events.jsonl").write_text(json.dumps(event) + "\n")
+        live = Live(RunFolder(tmp_path, LINE))
+        card.clear()
+        try:
+            assert live.picture(0, "render")
+        finally:
+            live.close()
+        assert card == [asked]
