@@ -112,7 +112,7 @@ def test_a_checkpoint_fetches_one_array_at_a_time_and_is_the_file_of_all_at_once
 
 def test_memory_that_ends_while_rows_are_moved_is_no_shortage_to_be_answered() -> None:
     class Tight(Tensor):
-        looks = 0
+        looks, is_cuda = 0, True
 
         def __getitem__(self, rows: object) -> Tensor:
             if isinstance(rows, Tensor):
@@ -132,6 +132,12 @@ def test_memory_that_ends_while_rows_are_moved_is_no_shortage_to_be_answered() -
     with pytest.raises(torch.OutOfMemoryError):  # before anything was moved
         taken_in_place(tensor, rows)
     assert torch.equal(tensor.as_subclass(Tensor), values)
+    Tight.looks = 2
+    take_rows(tensors := {"sh": tensor}, rows)  # so the host's memory helps
+    assert Tight.looks > 3 and torch.equal(tensors["sh"].as_subclass(Tensor), values[rows])
+    Tight.looks = 0
+    with pytest.raises(MachineError, match="40 Gaussians"):
+        take_rows({"sh": values.clone().as_subclass(Tight)}, rows)
 
 
 def test_the_cpus_rows_are_copied(monkeypatch: pytest.MonkeyPatch) -> None:
