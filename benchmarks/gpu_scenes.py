@@ -56,8 +56,14 @@ def device() -> Iterator[torch.device]:
 
 
 def inputs(capture: str, device_name: str, threads: int = 2) -> Inputs:
-    """The stages' parts of a packed capture, by the line's names."""
+    """The stages' parts of a packed capture, by the line's names.
+
+    Raises:
+        FileNotFoundError: if it is not packed.
+    """
     folder = PACK / "captures" / capture
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{capture} is not in {PACK}: `gpu_day.py prepare` packs it, and it is carried here")
     parts = {name: folder / name for name in PARTS if (folder / name).exists()}
     return Inputs(parts, folder, machine=Machine(device_name, threads))
 

@@ -75,9 +75,7 @@ class Uploader:
         if self._stream is None:
             return upload.colour, upload.mask
         begun = torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
-        begun.record(
-            torch.cuda.current_stream(self._device)
-        )  # happens when the iterations before this photo's are done
+        begun.record(torch.cuda.current_stream(self._device))  # happens when the iterations before are done
         self._lead.add(begun)
         if upload.sent is None:
             colour, mask = self._sent(upload.colour, upload.mask)
