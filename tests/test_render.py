@@ -133,7 +133,8 @@ def test_the_ground_of_the_demo_faces_up(demo_run: Path, tmp_path: Path) -> None
     there = np.linalg.norm(normals, axis=3) > 0.5
     np.testing.assert_allclose(np.linalg.norm(normals[there], axis=1), 1.0, atol=1e-4)
     mean = normals[there].mean(axis=0)
-    assert mean[2] > 0.7 and np.linalg.norm(mean[:2]) < 0.1
+    length = np.linalg.norm(mean)  # 1 where all agree; a short training's lawn is rough
+    assert length > 0.5 and mean[2] / length > 0.99
 
 
 @pytest.mark.parametrize("what", ["colour", "depth", "normals"])
