@@ -36,7 +36,6 @@ from splatpipe.pipeline.app.cli_options import (
 from splatpipe.pipeline.app.cli_runs import (
     Overrides,
     RunSession,
-    available_cores,
     check_stage,
     existing,
     overrides,
@@ -53,6 +52,7 @@ from splatpipe.pipeline.engine.errors import (
     UsageError,
     exit_code,
 )
+from splatpipe.pipeline.engine.machine import available_cores
 
 app = typer.Typer(
     name="splatpipe",

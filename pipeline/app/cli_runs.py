@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.machine import available_cores
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runner import Runner
@@ -74,13 +75,6 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
         import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)
     return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def existing(out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0) -> Request:

@@ -8,6 +8,7 @@ import platform
 import shutil
 from pathlib import Path
 
+from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
 from splatpipe.pipeline.engine.runner import versions
 from splatpipe.pipeline.engine.stage import JSON
 
@@ -18,7 +19,7 @@ def examine() -> dict[str, JSON]:
 
     return {
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "cores": os.cpu_count(),
+        "cores": _cores(),
         "memory": _memory(),
         "free disk here": f"{shutil.disk_usage(Path.cwd()).free / 1e9:.0f} GB",
         **versions(),
@@ -38,10 +39,15 @@ def _cuda() -> str:
     return f"used: {device.described()}"
 
 
+def _cores() -> str:
+    """What runs may use, and what the machine has beyond that."""
+    usable, all_of_them = available_cores(), os.cpu_count() or 0
+    return f"{usable} of {all_of_them}, by a limit on this process" if usable < all_of_them else str(usable)
+
+
 def _memory() -> str:
-    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
-        return "unknown"
-    return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 1e9:.1f} GB"
+    usable, free = available_memory_bytes(), free_memory_bytes()
+    return f"{usable / 1e9:.1f} GB for this process, {free / 1e9:.1f} GB of it free" if usable else "unknown"
 
 
 def _version(package: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 import shutil
 import time
@@ -19,6 +18,7 @@ from splatpipe.pipeline.engine.config import settings_of
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, UsageError, exit_code
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
+from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
 from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary
 from splatpipe.pipeline.engine.store import MIN_FREE_BYTES, Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.worker import Task
@@ -327,5 +327,10 @@ def versions() -> dict[str, str]:
 
 
 def describe_machine() -> dict[str, JSON]:
-    """The machine, for the manifest: system, processor family, cores."""
-    return {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()}
+    """The machine, for the manifest: system, processor family, the cores and the memory that may be used of it."""
+    return {
+        "system": platform.system(),
+        "processor": platform.machine(),
+        "cores": available_cores(),
+        "memory_bytes": available_memory_bytes(),
+    }

@@ -1,0 +1,184 @@
+"""What this process may use of its machine: memory and processors, within the control groups that it runs in.
+
+A container, a Slurm job or a systemd unit sees the whole machine in ``/proc/meminfo`` and ``os.cpu_count``, and is
+killed or slowed down at its own limits. They stand in the files of its control groups, version 1 or 2, and of all
+groups above (https://docs.kernel.org/admin-guide/cgroup-v2.html, cgroup-v1/memory.html, scheduler/sched-bwc.html).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+MOST_CHARACTERS = 1 << 20  # of a file of the kernel's: a machine with thousands of mounts has less
+UNLIMITED_BYTES = 1 << 60  # more than any machine has: version 1 says "no limit" with a number of that size
+_OCTAL = re.compile(r"\\([0-7]{3})")  # as the kernel writes blanks in names of mounts
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A line of ``/proc/self/mountinfo``.
+
+    Attributes:
+        root: Of the file system that is mounted, what is seen at ``point``.
+        point: Where.
+        kind: Of file system, e.g. ``ext4``.
+        options: Of the mount, then of the file system.
+    """
+
+    root: str
+    point: str
+    kind: str
+    options: tuple[str, ...]
+
+
+def mounts(root: Path = Path("/")) -> list[Mount]:
+    """What is mounted, in the order in which it was; empty where the system does not say."""
+    return parse_mounts(_text(root / "proc/self/mountinfo"))
+
+
+def parse_mounts(text: str) -> list[Mount]:
+    """The mounts in a text like ``/proc/self/mountinfo``; lines that are none are passed over."""
+    found = []
+    for line in text.splitlines():
+        before, _, after = line.partition(" - ")
+        left, right = before.split(" "), after.split(" ")
+        if len(left) >= 6 and len(right) >= 2:
+            options = (*left[5].split(","), *(right[2].split(",") if len(right) > 2 else ()))
+            found.append(Mount(_plain(left[3]), _plain(left[4]), right[0], options))
+    return found
+
+
+def available_cores(root: Path = Path("/")) -> int:
+    """Processors that this process may use: those that it is bound to, and no more than its groups give it time of.
+
+    Args:
+        root: Where ``proc`` and ``sys`` lie.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    shares = [share for folder in _groups(root, "cpu") if (share := _processors(folder)) is not None]
+    return max(1, min([cores, *(math.ceil(share) for share in shares)]))
+
+
+def available_memory_bytes(root: Path = Path("/")) -> int:
+    """Most memory that this process and those beside it in its groups may take together; 0 if nobody says.
+
+    Args:
+        root: Where ``proc`` and ``sys`` lie.
+    """
+    limits = [limit for folder in _groups(root, "memory") if (limit := _memory_limit(folder)) is not None]
+    return min([amount for amount in (_machine_memory(root, "MemTotal"), *limits) if amount], default=0)
+
+
+def free_memory_bytes(root: Path = Path("/")) -> int:
+    """How much more memory this process may take now without swapping or being killed; 0 if nobody says.
+
+    Args:
+        root: Where ``proc`` and ``sys`` lie.
+    """
+    machine = _machine_memory(root, "MemAvailable")
+    free = [machine] if machine else []
+    for folder in _groups(root, "memory"):
+        limit, used = _memory_limit(folder), _memory_used(folder)
+        if limit is not None and used is not None:
+            free.append(max(0, limit - used))
+    return min(free, default=0)
+
+
+def _groups(root: Path, controller: str) -> Iterator[Path]:
+    """Folders of this process's control groups that may limit something, and of all above them, innermost first."""
+    own = _own_groups(_text(root / "proc/self/cgroup"))
+    for mount in mounts(root):
+        if mount.kind == "cgroup2":
+            path = own.get("", "")
+        elif mount.kind == "cgroup" and controller in mount.options:
+            path = own.get(controller, "")
+        else:
+            continue
+        top = root / mount.point.lstrip("/")
+        folder = top / _below(path, mount.root)
+        yield folder
+        while folder != top:
+            folder = folder.parent
+            yield folder
+
+
+def _own_groups(text: str) -> dict[str, str]:
+    """Paths of the process's groups by controller, from ``/proc/self/cgroup``; version 2's has no name."""
+    found: dict[str, str] = {}
+    for line in text.splitlines():
+        _, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        found |= dict.fromkeys(controllers.split(","), path)
+    return found
+
+
+def _below(path: str, root: str) -> str:
+    """A group's path below what is mounted; the top where that is something else, as in a container of its own."""
+    inner = PurePosixPath(path)
+    if ".." in inner.parts or not inner.is_relative_to(root):
+        return ""
+    return inner.relative_to(root).as_posix()
+
+
+def _processors(folder: Path) -> float | None:
+    """Processors' worth of time that a group gets; None without a limit."""
+    quota, _, period = _text(folder / "cpu.max").strip().partition(" ")
+    if not quota:
+        quota, period = _text(folder / "cpu.cfs_quota_us"), _text(folder / "cpu.cfs_period_us")
+    share, per = _number(quota), _number(period)
+    return share / per if share and per else None
+
+
+def _memory_limit(folder: Path) -> int | None:
+    """Bytes at which a group's processes are slowed down or killed; None without a limit."""
+    names = ("memory.max", "memory.high", "memory.limit_in_bytes")
+    limits = [limit for name in names if (limit := _number(_text(folder / name)))]
+    return min((limit for limit in limits if limit < UNLIMITED_BYTES), default=None)
+
+
+def _memory_used(folder: Path) -> int | None:
+    """What a group has taken, without the file cache that goes first when memory gets short."""
+    for usage, cache in (("memory.current", "inactive_file"), ("memory.usage_in_bytes", "total_inactive_file")):
+        used = _number(_text(folder / usage))
+        if used is not None:
+            return max(0, used - (_field(_text(folder / "memory.stat"), cache) or 0))
+    return None
+
+
+def _machine_memory(root: Path, name: str) -> int:
+    """A line of ``/proc/meminfo`` in bytes; 0 if nobody says."""
+    told = _field(_text(root / "proc/meminfo"), f"{name}:")
+    if told is not None:
+        return told << 10
+    if name == "MemTotal" and "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
+        return int(os.sysconf("SC_PHYS_PAGES")) * int(os.sysconf("SC_PAGE_SIZE"))
+    return 0
+
+
+def _field(text: str, name: str) -> int | None:
+    """The number after a name at a line's beginning."""
+    words = next((words for line in text.splitlines() if (words := line.split())[:1] == [name]), [])
+    return _number(words[1]) if len(words) > 1 else None
+
+
+def _number(text: str) -> int | None:
+    """A count as the kernel writes it; None for ``max``, ``-1`` and what is none."""
+    digits = text.strip()
+    return int(digits) if digits.isascii() and digits.isdigit() and len(digits) <= 20 else None
+
+
+def _plain(name: str) -> str:
+    return _OCTAL.sub(lambda code: chr(int(code[1], 8)), name)
+
+
+def _text(path: Path) -> str:
+    """The beginning of a file; empty if it cannot be read."""
+    with suppress(OSError), path.open(encoding="utf-8", errors="surrogateescape") as file:
+        return file.read(MOST_CHARACTERS)
+    return ""
