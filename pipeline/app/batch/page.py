@@ -1,0 +1,217 @@
+"""A batch's page: a card a capture, true at any moment; while the batch is at work it loads itself again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+
+from splatpipe.pipeline.app.batch.state import STALE_S, BatchState, CaptureState, Level, State
+from splatpipe.pipeline.app.page_file import page_text, relative_link, shown
+from splatpipe.pipeline.app.report.wording import duration, plural, size
+from splatpipe.pipeline.app.thumbnails import Thumbnail, thumbnail
+from splatpipe.pipeline.engine.durable import write_durably
+
+TEMPLATES = Path(__file__).resolve().parent / "templates"
+REFRESH_S = 10  # as often as a reader would look; the batch renews the page somewhat less often
+PICTURE_SIDE = 480  # pixels, of a card on a good display
+SMALL_SIDE = 240  # where there are so many that the page would take long to load each time
+MANY = 60  # captures
+GROUPS: Sequence[tuple[State, str]] = (  # first what somebody has to see to
+    ("failed", "Failed"),
+    ("running", "Running"),
+    ("stopped", "Stopped"),
+    ("waiting", "Waiting"),
+    ("done", "Done"),
+    ("reused", "Finished before"),
+)
+STAGE_WORDS: Mapping[State, str] = {"running": "in {}", "failed": "in {}", "stopped": "in {}", "waiting": "before {}"}
+
+
+@dataclass(frozen=True)
+class Card:
+    """What is drawn of a capture.
+
+    Attributes:
+        name: As people can read it.
+        state: How it stands.
+        picture: Small; None where there is none.
+        stage: At which stage, in words; empty where there is nothing to say.
+        percent: Done of it; None where it does not run.
+        left: Done and left in words; empty where it does not run.
+        facts: Figures in words: photos, time, tries.
+        verdict: The report's headline.
+        level: How good that is.
+        reason: Why it failed or was stopped.
+        hint: What to do about it.
+        earlier: Why earlier tries ended.
+        links: Titles and addresses.
+    """
+
+    name: str
+    state: State
+    picture: Thumbnail | None
+    stage: str
+    percent: int | None
+    left: str
+    facts: str
+    verdict: str
+    level: Level
+    reason: str
+    hint: str
+    earlier: tuple[str, ...]
+    links: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Group:
+    """The captures in one state."""
+
+    state: State
+    title: str
+    cards: tuple[Card, ...]
+
+
+def write_page(state: BatchState, path: Path) -> None:
+    """Write a batch's page, whole or not at all.
+
+    Args:
+        state: Where the batch stands.
+        path: The page, in the batch's folder: pictures and links are sought beside it.
+
+    Raises:
+        OSError: if it cannot be written.
+        MachineError: if this installation lacks the page's script or style.
+    """
+    write_durably(path, batch_page(state, path.parent))
+
+
+def batch_page(state: BatchState, folder: Path) -> str:
+    """The page as one HTML text that needs nothing else.
+
+    Args:
+        state: Where the batch stands.
+        folder: The batch's.
+
+    Raises:
+        MachineError: if this installation lacks the page's script or style.
+    """
+    side = SMALL_SIDE if len(state.captures) > MANY else PICTURE_SIDE
+    groups = []
+    for standing, title in GROUPS:
+        cards = tuple(_card(it, folder, side) for it in state.captures if it.state == standing)
+        if cards:
+            groups.append(Group(standing, title, cards))
+    level, headline = _headline(state)
+    return page_text(
+        TEMPLATES,
+        "batch.html.j2",
+        style="batch.css",
+        script="batch.js" if state.at_work else None,
+        name=state.name,
+        at_work=state.at_work,
+        level=level,
+        headline=headline,
+        text=_text(state),
+        warnings=state.warnings,
+        unlisted=state.unlisted,
+        groups=groups,
+        total=len(state.captures),
+        written_s=state.as_of_s,
+        written=_moment(state.as_of_s),
+        silence_s=STALE_S,
+        refresh_s=REFRESH_S,
+    )
+
+
+def _headline(state: BatchState) -> tuple[Level, str]:
+    counts, total = state.counts, len(state.captures)
+    finished = counts.get("done", 0) + counts.get("reused", 0)
+    failed = counts.get("failed", 0)
+    lost = f", {failed:,} failed" if failed else ""
+    if state.at_work:
+        return ("bad" if failed else ""), f"At work: {finished:,} of {plural(total, 'capture')} finished{lost}"
+    if not total:
+        return "doubt", "There was no capture to work on"
+    if state.message:
+        return "bad", f"Ended early: {finished:,} of {plural(total, 'capture')} finished{lost}"
+    if state.all_succeeded:
+        doubtful = sum(capture.level in ("doubt", "bad") for capture in state.captures)
+        headline = "The capture succeeded" if total == 1 else f"All {total:,} captures succeeded"
+        if doubtful:
+            return "doubt", f"{headline}; {doubtful:,} to look at"
+        return "good", headline
+    if failed:
+        return "bad", f"{failed:,} of {plural(total, 'capture')} failed; {finished:,} finished"
+    return "doubt", f"Stopped: {finished:,} of {plural(total, 'capture')} finished"
+
+
+def _text(state: BatchState) -> str:
+    """When, for how long, and what it takes."""
+    until_s = state.as_of_s if state.ended_s is None else state.ended_s
+    told = [state.message, f"Began {_moment(state.began_s)}."]
+    if state.ended_s is not None:
+        told.append(f"Ended {_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")
+    elif state.left_s is not None:
+        told.append(f"About {duration(state.left_s)} to go, until {_moment(until_s + state.left_s)} (forecast).")
+    if state.free_bytes is not None and (state.at_work or not state.all_succeeded):
+        needed = f"; what is still to run takes about {size(state.needed_bytes)}" if state.needed_bytes else ""
+        told.append(f"{size(state.free_bytes)} are free on the disk{needed}.")
+    return " ".join(filter(None, told))
+
+
+def _card(capture: CaptureState, folder: Path, side: int) -> Card:
+    running = capture.state == "running"
+    facts = [plural(capture.photos, "photo") if capture.photos is not None else ""]
+    if capture.seconds > 0.0:
+        facts.append(duration(capture.seconds))
+    if capture.tries > 1:
+        facts.append(f"try {capture.tries}" if running else plural(capture.tries, "try", "tries"))
+    percent = round(100 * min(max(capture.progress, 0.0), 1.0))
+    left = f"{percent} %"
+    if capture.left_s is not None:
+        left += f", about {duration(capture.left_s)} left"
+    begun = capture.state != "waiting" or capture.progress > 0.0
+    return Card(
+        name=shown(capture.name),
+        state=capture.state,
+        picture=_picture(capture.picture, folder, side),
+        stage=STAGE_WORDS.get(capture.state, "").format(capture.stage) if capture.stage and begun else "",
+        percent=percent if running else None,
+        left=left if running else "",
+        facts=" · ".join(filter(None, facts)),
+        verdict=capture.verdict,
+        level=capture.level,
+        reason=capture.reason,
+        hint=capture.hint,
+        earlier=capture.earlier,
+        links=tuple(
+            (text, relative_link(target))
+            for text, target in (("Report", capture.report), ("Viewer", capture.viewer))
+            if _lies_in(folder, target)
+        ),
+    )
+
+
+def _picture(relative: str, folder: Path, side: int) -> Thumbnail | None:
+    return thumbnail(folder / relative, side) if _lies_in(folder, relative) else None
+
+
+def _lies_in(folder: Path, relative: str) -> bool:
+    """Whether it is a file below the folder: a page leads nowhere else."""
+    path = PurePosixPath(relative)
+    if not relative or path.is_absolute() or ".." in path.parts:
+        return False
+    try:
+        return (folder / path).is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _moment(seconds: float) -> str:
+    """A point in time by this machine's clock, with its zone."""
+    try:
+        return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
+    except (OverflowError, OSError, ValueError):
+        return "at an unknown time"

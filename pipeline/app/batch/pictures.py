@@ -1,0 +1,83 @@
+"""Which picture stands for a capture on its card: a render that training never saw, and until there is one a photo."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.app.report.holdings import open_holdings
+from splatpipe.pipeline.app.thumbnails import thumbnail
+from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.photos.names import PHOTO_SUFFIXES
+from splatpipe.pipeline.photos.photo_list import photo_root
+
+SIDE = 480  # pixels, of a card on a good display
+LOOKED_AT = 5  # photos, spread over the capture: some show little but sky, grass, or the ground before take-off
+
+
+def capture_picture(out: Path, photos: Path, kept: Path) -> Path | None:
+    """A small picture of a capture, of what there is of it now.
+
+    Args:
+        out: The folder of its results, which may not be there yet.
+        photos: Its photos.
+        kept: Folder that keeps the pictures of all captures; made where there is none.
+
+    Returns:
+        The picture in `kept`; it is written anew where another one is better now. None where there is nothing to show.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    source, orientation = _render(out) or (_photo(photos), 1)
+    if source is None:
+        return None
+    capture = hashlib.sha256(bytes(out.absolute())).hexdigest()[:16]
+    told = source.stat()
+    stamp = hashlib.sha256(f"{bytes(source)!r} {told.st_mtime_ns} {told.st_size}".encode()).hexdigest()[:16]
+    path = kept / f"{capture}-{stamp}.jpg"
+    if not path.is_file():
+        small = thumbnail(source, SIDE, orientation)
+        if small is None:
+            return None
+        kept.mkdir(parents=True, exist_ok=True)
+        write_durably(path, lambda file: file.write(base64.b64decode(str(small.picture).partition(",")[2])))
+    for other in kept.glob(f"{capture}-*.jpg"):
+        if other != path:
+            other.unlink(missing_ok=True)
+    return path
+
+
+def _render(out: Path) -> tuple[Path, int] | None:
+    """Of the held-out views that are like their photos the one with most to see, and how to turn it."""
+    try:
+        holdings = open_holdings(out)
+        folder = holdings.part("evaluate.views")
+        views: Sequence[Mapping[str, Any]] = holdings.read("evaluate.metrics").get("per_view", [])
+        if folder is None or not views:
+            return None
+        views = sorted(views, key=lambda view: -float(view.get("psnr_cc") or view.get("psnr") or 0.0))
+        renders = [(folder / f"{Path(str(view['file'])).name}.render.png", view) for view in views]
+        good = [(path, view) for path, view in renders[: (len(renders) + 1) // 2] if path.is_file()]
+        path, view = max(good, key=lambda render: render[0].stat().st_size)
+        photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
+        turned = {photo["name"]: int(photo.get("orientation") or 1) for photo in photos}
+        return path, turned.get(view["name"], 1)
+    except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # of a run that is not whole yet
+        return None
+
+
+def _photo(photos: Path) -> Path | None:
+    """Of photos spread over the capture the one with most to see."""
+    try:
+        root = photo_root(photos)
+        every = sorted(path for path in root.rglob("*") if path.suffix.lower().lstrip(".") in PHOTO_SUFFIXES)
+    except OSError:
+        return None
+    chosen = [every[len(every) * (2 * i + 1) // (2 * LOOKED_AT)] for i in range(LOOKED_AT)] if every else []
+    seen = ((len(small.picture), path) for path in dict.fromkeys(chosen) if (small := thumbnail(path, SIDE)))
+    return max(seen, default=(0, None))[1]

@@ -1,0 +1,247 @@
+"""The batch's page: one file, true while the batch runs and after it, whatever captures are called."""
+
+import base64
+import io
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, expect
+
+from splatpipe.demo import capture_path
+from splatpipe.pipeline.app.batch.page import REFRESH_S, batch_page, write_page
+from splatpipe.pipeline.app.batch.pictures import capture_picture
+from splatpipe.pipeline.app.batch.state import STALE_S, BatchState, CaptureState
+
+SCRIPT = '<script>document.title = "taken"</script><img src="http://example.org/x.png">&"\''
+HOSTILE = (SCRIPT, "two\nlines\r\t", "long" * 75, "\u202egpj.exe\u2066", "b\udcffd", "a#b?c%20d", "javascript:alert(1)")
+WIDTHS = ((1440, 900), (390, 844))
+
+
+def batch(*captures: CaptureState, **facts: object) -> BatchState:
+    return replace(BatchState("night", captures, as_of_s=time.time(), began_s=time.time() - 3600.0), **facts)
+
+
+def words(watched: object) -> str:
+    return " ".join(watched.page.evaluate("document.body.innerText").split())  # type: ignore[attr-defined]
+
+
+def full_batch(folder: Path) -> BatchState:
+    """A capture in each state, one of them with all that a card can have."""
+    whole = folder / "church"
+    whole.mkdir()
+    for name in ("report.html", "viewer.html"):
+        (whole / name).write_text("<!doctype html>")
+    Image.new("RGB", (900, 600), "green").save(whole / "best.jpg")
+    return batch(
+        CaptureState("lund", "failed", "sparse", reason="Only 3 of 29 photos could be placed.", hint="Add overlap.",
+                     tries=2, earlier=("train: killed by signal 9",), seconds=150.0, photos=29),
+        CaptureState("seneca", "running", "matches", progress=0.234, left_s=5400.0, photos=167, tries=1, seconds=70.0),
+        CaptureState("field", "stopped", "train", reason="The batch was stopped."),
+        CaptureState("copr", "waiting", "ingest"),
+        CaptureState("church", "done", verdict="Finished; 2 points to look at", level="doubt", seconds=1834.0,
+                     picture="church/best.jpg", report="church/report.html", viewer="church/viewer.html"),
+        CaptureState("roof", "reused", verdict="Finished", level="good"),
+        left_s=6000.0, free_bytes=81_000_000_000, needed_bytes=9_000_000_000, warnings=("Mind the disk.",),
+        unlisted=("old",),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("width", "height"), WIDTHS)
+def test_a_card_a_capture_fits_the_screen_and_asks_for_nothing(
+    tmp_path: Path, open_page: Callable, width: int, height: int
+) -> None:
+    write_page(full_batch(tmp_path), tmp_path / "batch.html")
+    watched = open_page((tmp_path / "batch.html").as_uri(), width=width, height=height, touch=width < 500)
+    assert (watched.requests, watched.errors) == ([], [])
+    assert watched.page.evaluate("document.documentElement.scrollWidth") <= width
+    cards = watched.page.locator(".capture")
+    assert cards.locator("h2").all_inner_texts() == ["lund", "seneca", "field", "copr", "church", "roof"]
+    said = words(watched)
+    assert "At work: 2 of 6 captures finished, 1 failed" in said and "About 1 h 40 min to go" in said
+    assert "81.00 GB are free on the disk; what is still to run takes about 9.00 GB" in said
+    assert "Only 3 of 29 photos could be placed. Add overlap." in said and "Mind the disk." in said
+    assert "Running in matches 23 %, about 1 h 30 min left" in said
+    assert watched.page.locator("progress").get_attribute("value") == "23"
+    church = cards.filter(has_text="church")
+    links = church.locator("a").evaluate_all("all => all.map(a => a.href)")
+    assert links == [(tmp_path / "church" / name).as_uri() for name in ("report.html", "viewer.html")]
+    assert cards.locator("a").count() == 2  # no other has a report yet
+    assert church.locator("img").evaluate("image => image.naturalWidth > 0 && image.naturalWidth <= 480")
+    for title in ("Failed", "Running", "Stopped", "Waiting", "Done", "Finished before"):
+        link = watched.page.locator(".counts a", has_text=title)
+        assert watched.page.locator(str(link.get_attribute("href"))).count() == 1
+    silent = watched.page.locator("[data-silent]")
+    expect(silent).to_be_hidden()
+
+
+@pytest.mark.parametrize(("width", "height"), WIDTHS)
+def test_hostile_names_and_messages_stay_text(tmp_path: Path, open_page: Callable, width: int, height: int) -> None:
+    captures = [
+        CaptureState(name, "failed", name, verdict=name, level="bad", reason=name, hint=name, earlier=(name,), tries=2,
+                     picture=f"{name}/x.jpg", report=f"../{name}", viewer=f"/etc/{name}")
+        for name in HOSTILE
+    ]  # fmt: skip
+    odd = tmp_path / "a#b?c%20d"
+    odd.mkdir()
+    (odd / "report.html").write_text("<!doctype html>")
+    captures[5] = replace(captures[5], report="a#b?c%20d/report.html", state="running")
+    (tmp_path.parent / SCRIPT.replace("/", "")).write_text("outside")
+    captures[0] = replace(captures[0], report=f"../{SCRIPT.replace('/', '')}", viewer=str(capture_path()))
+    state = batch(*captures, name=SCRIPT, message=SCRIPT, warnings=HOSTILE, unlisted=HOSTILE)
+    write_page(state, tmp_path / "batch.html")
+    watched = open_page((tmp_path / "batch.html").as_uri(), width=width, height=height, touch=width < 500)
+    assert (watched.requests, watched.errors) == ([], [])
+    assert watched.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert watched.page.locator("script").count() == 1
+    assert watched.page.title().startswith("▶ At work")  # not "taken"
+    assert words(watched).count('document.title = "taken"') >= 5
+    text = (tmp_path / "batch.html").read_text(encoding="utf-8")
+    assert "\u202e" not in text and "\u2066" not in text
+    links = watched.page.locator(".capture a").evaluate_all("all => all.map(a => a.href)")
+    assert links == [(odd / "report.html").as_uri()]
+
+
+def test_at_work_it_loads_itself_again_and_nothing_else(tmp_path: Path, open_page: Callable) -> None:
+    path = tmp_path / "batch.html"
+    state = batch(CaptureState("one", "running", "train", progress=0.25))
+    write_page(state, path)
+    path.write_text(path.read_text().replace(f'data-refresh="{REFRESH_S}"', 'data-refresh="1"'))
+    watched = open_page(path.as_uri())
+    end = replace(state, captures=(CaptureState("one", "done", progress=1.0),), ended_s=time.time(), exit_code=0)
+    write_page(end, path)
+    expect(watched.page.locator("h2").first).to_have_text("The capture succeeded")
+    assert (watched.requests, watched.errors) == ([], [])
+    assert watched.page.locator("script").count() == watched.page.locator("noscript").count() == 0  # and then no more
+    assert "1 h 00 min" in words(watched)
+
+
+def test_pause_stops_the_refresh(tmp_path: Path, open_page: Callable) -> None:
+    path = tmp_path / "batch.html"
+    write_page(batch(CaptureState("one", "running", "train")), path)
+    path.write_text(path.read_text().replace(f'data-refresh="{REFRESH_S}"', 'data-refresh="2"'))
+    watched = open_page(path.as_uri())
+    loads: list[str] = []
+    watched.page.on("load", lambda page: loads.append(page.url))
+    watched.page.get_by_role("button", name="Pause").click()
+    watched.page.wait_for_timeout(4500)
+    assert loads == []
+    watched.page.get_by_role("button", name="Go on refreshing").click()
+    watched.page.wait_for_event("load")
+
+
+def test_without_scripts_the_browser_itself_refreshes_it(tmp_path: Path, browser: Browser) -> None:
+    path = tmp_path / "batch.html"
+    write_page(batch(CaptureState("one", "running", "train")), path)
+    path.write_text(path.read_text().replace(f'refresh" content="{REFRESH_S}"', 'refresh" content="1"'))
+    with browser.new_context(java_script_enabled=False) as context:
+        page = context.new_page()
+        page.goto(path.as_uri())
+        write_page(batch(CaptureState("one", "failed", "train"), ended_s=time.time(), exit_code=3), path)
+        expect(page.locator("h2").first).to_have_text("1 of 1 capture failed; 0 finished")
+
+
+def test_a_page_that_nobody_renews_says_so_itself(tmp_path: Path, open_page: Callable) -> None:
+    """After a power cut nobody writes that the batch ended: the reader's clock tells."""
+    path = tmp_path / "batch.html"
+    write_page(batch(CaptureState("one", "running"), as_of_s=time.time() - STALE_S - 30.0), path)
+    watched = open_page(path.as_uri())
+    expect(watched.page.locator("[data-silent]")).to_be_visible()
+    assert "(1 min ago)" in words(watched) and "The same command goes on" in words(watched)
+
+
+@pytest.mark.parametrize(
+    ("captures", "facts", "level", "headline"),
+    [
+        (("done", "reused"), {"exit_code": 0}, "good", "All 2 captures succeeded"),
+        (("done", "failed", "failed"), {"exit_code": 1}, "bad", "2 of 3 captures failed; 1 finished"),
+        (("done", "stopped", "waiting"), {"exit_code": 130}, "doubt", "Stopped: 1 of 3 captures finished"),
+        (("done", "waiting"), {"exit_code": 4, "message": "The disk is full."}, "bad",
+         "Ended early: 1 of 2 captures finished"),
+        ((), {"exit_code": 0}, "doubt", "There was no capture to work on"),
+    ],
+)  # fmt: skip
+def test_the_headline_tells_how_it_ended(
+    tmp_path: Path, captures: tuple[str, ...], facts: dict[str, object], level: str, headline: str
+) -> None:
+    states = [CaptureState(f"c{i}", standing) for i, standing in enumerate(captures)]  # type: ignore[arg-type]
+    page = batch_page(batch(*states, ended_s=time.time(), **facts), tmp_path)
+    assert f'<section class="verdict {level}"' in page and f"<h2>{headline}</h2>" in page
+    assert "refresh" not in page and "<script>" not in page
+
+
+def test_finished_with_doubts_is_told_in_the_headline(tmp_path: Path) -> None:
+    captures = (CaptureState("a", "done", level="good"), CaptureState("b", "done", level="doubt"))
+    page = batch_page(batch(*captures, ended_s=time.time(), exit_code=0), tmp_path)
+    assert "<h2>All 2 captures succeeded; 1 to look at</h2>" in page
+
+
+def test_two_hundred_captures_stay_a_small_page(tmp_path: Path, open_page: Callable) -> None:
+    captures = []
+    for i in range(200):
+        name = f"capture-{i:03}"
+        (tmp_path / name).mkdir()
+        noise = Image.frombytes("RGB", (480, 360), os.urandom(480 * 360 * 3))
+        if i < 4:
+            noise.save(tmp_path / name / "x.jpg", quality=95)
+        else:
+            os.link(tmp_path / f"capture-00{i % 4}" / "x.jpg", tmp_path / name / "x.jpg")
+        captures.append(CaptureState(name, "done", verdict="Finished", level="good", picture=f"{name}/x.jpg"))
+    path = tmp_path / "batch.html"
+    write_page(batch(*captures), path)
+    assert path.stat().st_size < 12_000_000  # of pure noise; of photos a third
+    watched = open_page(path.as_uri(), width=390, height=844, touch=True)
+    assert (watched.requests, watched.errors) == ([], [])
+    assert watched.page.locator(".capture img").count() == 200
+
+
+def test_a_card_shows_a_render_and_before_there_is_one_a_photo(demo_run: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    photo = capture_picture(tmp_path / "none", capture_path(), kept)
+    assert photo is not None and photo.parent == kept
+    with Image.open(photo) as picture:
+        assert max(picture.size) == 480
+    out = tmp_path / "out"
+    out.symlink_to(demo_run)
+    render = capture_picture(out, capture_path(), kept)
+    assert render is not None
+    views = {path.name: path for path in demo_run.glob("stages/evaluate-*/views/*.render.png")}
+    with Image.open(render) as shown:
+        small = shown.convert("RGB")
+    off = {name: difference(small, path) for name, path in views.items()}
+    assert min(off.values()) < 6.0  # JPEG's
+    stamp = render.stat().st_mtime_ns
+    assert capture_picture(out, capture_path(), kept) == render and render.stat().st_mtime_ns == stamp
+    other = capture_picture(tmp_path / "none", demo_run, kept)
+    assert other is None and sorted(kept.iterdir()) == sorted({photo, render})  # each capture keeps its own
+
+
+def difference(small: Image.Image, path: Path) -> float:
+    """Mean grey values between a small picture and a large one."""
+    with Image.open(path) as large:
+        again = large.convert("RGB")
+    again.thumbnail((480, 480), Image.Resampling.BOX)
+    if again.size != small.size:
+        return 255.0
+    pairs = zip(small.tobytes(), again.tobytes(), strict=True)
+    return sum(abs(a - b) for a, b in pairs) / len(small.tobytes())
+
+
+def test_pictures_that_cannot_be_read_cost_nothing_but_themselves(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a.jpg").write_bytes(b"no picture")
+    (photos / "b.jpg").symlink_to(photos / "b.jpg")
+    assert capture_picture(tmp_path / "none", photos, tmp_path / "kept") is None
+    page = batch_page(batch(CaptureState("x", "done", picture="photos/a.jpg")), tmp_path)
+    assert "no picture</p>" in page and "data:image" not in page
+    whole = sorted(capture_path().glob("*.JPG"))[0].read_bytes()
+    (photos / "c.jpg").write_bytes(whole[: len(whole) // 2])  # the half that is there is shown
+    page = batch_page(batch(CaptureState("x", "done", picture="photos/c.jpg")), tmp_path)
+    code = page.split("data:image/jpeg;base64,")[1].split('"')[0]
+    with Image.open(io.BytesIO(base64.b64decode(code))) as picture:
+        assert picture.convert("L").crop((0, 0, 480, 100)).getextrema()[1] > 60
