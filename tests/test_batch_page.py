@@ -216,7 +216,7 @@ def test_a_card_shows_a_render_and_before_there_is_one_a_photo(demo_run: Path, t
     assert min(off.values()) < 6.0  # JPEG's
     stamp = render.stat().st_mtime_ns
     assert capture_picture(out, capture_path(), kept) == render and render.stat().st_mtime_ns == stamp
-    other = capture_picture(tmp_path / "none", demo_run, kept)
+    other = capture_picture(tmp_path / "none", tmp_path / "nowhere", kept)
     assert other is None and sorted(kept.iterdir()) == sorted({photo, render})  # each capture keeps its own
 
 
