@@ -251,7 +251,7 @@ def test_interrupt_ends_a_stage_that_ignores_signals(numbers: Path, out: Path) -
 def test_a_second_process_is_refused_and_told_who_works_there(
     numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatpipe.pipeline.engine.store.LOCK_PATIENCE_S", 0.2)
+    monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
     with run_in_background(numbers, out, steps=600, step_s=0.1) as process:
         assert process.stdout is not None
         process.stdout.readline()

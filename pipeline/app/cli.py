@@ -16,6 +16,7 @@ from splatpipe.pipeline.app.cli_options import (
     FpsOption,
     JsonOption,
     MaxMemoryOption,
+    NotifyOption,
     OutArgument,
     PathOption,
     PhotosArgument,
@@ -31,6 +32,7 @@ from splatpipe.pipeline.app.cli_options import (
     ThreadsOption,
     TimeBudgetOption,
     UntilOption,
+    WaitOption,
     WhatOption,
 )
 from splatpipe.pipeline.app.cli_runs import (
@@ -96,16 +98,19 @@ def run(
     device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
     seed: SeedOption = None,
+    wait: WaitOption = False,
+    notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Turn a folder of photos into a Gaussian splat; what is there and valid is reused."""
     from splatpipe.pipeline.engine.config import load_preset
 
     with Ending(out, as_json) as done:
+        done.notify_by(notify)
         assignments = with_budgets(assignments, time_budget, max_memory)
         resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
         again = stages_to_rerun(rerun or [], rerun_from, until)
-        with RunSession(request_of(photos, out, resolved, device, threads)) as runner:
+        with RunSession(request_of(photos, out, resolved, device, threads), wait) as runner:
             done.outcome = runner.outcome
             runner.walk(until=until, rerun=again)
 
@@ -120,14 +125,17 @@ def demo(
     device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
     seed: SeedOption = None,
+    wait: WaitOption = False,
+    notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run the line on the capture that ships with splatpipe, to see it work."""
     from splatpipe.demo import capture_path
 
     budgets = {"time_budget": time_budget, "max_memory": max_memory}
-    machine = {"device": device, "threads": threads, "seed": seed, "as_json": as_json}
-    run(capture_path(), out, preset, None, assignments, **budgets, **machine)  # type: ignore[arg-type]
+    machine = {"device": device, "threads": threads, "seed": seed}
+    ending = {"wait": wait, "notify": notify, "as_json": as_json}
+    run(capture_path(), out, preset, None, assignments, **budgets, **machine, **ending)  # type: ignore[arg-type]
 
 
 @app.command()
@@ -137,12 +145,15 @@ def stage(
     assignments: SetOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
+    wait: WaitOption = False,
+    notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run one stage again on an existing OUT, and nothing else."""
     with Ending(out, as_json) as done:
+        done.notify_by(notify)
         check_stage(name)
-        with RunSession(existing(out, overrides(None, assignments, None).tables, device, threads)) as runner:
+        with RunSession(existing(out, overrides(None, assignments, None).tables, device, threads), wait) as runner:
             done.outcome = runner.outcome
             runner.run_alone(name)
 
@@ -157,13 +168,16 @@ def georef(
     assignments: SetOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
+    wait: WaitOption = False,
+    notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Place a finished run anew: other control points, another CRS. What does not change is reused."""
     with Ending(out, as_json) as done:
+        done.notify_by(notify)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
         tables = [*control, *overrides(None, assignments, None).tables]
-        with RunSession(existing(out, tables, device, threads)) as runner:
+        with RunSession(existing(out, tables, device, threads), wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
 
@@ -253,13 +267,13 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the present configuration no longer asks for."""
     from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.engine.lock import locked
     from splatpipe.pipeline.engine.runner import survey
     from splatpipe.pipeline.engine.session import survey_line
-    from splatpipe.pipeline.engine.store import locked
 
     with Ending(out, as_json) as done:
         line, store = survey_line(existing(out))
-        with locked(store):
+        with locked(store.out, tell=say):
             keep = [(standing.stage.name, standing.key) for standing in survey(line, store)]
             removed, freed = store.remove_stale(keep)
         done.told = {"removed": removed, "freed_bytes": freed}

@@ -25,6 +25,17 @@ DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 ThreadsOption = Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. The result is the same.")]
 SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout at the end.")]
+WaitOption = Annotated[
+    bool, typer.Option("--wait", help="Wait where another splatpipe works in OUT, instead of being refused.")
+]
+NotifyOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="COMMAND",
+        help="A shell command called at the end, good or bad; it finds SPLATPIPE_STATE (done, failed, stopped), "
+        "SPLATPIPE_CAPTURE, SPLATPIPE_REPORT and SPLATPIPE_OUT in its environment.",
+    ),
+]
 PresetOption = Annotated[str, typer.Option(help="preview (minutes), standard or high.")]
 TimeBudgetOption = Annotated[
     str | None,

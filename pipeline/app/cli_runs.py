@@ -107,15 +107,15 @@ def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | N
 class RunSession:
     """An open session whose events go to the terminal, which is left tidy whatever happens."""
 
-    def __init__(self, request: Request) -> None:
-        self._request = request
+    def __init__(self, request: Request, wait: bool = False) -> None:
+        self._request, self._wait = request, wait
 
     def __enter__(self) -> Runner:
         from splatpipe.pipeline.app.console import RunConsole
         from splatpipe.pipeline.engine.session import open_session
 
         self._console = RunConsole()
-        self._session = open_session(self._request, self._console)
+        self._session = open_session(self._request, self._console, wait=self._wait)
         return self._session.__enter__()
 
     def __exit__(self, *error: Any) -> bool | None:

@@ -12,12 +12,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatpipe.pipeline.app.notice import TIME_LIMIT_S, State, check_command, notify
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, exit_code
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runner import Outcome
 
 STOP_S = 4.0  # after Ctrl-C the report is over, too: an end within five seconds is promised, on a busy machine as well
+
+NOTICE_S = 4.7  # and a notice has what is left of that time,
+LEAST_NOTICE_S = 0.5  # but at least this
 
 
 class Ending:
@@ -26,6 +30,7 @@ class Ending:
     outcome: Outcome | None = None
     told: Mapping[str, Any] | None = None
     _reported: Path | None = None
+    _command: str | None = None
 
     def __init__(self, out: Path, as_json: bool) -> None:
         self._out, self._as_json = out, as_json
@@ -33,6 +38,16 @@ class Ending:
 
     def __enter__(self) -> Ending:
         return self
+
+    def notify_by(self, command: str | None) -> None:
+        """Have a command of the user's called at the end, if there is one.
+
+        Raises:
+            UsageError: if it cannot be called.
+        """
+        if command is not None:
+            check_command(command)
+            self._command = command
 
     def __exit__(self, _kind: Any, error: BaseException | None, _traceback: Any) -> None:
         seconds = time.monotonic() - self._started_s
@@ -44,6 +59,22 @@ class Ending:
             self._show(self.outcome, seconds)
         if self._as_json:
             print_json({**self._as_object(error, seconds), **(self.told or {})})
+        if self._command is not None and not _insists(error):
+            self._notify(self._command, error)
+
+    def _notify(self, command: str, error: BaseException | None) -> None:
+        """Call it; what is wrong with it is told, and changes nothing about the run."""
+        from splatpipe.pipeline.app.console import say
+
+        state: State = "done" if error is None else "failed"
+        limit_s = TIME_LIMIT_S
+        if isinstance(error, Stopped | KeyboardInterrupt):
+            state = "stopped"
+            limit_s = max(LEAST_NOTICE_S, getattr(error, "at_s", time.monotonic()) + NOTICE_S - time.monotonic())
+        out = self._out.resolve()
+        trouble = notify(command, state, out.name, self._reported and self._reported.resolve(), out, limit_s)
+        if trouble:
+            say(trouble)
 
     def _report(self, error: BaseException | None) -> None:
         """Have the report written; what is wrong with it is told, and changes nothing about the run."""

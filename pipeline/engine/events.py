@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import math
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -97,18 +100,40 @@ class EventReporter:
 
 
 class EventLog:
-    """Appends events to ``events.jsonl``, one JSON object a line, progress thinned out."""
+    """Appends events to ``events.jsonl``, one JSON object a line, each whole or not there; progress thinned out."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("a", encoding="utf-8", buffering=1)
+        self._name = path.name
+        self._descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
         self._last_progress_s = 0.0
+        size = os.fstat(self._descriptor).st_size
+        if size and os.pread(self._descriptor, 1, size - 1) != b"\n":  # a machine that stopped in the middle of a line
+            os.write(self._descriptor, b"\n")
 
     def __call__(self, event: Event) -> None:
+        """Append an event.
+
+        Raises:
+            OSError: if the disk is full or gone; what is there ends with a whole line.
+        """
         if event.kind == "progress":
             if event.time_s - self._last_progress_s < LOGGED_PROGRESS_INTERVAL_S:
                 return
             self._last_progress_s = event.time_s
-        self._file.write(json.dumps(asdict(event)) + "\n")
+        line = f"{json.dumps(_finite(asdict(event)), allow_nan=False)}\n".encode()
+        size = os.fstat(self._descriptor).st_size
+        if os.write(self._descriptor, line) < len(line):
+            os.ftruncate(self._descriptor, size)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), self._name)
 
     def close(self) -> None:
-        self._file.close()
+        os.close(self._descriptor)
+
+
+def _finite(value: JSON) -> JSON:
+    """The value with null for numbers that JSON does not have."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(name): _finite(each) for name, each in value.items()}
+    return [_finite(each) for each in value] if isinstance(value, list | tuple) else value

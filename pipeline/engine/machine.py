@@ -10,13 +10,16 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 MOST_CHARACTERS = 1 << 20  # of a file of the kernel's: a machine with thousands of mounts has less
 UNLIMITED_BYTES = 1 << 60  # more than any machine has: version 1 says "no limit" with a number of that size
+# File systems that one machine has to itself, and on which its locks hold.
+LOCAL_DISKS = ("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "ntfs3", "vfat", "exfat")
+LOCAL_KINDS = frozenset((*LOCAL_DISKS, "overlay", "tmpfs", "ramfs"))
 _OCTAL = re.compile(r"\\([0-7]{3})")  # as the kernel writes blanks in names of mounts
 
 
@@ -51,6 +54,21 @@ def parse_mounts(text: str) -> list[Mount]:
         if len(left) >= 6 and len(right) >= 2:
             options = (*left[5].split(","), *(right[2].split(",") if len(right) > 2 else ()))
             found.append(Mount(_plain(left[3]), _plain(left[4]), right[0], options))
+    return found
+
+
+def mount_of(path: Path, among: Sequence[Mount] | None = None) -> Mount | None:
+    """The mount that a path lies in, which need not be there yet; None where the system does not say.
+
+    Args:
+        path: Any.
+        among: What is mounted, in order; now and here by default.
+    """
+    place = PurePosixPath(path.resolve())
+    found = None
+    for mount in mounts() if among is None else among:
+        if place.is_relative_to(mount.point) and (found is None or len(mount.point) >= len(found.point)):
+            found = mount  # the later of two at one place hides the other
     return found
 
 

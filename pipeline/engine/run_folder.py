@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.config import Table, known, load_file, resolve, settings_of
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.stage import Stage
 from splatpipe.pipeline.engine.store import Artifact, Part, Store, is_copy, open_store
 
@@ -65,7 +66,7 @@ class RunFolder:
     @property
     def at_work(self) -> bool:
         """Whether a splatpipe works in it now."""
-        return self.store.is_locked()
+        return is_locked(self.out)
 
     def settings(self) -> tuple[Path, Table]:
         """The photos' folder and the options as they were written.

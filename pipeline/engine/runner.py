@@ -231,7 +231,7 @@ class Runner:
         finally:
             told = {"message": "" if ended is None else str(ended), "hint": getattr(ended, "hint", "")}
             seconds = round(time.monotonic() - began_s, 3)
-            with suppress(OSError):  # a full disk is what ended it, and is told
+            with suppress(OSError, MachineError):  # a full disk, or a taken one, is what ended it, and is told
                 self.sink(Event("run_finished", data={"exit_code": exit_code(ended), **told, "seconds": seconds}))
 
     def _run(self, stage: Stage, inputs: StageInputs, parts: Mapping[str, Part], reason: str) -> Artifact:
@@ -265,7 +265,8 @@ class Runner:
                 }
                 artifact = self.store.commit(stage, inputs, partial, summary, run)
         except (SplatpipeError, Stopped, KeyboardInterrupt) as error:
-            self.sink(self._failed(inputs, time.monotonic() - began_s, error))
+            with suppress(OSError, MachineError):  # what cannot be logged has been shown
+                self.sink(self._failed(inputs, time.monotonic() - began_s, error))
             raise
         outcome.ran.append(stage.name)
         outcome.failed = ""
@@ -308,13 +309,28 @@ class Runner:
         try:
             yield
         except OSError as error:
+            self._check_places()
             raise MachineError(
-                f"Cannot write to {self.store.out}: {error.strerror}.",
+                f"Cannot write to {self.store.out}: {error.strerror or error}.",
                 hint="Make room or check the permissions, then run again: it goes on from here.",
             ) from error
         except StageError:
+            self._check_places()
             self._check_space()
             raise
+
+    def _check_places(self) -> None:
+        """What lies behind many an error: a disk that is no longer there."""
+        if not self.store.stages.is_dir():
+            raise MachineError(
+                f"{self.store.out} is gone.",
+                hint="Was its disk taken away, or the folder removed or renamed? Run again when it is back.",
+            )
+        if not self.line.photos_dir.is_dir():
+            raise SplatpipeError(
+                f"The photos' folder {self.line.photos_dir} is gone.",
+                hint="Bring it back, then run again: what was finished is kept.",
+            )
 
 
 def versions() -> dict[str, str]:

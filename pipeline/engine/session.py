@@ -17,11 +17,12 @@ from splatpipe.pipeline.engine.digests import HashTable
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
 from splatpipe.pipeline.engine.executor import Executor
+from splatpipe.pipeline.engine.lock import locked
 from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_FILE
 from splatpipe.pipeline.engine.runner import Line, Runner
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Machine, Stage
-from splatpipe.pipeline.engine.store import Part, Store, locked, open_store
+from splatpipe.pipeline.engine.store import Part, Store, open_store, unwritable
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,13 @@ class Request:
 
 
 @contextmanager
-def open_session(request: Request, show: Sink) -> Iterator[Runner]:
+def open_session(request: Request, show: Sink, *, wait: bool = False) -> Iterator[Runner]:
     """Everything that a run needs, held for its length.
 
     Args:
         request: What to run.
         show: Shows events to the user.
+        wait: Wait for another splatpipe that works there.
 
     Yields:
         The runner.
@@ -59,14 +61,19 @@ def open_session(request: Request, show: Sink) -> Iterator[Runner]:
     """
     source = open_source(request.photos, request.out, request.stages, request.config)
     store = open_store(request.out, create=True)
-    with locked(store) as lock:
-        log = EventLog(store.out / EVENTS_FILE)
-        executor = Executor(store.out / LOG_FILE, lock, _worker_environment(request.machine.threads))
+
+    def tell(message: str) -> None:
+        show(Event("note", data={"message": message}))
+
+    with locked(store.out, wait=wait, tell=tell) as hold:
+        log = _open_log(store)
+        executor = Executor(store.out / LOG_FILE, hold.descriptor, _worker_environment(request.machine.threads))
         try:
 
             def sink(event: Event) -> None:
+                show(event)  # first: a full disk takes the log, and not what is told
                 log(event)
-                show(event)
+                hold.confirm()
 
             digests = partial(_digests, request, store, EventReporter("source", sink), remember=True)
             line = _open_line(request, digests())
@@ -79,6 +86,13 @@ def open_session(request: Request, show: Sink) -> Iterator[Runner]:
             executor.close()
         finally:
             log.close()
+
+
+def _open_log(store: Store) -> EventLog:
+    try:
+        return EventLog(store.out / EVENTS_FILE)
+    except OSError as error:
+        raise unwritable(store.out, error) from error
 
 
 def survey_line(request: Request) -> tuple[Line, Store]:
@@ -106,8 +120,15 @@ def _digests(request: Request, store: Store, report: EventReporter, *, remember:
 
 
 def _worker_environment(threads: int) -> dict[str, str]:
-    """What libraries read at import: the size of their pools, which shall sleep and not spin; the order of sets."""
+    """What libraries read at import: the size of their pools, which shall sleep and not spin; the order of sets.
+
+    And that nobody reads their log on a terminal, whatever the user's own environment says of colours.
+    """
     return {
+        "NO_COLOR": "1",
+        "FORCE_COLOR": "",
+        "CLICOLOR_FORCE": "",
+        "TERM": "dumb",
         "OMP_NUM_THREADS": str(threads),
         "MKL_NUM_THREADS": str(threads),
         "OMP_WAIT_POLICY": "PASSIVE",

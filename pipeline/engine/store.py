@@ -1,15 +1,13 @@
-"""The artifacts of a run: keys, manifests, the lock, and the commit that makes them appear whole or not at all."""
+"""The artifacts of a run: keys, manifests, and the commit that makes them appear whole or not at all."""
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,8 +18,6 @@ from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
 FORMAT = 1  # of what lies under OUT; raised when older versions could no longer read it
 KEY_CHARACTERS = 16  # of a folder's name: 64 bits tell the few artifacts of one OUT apart
-LOCK_FILE = ".lock"  # below stages/; it stays there, and only who holds it works
-LOCK_PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
 MIN_FREE_BYTES = 16 << 20
 
 
@@ -106,22 +102,6 @@ class Store:
         found = [_read_artifact(folder) for folder in self.stages.glob(f"{stage}-*")]
         whole = [artifact for artifact in found if artifact is not None]
         return sorted(whole, key=lambda artifact: float(artifact.manifest["finished_s"]), reverse=True)
-
-    def is_locked(self) -> bool:
-        """Whether a splatpipe works here now."""
-        try:
-            descriptor = os.open(self.stages / LOCK_FILE, os.O_RDONLY | os.O_NOFOLLOW)
-        except OSError:
-            return False
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a run that begins now waits for longer
-        except BlockingIOError:
-            return True
-        except OSError:
-            return False
-        finally:
-            os.close(descriptor)
-        return False
 
     def working_folder(self, stage: Stage, key: str) -> Path:
         """Where a stage of that key works until it is done; it need not be there."""
@@ -325,15 +305,20 @@ def open_store(out: Path, *, create: bool) -> Store:
         store.partials.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=store.partials) as probe:
             probe.write(canonical(FORMAT))
+        format_file = store.stages / "format.json"
+        if not format_file.exists():
+            write_durably(format_file, json.dumps({"format": FORMAT}))
     except OSError as error:
-        raise MachineError(
-            f"Cannot write to {out}: {error.strerror}.",
-            hint="Check its permissions and the free space, or choose another OUT.",
-        ) from error
-    format_file = store.stages / "format.json"
-    if not format_file.exists():
-        write_durably(format_file, json.dumps({"format": FORMAT}))
+        raise unwritable(out, error) from error
     return store
+
+
+def unwritable(out: Path, error: OSError) -> MachineError:
+    """An OUT that cannot be written, from the first look on: full, read-only, another user's, gone."""
+    return MachineError(
+        f"Cannot write to {out}: {error.strerror or error}.",
+        hint="Check its permissions and the free space, or choose another OUT.",
+    )
 
 
 def _check_format(out: Path) -> None:
@@ -351,35 +336,3 @@ def _check_format(out: Path) -> None:
             f"{out} was made by a version of splatpipe with another layout ({found}; this one has {FORMAT}).",
             hint="Choose another OUT, or use the version that made it. Nothing in it was touched.",
         )
-
-
-@contextmanager
-def locked(store: Store) -> Iterator[int]:
-    """Hold the OUT for writing.
-
-    Yields:
-        The lock's file descriptor, for the worker to inherit: the lock lasts as long as either lives.
-
-    Raises:
-        UsageError: if another process works in it.
-    """
-    descriptor = os.open(store.stages / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        deadline = time.monotonic() + LOCK_PATIENCE_S
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    holder = os.pread(descriptor, 64, 0).decode(errors="replace").strip() or "unknown"
-                    raise UsageError(
-                        f"Another splatpipe (process {holder}) is working in {store.out}.",
-                        hint="Wait for it to end, or choose another OUT.",
-                    ) from None
-                time.sleep(0.1)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        yield descriptor
-    finally:
-        os.close(descriptor)

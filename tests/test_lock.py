@@ -1,0 +1,196 @@
+"""One splatpipe at a time in an OUT: on this machine by the kernel's lock, across machines by signs of life."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine import lock as engine_lock
+from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked
+from splatpipe.pipeline.engine.machine import Mount
+
+ELSEWHERE = {"process": 4711, "host": "node7", "boot": "another", "turn": "first"}
+PATIENCE_S = 60.0
+HOLDS = """
+import sys
+from pathlib import Path
+from splatpipe.pipeline.engine.lock import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.fixture
+def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An OUT's folder, and silence that is soon long enough."""
+    monkeypatch.setattr(engine_lock, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(engine_lock, "SILENCE_S", 1.5)
+    monkeypatch.setattr(engine_lock, "BEAT_S", 0.1)
+    monkeypatch.setattr(engine_lock, "LOOK_S", 0.02)
+    (tmp_path / "stages").mkdir()
+    return tmp_path
+
+
+@contextmanager
+def holder(out: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that holds the lock until it is told or killed."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(out)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None and process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+@contextmanager
+def at_work_elsewhere(out: Path) -> Iterator[threading.Event]:
+    """Another machine, whose lock this one does not see: it has signed the file and touches it."""
+    path, over = out / "stages" / LOCK_FILE, threading.Event()
+    path.write_text(json.dumps(ELSEWHERE))
+
+    def touch() -> None:
+        while not over.wait(0.05):
+            os.utime(path)
+
+    thread = threading.Thread(target=touch)
+    thread.start()
+    yield over
+    over.set()
+    thread.join()
+
+
+def test_who_holds_it_signs_it_and_takes_the_signature_back(out: Path) -> None:
+    path = out / "stages" / LOCK_FILE
+    with locked(out):
+        assert json.loads(path.read_text())["process"] == os.getpid()
+        assert is_locked(out)
+    assert path.read_text() == "" and not is_locked(out)
+
+
+def test_a_second_one_is_refused_and_a_killed_one_is_no_hindrance(out: Path) -> None:
+    with holder(out) as process:
+        assert is_locked(out)
+        with pytest.raises(UsageError, match=f"process {process.pid}\\) is working") as refused, locked(out):
+            pass
+        assert "--wait" in refused.value.hint
+        process.kill()
+        process.wait()
+        assert (out / "stages" / LOCK_FILE).read_text()  # still signed
+        told: list[str] = []
+        with locked(out, tell=told.append):
+            assert told == []  # the kernel knows that it is dead: nothing to look for
+
+
+def test_who_waits_is_told_whom_for_and_goes_on_when_that_one_ends(out: Path) -> None:
+    told: list[str] = []
+
+    def tell(text: str) -> None:
+        told.append(text)
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+
+    with holder(out) as process, locked(out, wait=True, tell=tell):
+        assert process.wait(PATIENCE_S) == 0
+    assert len(told) == 1 and f"process {process.pid}" in told[0]
+
+
+def test_another_machine_at_work_is_refused(out: Path) -> None:
+    with at_work_elsewhere(out):
+        assert is_locked(out)
+        with pytest.raises(UsageError, match="process 4711 on node7"), locked(out):
+            pass
+    assert json.loads((out / "stages" / LOCK_FILE).read_text()) == ELSEWHERE
+
+
+def test_another_machine_that_died_is_outlasted(out: Path) -> None:
+    (out / "stages" / LOCK_FILE).write_text(json.dumps(ELSEWHERE))
+    told: list[str] = []
+    began_s = time.monotonic()
+    with locked(out, tell=told.append):
+        assert time.monotonic() - began_s >= engine_lock.SILENCE_S
+    assert len(told) == 1 and "process 4711 on node7" in told[0]
+
+
+def test_another_machine_at_work_is_waited_for(out: Path) -> None:
+    told: list[str] = []
+    with at_work_elsewhere(out) as over:
+
+        def tell(text: str) -> None:
+            told.append(text)
+            if "waiting" in text:
+                over.set()
+
+        with locked(out, wait=True, tell=tell):
+            assert "waiting" in told[-1]
+
+
+def test_a_lock_that_is_given_back_elsewhere_is_taken_at_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine_lock, "SILENCE_S", 10 * PATIENCE_S)
+    path = out / "stages" / LOCK_FILE
+    path.write_text(json.dumps(ELSEWHERE))
+    began_s = time.monotonic()
+    with locked(out, tell=lambda _: path.write_text("")):
+        assert time.monotonic() - began_s < PATIENCE_S
+
+
+def test_who_slept_too_long_finds_its_place_taken_and_leaves_the_signature(out: Path) -> None:
+    path = out / "stages" / LOCK_FILE
+    with locked(out) as hold:
+        hold.confirm()
+        path.write_text(json.dumps(ELSEWHERE))
+        deadline_s = time.monotonic() + PATIENCE_S
+        with pytest.raises(MachineError, match=r"4711 on node7.* has taken over"):
+            while time.monotonic() < deadline_s:
+                hold.confirm()
+                time.sleep(0.01)
+    assert json.loads(path.read_text()) == ELSEWHERE
+
+
+def test_a_file_system_without_locks_is_refused_in_so_many_words(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(_descriptor: int, _how: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    monkeypatch.setattr(engine_lock, "mount_of", lambda path: Mount("/", "/mnt/nas", "nfs", ("rw", "nolock")))
+    with pytest.raises(MachineError, match=r"\(nfs at /mnt/nas\) has no locks \(No locks available\)"), locked(out):
+        pass
+
+
+def test_two_that_sign_at_once_do_not_both_work(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = out / "stages" / LOCK_FILE
+    monkeypatch.setattr(engine_lock, "mount_of", lambda path: Mount("/", "/mnt/c", "9p", ("rw",)))
+    monkeypatch.setattr(time, "sleep", lambda seconds: path.write_text(json.dumps(ELSEWHERE)))
+    with pytest.raises(UsageError, match="4711 on node7"), locked(out):
+        pass
+
+
+@pytest.mark.parametrize(
+    "left", ["1234\n", "null", "[]", "{", '{"process": 1}', "[" * 4000, '{"process": [], "host": 1}', "\xff" * 9000]
+)
+def test_what_is_no_signature_holds_nobody_up(out: Path, left: str) -> None:
+    (out / "stages" / LOCK_FILE).write_text(left, encoding="latin-1")
+    assert not is_locked(out)
+    with locked(out, tell=pytest.fail):
+        assert is_locked(out)
+
+
+def test_a_link_in_the_locks_place_is_not_followed(out: Path, tmp_path: Path) -> None:
+    (tmp_path / "victim").write_text("mine")
+    (out / "stages" / LOCK_FILE).symlink_to(tmp_path / "victim")
+    with pytest.raises(MachineError, match="Cannot lock"), locked(out):
+        pass
+    assert (tmp_path / "victim").read_text() == "mine"
