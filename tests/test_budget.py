@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
@@ -21,9 +22,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import iteration, loop, memory, planning
 from splatpipe.pipeline.train import plan as planning_of_schedule
 from splatpipe.pipeline.train.budget import (
-    FEWEST,
     FEWEST_GAUSSIANS,
-    LONGEST,
     SCHEDULE_SHARE,
     SMALLEST_MEGAPIXELS,
     VISITS,
@@ -36,8 +35,9 @@ from splatpipe.pipeline.train.budget import (
     forecast,
 )
 from splatpipe.pipeline.train.densify import room_at
+from splatpipe.pipeline.train.limits import FEWEST, FIXED_BYTES, LONGEST, bytes_per_gaussian
 from splatpipe.pipeline.train.measure import Measured
-from splatpipe.pipeline.train.memory import FIXED_BYTES, bytes_per_gaussian, resident_bytes, return_free_heap
+from splatpipe.pipeline.train.memory import resident_bytes
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.plan import Plan, duration, make_plan
 from splatpipe.pipeline.train.schedule import resolve_schedule
@@ -342,7 +342,7 @@ def test_memory_that_holds_the_sparse_points_takes_the_sweep_s_without_a_warning
     plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "resident_bytes", lambda: 0)
-    limit = FIXED_BYTES + 2000 * bytes_per_gaussian(plan.options)
+    limit = FIXED_BYTES + 2000 * bytes_per_gaussian(plan.options.sh_degree)
     limited = plan.of(plan.options.model_copy(update={"max_memory_bytes": limit}))
     for sparse, told in ((1500, 0), (2500, 1)):
         recorder = tiny_scene.Recorder()
@@ -362,7 +362,8 @@ from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
 from splatpipe.pipeline.train import plan
 from splatpipe.pipeline.train.measure import Measured
-from splatpipe.pipeline.train.memory import FIXED_BYTES, resident_bytes
+from splatpipe.pipeline.train.limits import FIXED_BYTES
+from splatpipe.pipeline.train.memory import resident_bytes
 
 scene, out = Path(sys.argv[2]), Path(sys.argv[3])
 limit = resident_bytes() + FIXED_BYTES + int(sys.argv[4])
@@ -391,7 +392,7 @@ def test_a_memory_limit_binds_and_the_resident_memory_stays_below_it(scene: Path
     room = 30_000_000
     told = in_little_memory(scene, tmp_path / "out", room)
     cap = read_plan(tmp_path / "out").options.max_gaussians
-    assert cap < room // bytes_per_gaussian(TrainConfig()) < TrainConfig().max_gaussians
+    assert cap < room // bytes_per_gaussian(TrainConfig().sh_degree) < TrainConfig().max_gaussians
     assert 0.8 * cap < told["gaussians"] <= cap  # type: ignore[operator]  # halved again and again, some are never seen
     assert told["peak"] <= told["limit"]  # type: ignore[operator]
 

@@ -19,7 +19,7 @@ from splatpipe.pipeline.raster import cuda_driver, cuda_library
 from splatpipe.pipeline.raster import device as devices
 from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows, taken_in_place
-from splatpipe.pipeline.train import memory, planning, state
+from splatpipe.pipeline.train import limits, memory, planning, state
 from splatpipe.pipeline.train.checkpoint import HostArrays, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.densify import Growth, along_curve
 from splatpipe.pipeline.train.history import History
@@ -149,8 +149,8 @@ def test_the_cpus_rows_are_copied(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.MonkeyPatch) -> None:
     model = tiny_scene.true_model(100)
-    each = memory.device_bytes_per_gaussian(3)
-    for free, room in ((None, 500), (10**9, 500), (100 * memory.DEVICE_PASSING_BYTES + 50 * each, 150), (0, 100)):
+    each = limits.device_bytes_per_gaussian(3)
+    for free, room in ((None, 500), (10**9, 500), (100 * limits.DEVICE_PASSING_BYTES + 50 * each, 150), (0, 100)):
         monkeypatch.setattr(memory, "free_bytes", lambda device, free=free: free)
         assert memory.within_room(500, model) == room
     monkeypatch.setattr(state, "within_room", lambda wanted, gaussians: len(gaussians) + 3)
@@ -163,12 +163,12 @@ def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.M
 
 
 def test_a_limit_of_memory_is_the_devices_where_that_trains() -> None:
-    each, recorder = memory.device_bytes_per_gaussian(3), tiny_scene.Recorder()
-    limit = memory.FIXED_BYTES + 1_000_000 * memory.PIXEL_BYTES + 5000 * each
+    each, recorder = limits.device_bytes_per_gaussian(3), tiny_scene.Recorder()
+    limit = limits.FIXED_BYTES + 1_000_000 * limits.PIXEL_BYTES + 5000 * each
     plan = make_small_plan(ALL.model_copy(update={"max_memory_bytes": limit, "max_gaussians": 1_000_000}))
     assert memory.within_memory(plan, 1_000_000, 150, recorder, on_cuda=True).options.max_gaussians == 5000
     # 236 bytes of parameters and 472 of moments, 12 of statistics; a tenth of a million more fit than on the CPU.
-    assert 708 + 12 < each < memory.bytes_per_gaussian(TrainConfig())
+    assert 708 + 12 < each < limits.bytes_per_gaussian(TrainConfig().sh_degree)
 
 
 def test_a_devices_share_of_memory_is_the_whole_again_after_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,7 +221,7 @@ def test_a_budgets_forecast_is_measured_where_a_device_works(monkeypatch: pytest
     found = [pilot(*budgeted(60.0, device)).options.max_gaussians for device in (cpu(), cuda)]
     assert found == [9_000, 900_000]
     assert pilot(*budgeted(6000.0, cuda)).options.max_gaussians == TrainConfig().max_gaussians
-    free[0] = 2 * 20_000 * memory.device_bytes_per_gaussian(3)
+    free[0] = 2 * 20_000 * limits.device_bytes_per_gaussian(3)
     assert pilot(*budgeted(60.0, cuda)).options.max_gaussians == 20_000
 
 

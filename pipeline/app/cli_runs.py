@@ -59,6 +59,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     from splatpipe.pipeline.engine.session import Request
     from splatpipe.pipeline.engine.source import with_absolute_files
     from splatpipe.pipeline.engine.stage import Machine
+    from splatpipe.stages.forecast import Forecaster
     from splatpipe.stages.line import LINE
 
     began_s = round(time.monotonic(), 3)
@@ -74,7 +75,8 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)
-    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine)
+    foresee = Forecaster(config, machine.threads)
+    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, foresee)
 
 
 def existing(out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0) -> Request:

@@ -19,6 +19,7 @@ from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, Stage
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
+from splatpipe.pipeline.engine.needs import Foresight, unforeseen
 from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary
 from splatpipe.pipeline.engine.store import MIN_FREE_BYTES, Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.worker import Task
@@ -142,6 +143,7 @@ class Runner:
         sink: Takes the events.
         source_now: Digests of the external parts as they are at this moment.
         save_config: Keeps the configuration in OUT; called once it is known that something can run with it.
+        foresee: What each stage will take; written beside what it took.
         outcome: What was done so far, also when it ends in an error.
     """
 
@@ -152,6 +154,7 @@ class Runner:
     sink: Sink
     source_now: Callable[[], Mapping[str, str]]
     save_config: Callable[[BaseModel], None]
+    foresee: Foresight = unforeseen
     outcome: Outcome = field(default_factory=Outcome)
 
     def walk(self, *, until: str | None = None, rerun: frozenset[str] = frozenset()) -> Outcome:
@@ -262,6 +265,7 @@ class Runner:
                     **result,
                     "machine": {**asdict(self.machine), **describe_machine()},
                     "versions": versions(),
+                    **self._forecast(stage),
                 }
                 artifact = self.store.commit(stage, inputs, partial, summary, run)
         except (SplatpipeError, Stopped, KeyboardInterrupt) as error:
@@ -272,6 +276,11 @@ class Runner:
         outcome.failed = ""
         self.sink(Event("stage_finished", stage.name, {"summary": summary, **result, "key": inputs.key}))
         return artifact
+
+    def _forecast(self, stage: Stage) -> dict[str, JSON]:
+        """What the stage was thought to take, for its manifest; empty where nobody could know."""
+        needs = self.foresee({name: done.summary for name, done in self.outcome.artifacts.items()})
+        return {"forecast": needs[stage.name].as_json()} if stage.name in needs else {}
 
     def _failed(self, inputs: StageInputs, seconds: float, error: BaseException) -> Event:
         """The event of a stage's bad end; the worker still lives, so that its memory can be told."""

@@ -18,6 +18,7 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
 from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.lock import locked
+from splatpipe.pipeline.engine.needs import Foresight, unforeseen
 from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_FILE
 from splatpipe.pipeline.engine.runner import Line, Runner
 from splatpipe.pipeline.engine.source import open_source
@@ -35,6 +36,7 @@ class Request:
         photos: The user's folder.
         out: Where the results go.
         machine: Device and threads.
+        foresee: What each stage will take, for the manifests.
     """
 
     stages: Sequence[Stage]
@@ -42,6 +44,7 @@ class Request:
     photos: Path
     out: Path
     machine: Machine
+    foresee: Foresight = unforeseen
 
 
 @contextmanager
@@ -78,7 +81,7 @@ def open_session(request: Request, show: Sink, *, wait: bool = False) -> Iterato
             digests = partial(_digests, request, store, EventReporter("source", sink), remember=True)
             line = _open_line(request, digests())
             save = partial(_save_config, store, source.folder)
-            yield Runner(line, store, executor, request.machine, sink, digests, save)
+            yield Runner(line, store, executor, request.machine, sink, digests, save, request.foresee)
         except BaseException:
             executor.stop()
             raise

@@ -26,6 +26,7 @@ from typing import IO
 
 from splatpipe.pipeline.engine.errors import ERRORS, MachineError, SplatpipeError, StageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, StageConfig, load_body
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
@@ -144,6 +145,7 @@ class _Usage:
 
     @staticmethod
     def now() -> _Usage:
+        return_free_heap()  # of the stages before, so that none is charged with what another has freed
         with contextlib.suppress(OSError):  # restarts the kernel's record of this process's peak memory
             Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
         return _Usage(time.monotonic(), time.process_time())

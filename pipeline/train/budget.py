@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from splatpipe.pipeline.train.densify import room_at
+from splatpipe.pipeline.train.limits import FEWEST, LONGEST, worthwhile_iterations
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 from splatpipe.pipeline.train.start import started
@@ -24,10 +25,6 @@ SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels f
 SIZE_STEP = 1.5  # between the sizes tried: fine enough to use the time, coarse enough for a short list
 FULL_SHARE = 0.9  # of the dataset's size is as good as all of it, and spares the resampling
 
-FIRST_ITERATIONS = 1500  # a training of FIRST_SECONDS shall have as many: below it the colours have not settled
-FIRST_SECONDS = 30.0
-LONGEST = 30_000  # iterations, as published: beyond them little is learnt
-FEWEST = 300  # iterations, however short the time: fewer do not leave the initial blur
 VISITS = 10  # iterations a photo at least: one seen less often leaves floaters before its camera
 
 FIRST_GROWTH = 1.5  # times the Gaussians of sparse points that every plan has room for, before it takes larger photos
@@ -212,16 +209,6 @@ def sizes(megapixels: float) -> list[float]:
 def wanted_iterations(task: Task, megapixels: float) -> int:
     """Iterations that are worth more than larger photos or more Gaussians."""
     return max(VISITS * task.photos, worthwhile_iterations(task.seconds(megapixels)))
-
-
-def worthwhile_iterations(seconds: float) -> int:
-    """Iterations that a training of so many seconds shall have at least, from ``FEWEST`` to ``LONGEST``.
-
-    They grow with the root of the time, so that what they work on grows as much; with it 10 minutes give about the
-    7,000 of the standard preset.
-    """
-    wanted = FIRST_ITERATIONS * math.sqrt(max(seconds, 1.0) / FIRST_SECONDS)
-    return int(min(LONGEST, max(FEWEST, wanted)))
 
 
 def planned_options(task: Task, megapixels: float, cap: int, iterations: int) -> TrainConfig:

@@ -12,16 +12,10 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster.device import Device, cpu, free_bytes
-from splatpipe.pipeline.train.budget import (
-    FEWEST_GAUSSIANS,
-    FIRST_GROWTH,
-    FIRST_ITERATIONS,
-    Task,
-    choose,
-    worthwhile_iterations,
-)
+from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, Task, choose
+from splatpipe.pipeline.train.limits import FIRST_ITERATIONS, device_bytes_per_gaussian, worthwhile_iterations
 from splatpipe.pipeline.train.measure import Effort, Measured, Step, Subject, measure
-from splatpipe.pipeline.train.memory import device_bytes_per_gaussian, within_memory
+from splatpipe.pipeline.train.memory import within_memory
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.plan import Plan, mean_megapixels
 from splatpipe.pipeline.train.shortage import HINT

@@ -1,0 +1,66 @@
+"""What limits of memory and time allow a training, as plain arithmetic. Light to import.
+
+| of a Gaussian with SH of degree 3 (59 numbers, float32) | bytes |
+|---|---|
+| parameters | 236 |
+| their gradients | 236 |
+| Adam's two moments | 472 |
+| statistics of density control | 12 |
+| **state of training** | **956** |
+| while density control copies parameters and moments, and the model is written | 860 |
+
+On a CUDA device gradients are never stored, and density control moves one tensor at a time:
+
+| of the same Gaussian on a CUDA device | bytes |
+|---|---|
+| parameters and moments | 708 |
+| statistics of density control | 12 |
+| **state of training** | **720** |
+| a frame with its pairs in the smallest chunks (see `frame.h`), radii, gradients on the screen | 201 |
+| or, later, density control: a copy of the harmonics, places, scores, an index and its sort | 320 |
+"""
+
+from __future__ import annotations
+
+import math
+
+FLOAT_BYTES = 4
+SHAPE_NUMBERS = 11  # of a Gaussian besides its colour: position, scales, rotation, opacity
+STATE_COPIES = 4  # a parameter has a gradient and two moments
+STATISTICS_BYTES = 12
+PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
+PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
+DEVICE_COPIES = 3  # a parameter has two moments there
+DEVICE_PASSING_BYTES = 320  # the larger of what a frame and density control take
+FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
+
+FIRST_ITERATIONS = 1500  # a training of FIRST_SECONDS shall have as many: below it the colours have not settled
+FIRST_SECONDS = 30.0
+LONGEST = 30_000  # iterations, as published: beyond them little is learnt
+FEWEST = 300  # iterations, however short the time: fewer do not leave the initial blur
+
+
+def numbers_of(sh_degree: int) -> int:
+    """Of a Gaussian: its shape, and three colours of as many coefficients as its harmonics have."""
+    return SHAPE_NUMBERS + 3 * (sh_degree + 1) ** 2
+
+
+def bytes_per_gaussian(sh_degree: int) -> int:
+    """Most that a Gaussian takes at any time of a training on the CPU."""
+    state = STATE_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + STATISTICS_BYTES
+    return int(state * (1.0 + PEAK_SHARE))
+
+
+def device_bytes_per_gaussian(sh_degree: int) -> int:
+    """The same on a CUDA device."""
+    return DEVICE_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + STATISTICS_BYTES + DEVICE_PASSING_BYTES
+
+
+def worthwhile_iterations(seconds: float) -> int:
+    """Iterations that a training of so many seconds shall have at least, from ``FEWEST`` to ``LONGEST``.
+
+    They grow with the root of the time, so that what they work on grows as much; with it 10 minutes give about the
+    7,000 of the standard preset.
+    """
+    wanted = FIRST_ITERATIONS * math.sqrt(max(seconds, 1.0) / FIRST_SECONDS)
+    return int(min(LONGEST, max(FEWEST, wanted)))

@@ -1,0 +1,95 @@
+"""Forecasts: what they follow from, where they stand, and that they are light."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splatpipe.pipeline.engine.config import load_preset, resolve
+from splatpipe.pipeline.engine.needs import Need, whole
+from splatpipe.pipeline.train.limits import FIXED_BYTES, bytes_per_gaussian
+from splatpipe.stages.forecast import CaptureSize, Forecaster, forecast, machine_speed, seconds
+from splatpipe.stages.line import LINE
+from splatpipe.stages.options import LineConfig
+
+SIZE = CaptureSize(photos=80, megapixels=12.0, positions=True)
+
+
+def configured(preset: str, **train: Any) -> LineConfig:
+    return resolve(LineConfig, [load_preset(preset), {"train": train}])
+
+
+def test_every_stage_has_a_forecast_that_grows_with_the_preset() -> None:
+    preview, standard, high = (forecast(SIZE, configured(name)) for name in ("preview", "standard", "high"))
+    assert list(preview) == [stage.name for stage in LINE]
+    for less, more in ((preview, standard), (standard, high)):
+        assert whole(less).cpu_seconds < whole(more).cpu_seconds
+        assert whole(less).memory_bytes < whole(more).memory_bytes
+        assert whole(less).disk_bytes < whole(more).disk_bytes
+        assert all(less[name].cpu_seconds <= more[name].cpu_seconds for name in less)
+
+
+def test_more_photos_and_larger_ones_take_more() -> None:
+    config = configured("standard")
+    base = whole(forecast(SIZE, config))
+    for larger in (replace(SIZE, photos=160), replace(SIZE, megapixels=24.0)):
+        more = whole(forecast(larger, config))
+        assert more.cpu_seconds > base.cpu_seconds and more.disk_bytes >= base.disk_bytes
+    without = forecast(replace(SIZE, positions=False), resolve(LineConfig, [{"matches": {"pairing": "exhaustive"}}]))
+    assert without["matches"].cpu_seconds > 2 * forecast(SIZE, config)["matches"].cpu_seconds
+
+
+def test_threads_divide_what_they_can_and_cost_memory() -> None:
+    one, four = (forecast(SIZE, configured("standard"), threads) for threads in (1, 4))
+    assert one["train"].cpu_seconds == four["train"].cpu_seconds
+    assert one["features"].memory_bytes < four["features"].memory_bytes
+    need = Need(1, 100.0, 1, parallel=0.8)
+    assert seconds(need, 1) == pytest.approx(100.0) and seconds(need, 4) == pytest.approx(40.0)
+    fast = forecast(SIZE, configured("standard"), speed=2.0)
+    assert fast["train"].cpu_seconds == pytest.approx(one["train"].cpu_seconds / 2)
+
+
+def test_limits_of_memory_and_of_gaussians_bound_the_training() -> None:
+    free = forecast(SIZE, configured("high"))["train"]
+    limit = free.memory_bytes - 200 * bytes_per_gaussian(3) - FIXED_BYTES
+    for bounds in ({"max_memory_bytes": limit}, {"max_gaussians": 100_000}):
+        bound = forecast(SIZE, configured("high", **bounds))["train"]
+        assert bound.memory_bytes <= limit and bound.disk_bytes < free.disk_bytes
+        assert bound.cpu_seconds < free.cpu_seconds
+
+
+@pytest.mark.parametrize("budget", [120.0, 1800.0, 36_000.0])
+def test_a_time_budget_is_the_time(budget: float) -> None:
+    needs = forecast(CaptureSize(20, 2.0, True), configured("preview", time_budget_s=budget), threads=4)
+    assert sum(seconds(need, 4) for need in needs.values()) == pytest.approx(budget, rel=0.15)
+
+
+def test_it_is_light_and_runs_anywhere() -> None:
+    code = "import sys, splatpipe.stages.forecast; print({'numpy', 'torch', 'cv2'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+    assert 0.25 <= machine_speed() <= 4.0
+
+
+def test_a_run_forecasts_from_what_ingest_counted() -> None:
+    forecaster = Forecaster(configured("preview"), 2)
+    assert forecaster({}) == {}
+    assert forecaster({"ingest": {"photos": 0}}) == {}
+    needs = forecaster({"ingest": {"photos": 80, "megapixels": 960.0, "positions": 80}})
+    expected = forecast(SIZE, configured("preview"), 2, speed=forecaster.speed)
+    assert needs == expected
+
+
+def test_each_manifest_has_the_forecast_beside_what_was_used(demo_run: Path) -> None:
+    manifests = [json.loads(path.read_text()) for path in sorted(demo_run.glob("stages/*/manifest.json"))]
+    foretold = {manifest["stage"]: manifest for manifest in manifests if "forecast" in manifest}
+    assert {stage.name for stage in LINE} - set(foretold) == {"ingest"}
+    for manifest in foretold.values():
+        assert set(manifest["forecast"]) >= {"memory_bytes", "cpu_seconds", "disk_bytes"}
+        assert "forecast" not in manifest["inputs"]
