@@ -1,5 +1,7 @@
 """What ``splatpipe view`` gives to whom, tried against the real server process: what is not for us is refused."""
 
+import contextlib
+import http.client
 import json
 import os
 import signal
@@ -333,8 +335,26 @@ def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> 
         taken.listen()
         done = view(demo_run, "--port", taken.getsockname()[1])
     assert done.returncode == 4 and "--port" in done.stderr
+    done = view(demo_run, "--bind", "everywhere")
+    assert done.returncode == 2 and "--bind 0.0.0.0" in done.stderr
     done = view(demo_run, "--points", "points.csv")
     assert done.returncode == 2 and "--mark" in done.stderr
+
+
+def test_a_published_port_of_a_container_is_answered_and_the_host_is_checked_all_the_same(demo_run: Path) -> None:
+    """127.0.0.2 is this machine, too, and not the address that is listened on without --bind."""
+
+    def status(port: int, host: str) -> int:
+        connection = http.client.HTTPConnection("127.0.0.2", port, timeout=30)
+        with contextlib.closing(connection):
+            connection.request("GET", "/", headers={"Host": host})
+            return connection.getresponse().status
+
+    with serving(demo_run, "--bind", "0.0.0.0") as server:
+        assert status(server.port, f"localhost:{server.port}") == status(server.port, "127.0.0.1:8080") == 200
+        assert status(server.port, f"127.0.0.2:{server.port}") == status(server.port, "splat.example") == 421
+    with serving(demo_run) as server, pytest.raises(ConnectionRefusedError):
+        status(server.port, f"localhost:{server.port}")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])

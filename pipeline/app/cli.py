@@ -208,6 +208,10 @@ def render(
 def view(
     out: OutArgument,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for a free one.")] = 0,
+    bind: Annotated[
+        str,
+        typer.Option(metavar="ADDRESS", help="Address to listen on: 0.0.0.0 in a container, whose port is published."),
+    ] = "127.0.0.1",
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     mark: Annotated[bool, typer.Option("--mark", help="Mark control points in the photos.")] = False,
     points: Annotated[
@@ -221,7 +225,7 @@ def view(
 
     if points is not None and not mark:
         raise UsageError("--points says what to mark.", hint="Add --mark.")
-    serve(out, ViewOptions(port, browser, mark, points), say)
+    serve(out, ViewOptions(port, bind, browser, mark, points), say)
 
 
 @app.command()

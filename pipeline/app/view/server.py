@@ -1,7 +1,8 @@
-"""``splatpipe view``: the server, on 127.0.0.1 and nowhere else."""
+"""``splatpipe view``: the server, on 127.0.0.1 unless a container publishes its port."""
 
 from __future__ import annotations
 
+import ipaddress
 import secrets
 import signal
 import socket
@@ -25,7 +26,7 @@ from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, NotThereError, 
 from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, Guard
 from splatpipe.pipeline.app.view.landing import fetchable, landing
 from splatpipe.pipeline.app.view.live import Live
-from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, Stopped
+from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, Stopped, UsageError
 from splatpipe.pipeline.engine.run_folder import RunFolder, open_run_folder
 from splatpipe.pipeline.web import asset
 from splatpipe.stages.line import LINE
@@ -51,12 +52,15 @@ class ViewOptions:
 
     Attributes:
         port: Of the server; 0 for any that is free.
+        bind: The IPv4 address that it listens on. Another than 127.0.0.1 is for a container, where what comes through a
+            published port comes from outside: requests have to name 127.0.0.1 or localhost all the same.
         open_browser: Whether to open the page.
         mark: Whether control points can be marked.
         points: File of points to mark.
     """
 
     port: int = 0
+    bind: str = ADDRESS
     open_browser: bool = True
     mark: bool = False
     points: Path | None = None
@@ -74,8 +78,9 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
         SplatpipeError: if there is no run, or nothing to mark.
         MachineError: if the port is taken.
     """
+    bind = _checked(options.bind)
     run = open_run_folder(out, LINE)
-    listening = _listen_for_marks() if options.mark and options.port == 0 else _listen(options.port)
+    listening = _listen_for_marks(bind) if options.mark and options.port == 0 else _listen(bind, options.port)
     live, token = Live(run), secrets.token_urlsafe(32)
     pages = Pages(run, live, token)
     try:
@@ -85,6 +90,8 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
         _take_signals_back()
 
         def ready() -> None:
+            if bind != ADDRESS:
+                say(f"It listens on {bind}: publish the port to this machine alone (-p {ADDRESS}:PORT:PORT).")
             say(f"Open {start} (Ctrl-C ends it)")
             if options.open_browser:
                 threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
@@ -143,22 +150,32 @@ def _settings(app: ASGIApp) -> uvicorn.Config:
     )
 
 
-def _listen_for_marks() -> socket.socket:
+def _checked(bind: str) -> str:
     try:
-        return _listen(MARKING_PORT)
+        return str(ipaddress.IPv4Address(bind))
+    except ValueError as error:
+        raise UsageError(
+            f'"{bind}" is no IPv4 address to listen on.',
+            hint="In a container --bind 0.0.0.0, else leave --bind out.",
+        ) from error
+
+
+def _listen_for_marks(bind: str) -> socket.socket:
+    try:
+        return _listen(bind, MARKING_PORT)
     except MachineError:
-        return _listen(0)
+        return _listen(bind, 0)
 
 
-def _listen(port: int) -> socket.socket:
+def _listen(bind: str, port: int) -> socket.socket:
     listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listening.bind((ADDRESS, port))
+        listening.bind((bind, port))
     except OSError as error:
         listening.close()
         raise MachineError(
-            f"Port {port} of this machine cannot be used: {error.strerror}.", hint="Choose another: --port N."
+            f"Port {port} of {bind} cannot be used: {error.strerror}.", hint="Choose another: --port N, --bind ADDRESS."
         ) from error
     listening.listen(64)
     return listening
