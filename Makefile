@@ -3,6 +3,7 @@
 # make test                    sets up, then passes every test
 # make develop                 installs links to the sources, so that what is edited is what runs; make test goes back
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
+# make test-image              builds the container image for real and runs the demo in it (Linux, root, buildah, crun)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
 # SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or for some: "80;90"
@@ -39,7 +40,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-.PHONY: run test test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-image test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -63,6 +64,11 @@ test-isa: .venv/.tested
 	  echo "== training on $$isa" && SPLATPIPE_ISA=$$isa $(BIN)/python -m pytest -q tests/test_train.py || exit 1; done
 	@echo "== the line on baseline"
 	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/test_line.py -k test_a_run_leaves_what_is_promised
+
+# Builds the cpu image without a container engine's daemon, and runs the demo in it: see docs/containers.md. Needs root.
+test-image: | .venv/bin/python
+	@echo "== the image"
+	@$(BIN)/python tests/image $(if $(filter cpu,$(TORCH)),--torch-index https://download.pytorch.org/whl/cpu)
 
 test-captures: .venv/.tested
 	@echo "== the line on real photos"
@@ -167,6 +173,7 @@ versions: $(EITHER) .venv/.dev
 lint: .venv/.dev
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/clang-format --dry-run --Werror $(NATIVE)
+	@$(BIN)/hadolint docker/Dockerfile
 
 format: .venv/.dev
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/clang-format -i $(NATIVE)

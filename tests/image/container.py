@@ -1,0 +1,165 @@
+"""Runs an image as a container by an OCI runtime, as strictly as a cluster would."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from building import Image, Problem
+
+USER = 54321  # in no passwd of the image
+SHM = "size=65536k"  # what Docker gives
+DOCKER_KILLS_S = 10.0
+PATIENCE_S = 3600.0  # of a busy machine; a container that hangs ends the test
+LOOK_S = 0.1
+DEVICES = ["nosuid", "noexec"]
+
+
+@dataclass(frozen=True)
+class Mounts:
+    """What the container is given.
+
+    Attributes:
+        photos: Read-only, at ``/photos``.
+        out: At ``/out``, the only place that it can write but ``/dev/shm``.
+    """
+
+    photos: Path
+    out: Path
+
+
+@dataclass(frozen=True)
+class End:
+    """How a stopped container ended.
+
+    Attributes:
+        code: Exit code; 137 where it had to be killed, as Docker does after ten seconds.
+        seconds: From the signal to the end.
+        progress: What the stage last told before.
+        told: The container's last words.
+    """
+
+    code: int
+    seconds: float
+    progress: str
+    told: str
+
+
+class Container:
+    """A container of an image, for one command after the other.
+
+    Args:
+        image: The image.
+        bundle: A folder for the runtime's configuration.
+        mounts: What it is given.
+    """
+
+    def __init__(self, image: Image, bundle: Path, mounts: Mounts) -> None:
+        self._image, self._bundle, self._mounts = image, bundle, mounts
+        self._name = f"splatpipe-test-{os.getpid()}"
+        os.chown(mounts.out, USER, USER)
+
+    def must_end(self, code: int, command: list[str], say: Callable[[str], None]) -> None:
+        """Run a command to its end.
+
+        Raises:
+            Problem: if it ends with another code.
+        """
+        started_s = time.monotonic()
+        with self._running(command) as process:
+            process.wait(PATIENCE_S)
+        say(f"splatpipe {' '.join(command)}: exit code {process.returncode}, {time.monotonic() - started_s:.0f} s.")
+        if process.returncode != code:
+            raise Problem(f"It has to be {code}.\n{self._told()}")
+        if "Traceback" in self._told() or "not writable" in self._told():
+            raise Problem(f"It complains:\n{self._told()}")
+
+    def stop_inside(self, command: list[str], stage: str, done: float) -> End:
+        """Run a command and send SIGTERM to it once a stage has done more than so much."""
+        before = sum(1 for _ in self._events())
+        with self._running(command) as process:
+            progress = self._await_progress(process, before, stage, done)
+            subprocess.run(["crun", "kill", self._name, "TERM"], check=True)
+            sent_s = time.monotonic()
+            try:
+                process.wait(DOCKER_KILLS_S)
+            except subprocess.TimeoutExpired:
+                subprocess.run(["crun", "kill", self._name, "KILL"], check=True)
+                process.wait(PATIENCE_S)
+            return End(process.returncode, time.monotonic() - sent_s, progress, self._told())
+
+    def _await_progress(self, process: subprocess.Popen[bytes], before: int, stage: str, done: float) -> str:
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s:
+            for event in list(self._events())[before:]:
+                data = event["data"]
+                if event["stage"] == stage and event["kind"] == "progress" and data["done"] > done:
+                    return f"{data['what']} {data['done']:.0f} of {data['total']:.0f}"
+            if process.poll() is not None:
+                raise Problem(f"It ended before it could be stopped inside {stage}.\n{self._told()}")
+            time.sleep(LOOK_S)
+        raise Problem(f"It never came to {stage}.\n{self._told()}")
+
+    def _events(self) -> Iterator[dict]:
+        log = self._mounts.out / "events.jsonl"
+        if log.exists():
+            for line in log.read_text(encoding="utf-8").splitlines(keepends=True):
+                if line.endswith("\n"):
+                    yield json.loads(line)
+
+    def _told(self) -> str:
+        return (self._bundle / "told.txt").read_text(encoding="utf-8", errors="replace")[-3000:]
+
+    @contextmanager
+    def _running(self, command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+        shutil.rmtree(self._bundle, ignore_errors=True)
+        self._bundle.mkdir(parents=True)
+        (self._bundle / "config.json").write_text(json.dumps(self._config(command)), encoding="utf-8")
+        arguments = ["crun", "--cgroup-manager=disabled", "run", "--bundle", str(self._bundle), self._name]
+        with (self._bundle / "told.txt").open("wb") as told:
+            process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=told, stderr=told)
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                subprocess.run(["crun", "delete", "--force", self._name], check=False)
+                process.wait(PATIENCE_S)
+
+    def _config(self, command: list[str]) -> dict:
+        """As ``docker run --read-only --network none --user 54321:54321 -v photos:/photos:ro -v out:/out``."""
+        kinds = ("pid", "network", "ipc", "uts", "mount")
+        return {
+            "ociVersion": "1.0.2",
+            "process": {
+                "terminal": False,
+                "user": {"uid": USER, "gid": USER},
+                "args": ["env", "-u", "HOME", *self._image.entrypoint, *command],  # runtimes put a HOME in
+                "env": self._image.environment,
+                "cwd": self._image.folder,
+                "noNewPrivileges": True,
+                "capabilities": {},
+            },
+            "root": {"path": str(self._image.root), "readonly": True},
+            "hostname": "splatpipe",
+            "mounts": [
+                _mount("/proc", "proc", *DEVICES),
+                _mount("/dev", "tmpfs", "nosuid", "mode=755", "size=65536k"),
+                _mount("/dev/shm", "tmpfs", *DEVICES, "mode=1777", SHM),
+                _mount("/sys", "sysfs", *DEVICES, "ro"),
+                _mount("/photos", str(self._mounts.photos), "rbind", "ro"),
+                _mount("/out", str(self._mounts.out), "rbind", "rw"),
+            ],
+            "linux": {"namespaces": [{"type": kind} for kind in kinds]},
+        }
+
+
+def _mount(place: str, source: str, *options: str) -> dict:
+    kind = "bind" if source.startswith("/") else source
+    return {"destination": place, "type": kind, "source": source, "options": list(options)}
