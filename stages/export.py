@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import platform
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import torch
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.geometry.plan_area import read_world_area
 from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
 from splatpipe.pipeline.render.rendering import as_trained, load_rendering
 from splatpipe.pipeline.splat.dome import sky_dome
@@ -24,7 +26,15 @@ from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.georeference import georeference, scene_box, told_in_a_line
-from splatpipe.pipeline.survey.handover import cameras_json, in_world, ply_comments, pose_in_world
+from splatpipe.pipeline.survey.handover import (
+    boundary_facts,
+    bounded_comments,
+    cameras_json,
+    in_world,
+    inside_first,
+    ply_comments,
+    pose_in_world,
+)
 from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.web.options import ExportConfig
 from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
@@ -48,9 +58,10 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 
     report.progress(0, 4, "moving the model into its frame", "files")
     model = read_splat(inputs["train.model"])
-    gaussians = in_world(model, frame)
     comments = ply_comments(frame, load_rendering(inputs["train.rendering"]).antialias)
-    write_splat(out / "splat.ply", gaussians, comments)
+    area = read_world_area(inputs.parts.get("georef.boundary"))
+    gaussians, within = inside_first(in_world(model, frame), area)
+    write_splat(out / "splat.ply", gaussians, [*comments, *bounded_comments(within, len(gaussians))])
     sky = read_panorama(inputs["train.sky"]) if config.sky else None
     (out / "sky").mkdir()
     if sky is not None:
@@ -64,11 +75,13 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
     box = scene_box(frame.world_from_model.apply(points.xyz), centres)
     placed = georeference(frame, box)
-    write_json(out / "georef.json", {**placed, "uncertainty": frame.residuals.get("uncertainty")})
+    bounded = {} if area is None else {"boundary": boundary_facts(area, inputs["georef.boundary"])}
+    write_json(out / "georef.json", {**placed, "uncertainty": frame.residuals.get("uncertainty"), **bounded})
     if frame.origin is not None:
         report.note(told_in_a_line(placed))
     report.progress(2, 4, "collecting the figures", "files")
     figures = collect_metrics(inputs, points, len(cameras), len(gaussians))
+    figures |= {} if within is None else {"gaussians_inside": within}
     write_json(out / "metrics.json", figures)
     report.progress(3, 4, "writing the viewer", "files")
     write_viewer_of(inputs, gaussians, out / "viewer", config)
@@ -94,6 +107,8 @@ def write_viewer_of(inputs: Inputs, gaussians: Gaussians, folder: Path, config: 
     held_out = {view["name"] for view in _read_json(inputs["evaluate.metrics"])["per_view"]}
     frame = load_frame(inputs["georef.frame"])
     scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out, len(gaussians), config.title)
+    if (area := read_world_area(inputs.parts.get("georef.boundary"))) is not None:
+        scene = replace(scene, focus=area.contains(scene.points))
     write_viewer(folder, scene, gaussians, config.viewer_megabytes * 1e6)
 
 
@@ -122,6 +137,7 @@ def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: 
         "peak_memory_bytes": train.get("peak_memory_bytes"),
         "test_views": measured["test_views"],
         **measured["mean"],
+        **({"whole": measured["whole"]} if "whole" in measured else {}),  # with a boundary: the rest is of the inside
         "floaters": measured["floaters"],
         "accuracy": measured["accuracy"],
         "per_view": measured["per_view"],

@@ -18,6 +18,7 @@ from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
 from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.pipeline.survey.accuracy import Placed, accuracy_json, control_json, no_control
 from splatpipe.pipeline.survey.blunders import gsd_m
+from splatpipe.pipeline.survey.boundary import lay_boundary
 from splatpipe.pipeline.survey.control import ByControl, Capture, place_by_control
 from splatpipe.pipeline.survey.crs import parse_vertical
 from splatpipe.pipeline.survey.fitting import NoPlaceError
@@ -34,10 +35,12 @@ DATUM_STEP_M = 1.0  # between two vertical datums; less may be the receiver's er
 
 
 def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the parts frame (``frame.json``), model, control (``control.json``) and accuracy (``accuracy.json``).
+    """Write the parts frame (``frame.json``), model, control (``control.json``), accuracy (``accuracy.json``) and
+    boundary (``boundary.json``).
 
     Raises:
-        SplatpipeError: if the model cannot be read or has no photos, or the control is not of this capture.
+        SplatpipeError: if the model cannot be read or has no photos, the control is not of this capture, or nothing
+            lies inside the boundary.
     """
     source = inputs["sparse.model"]
     report.progress(0, 3, "reading the model", "steps")
@@ -66,13 +69,15 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         frame = arbitrary_frame(model, positions, frame)
     frame = _declared(frame, config, controlled)
     save_frame(frame, out / "frame.json")
+    placed_points = (controlled.placed.model if controlled is not None else model).points
+    bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
     accuracy = _write_accuracy(config, out, controlled, (model, positions, frame), photos, report)
     if controlled is not None and controlled.bent is not None:
         write_model(controlled.bent, out / "sparse" / "0")
     else:
         copy_model(source, out / "sparse" / "0", may_link=inputs.photos_dir not in source.parents)
     report.progress(3, 3, "fitting the control", "steps")
-    return _summary(frame, controlled, accuracy)
+    return {**_summary(frame, controlled, accuracy), **bounded}
 
 
 def _by_positions(

@@ -11,9 +11,11 @@ from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.mvs.dense import DensePoints, dense_points
+from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area
+from splatpipe.pipeline.mvs.dense import Cover, DensePoints, dense_points
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_split, load_views
+from splatpipe.pipeline.splat.backdrop import coarse_start
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import write_splat
 from splatpipe.pipeline.splat.sh import rgb_to_dc
@@ -33,6 +35,8 @@ MOST_DENSE = 50_000  # points of the sweep, an even cover; what is finer, densit
 def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write `init.ply`: isotropic Gaussians at the sparse points and, after them, at the sweep's, in the model's frame.
 
+    With a boundary, all of those inside and a backdrop's worth of the others.
+
     Raises:
         SplatpipeError: if the model has no points.
     """
@@ -51,23 +55,30 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     views = load_views(inputs["undistort.dataset"])
     centres = np.array([view.camera.centre() for view in views])
     xyz, rgb = points.xyz[chosen], points.rgb[chosen]
-    summary = {}
+    area = read_model_area(inputs.parts.get("georef.boundary"))
+    sparse, summary = int(chosen.size), {}
     if config.dense:
-        more = _sweep(views, inputs, out, report)
+        more = _sweep(views, inputs, area, out, report)
         xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
-        summary = {"points": int(chosen.size), "dense_points": len(more)}
+    if area is not None:
+        rows = coarse_start(inside := area.contains(xyz))
+        xyz, rgb, sparse = xyz[rows], rgb[rows], int(np.searchsorted(rows, sparse))
+        summary = {"inside": int(inside.sum())}
+    if config.dense:
+        summary |= {"points": sparse, "dense_points": len(xyz) - sparse}
     sizes = point_sizes(xyz, centres, config.max_angle, report)
     gaussians = make_gaussians(xyz, rgb, sizes, config.opacity)
-    write_splat(out / "init.ply", gaussians, [sparse_comment(chosen.size)])
+    write_splat(out / "init.ply", gaussians, [sparse_comment(sparse)])
     return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
 
 
-def _sweep(views: list[View], inputs: Inputs, out: Path, report: Reporter) -> DensePoints:
+def _sweep(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter) -> DensePoints:
     """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
+    cover = Cover(MOST_DENSE, None if area is None else area.contains)
     kept = set(load_split(inputs["split.views"]).train)
     used = [view for view in views if view.camera.name in kept]
     dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
-    return dense_points(dataset, used, MOST_DENSE, out, threads, report)
+    return dense_points(dataset, used, cover, out, threads, report)
 
 
 def choose_points(points: Points, usable: npt.NDArray[np.int64], limit: int) -> npt.NDArray[np.int64]:

@@ -68,11 +68,20 @@ GEOREF = Stage(
     "georef",
     version=5,
     config=GeorefConfig,
-    reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control"),
-    parts={"frame": "frame.json", "model": "sparse/0", "control": "control.json", "accuracy": "accuracy.json"},
+    reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control", "source.boundary"),
+    parts={
+        "frame": "frame.json",
+        "model": "sparse/0",
+        "control": "control.json",
+        "accuracy": "accuracy.json",
+        "boundary": "boundary.json",
+    },
     entry="splatpipe.stages.georef:run",
     borrows=("sparse.lens",),
-    files={"control": NamedFile("source.control", ("gcp_list.txt", "control.csv"))},
+    files={
+        "control": NamedFile("source.control", ("gcp_list.txt", "control.csv")),
+        "boundary": NamedFile("source.boundary", ("boundary.geojson",)),
+    },
 )
 UNDISTORT = Stage(
     "undistort",
@@ -94,7 +103,7 @@ INITIALIZE = Stage(
     "initialize",
     version=2,
     config=InitializeConfig,
-    reads=("undistort.dataset", "split.views"),
+    reads=("undistort.dataset", "split.views", "georef.boundary"),
     parts={"splat": "init.ply"},
     entry="splatpipe.stages.initialize:run",
 )
@@ -102,7 +111,7 @@ TRAIN = Stage(
     "train",
     version=6,
     config=TrainConfig,
-    reads=("undistort.dataset", "split.views", "initialize.splat"),
+    reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={
         "model": "model.ply",
         "history": "history.json",
@@ -127,6 +136,7 @@ EVALUATE = Stage(
         "georef.frame",
         "georef.control",
         "georef.accuracy",
+        "georef.boundary",
     ),
     parts={"metrics": "metrics.json", "views": "views"},
     entry="splatpipe.stages.evaluate:run",
@@ -141,6 +151,7 @@ EXPORT = Stage(
         "train.sky",
         "georef.frame",
         "georef.model",
+        "georef.boundary",
         "undistort.dataset",
         "evaluate.metrics",
         "ingest.photos",

@@ -11,7 +11,7 @@ import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.dense import DensePoints, dense_points, thinned
+from splatpipe.pipeline.mvs.dense import Cover, DensePoints, dense_points, thinned
 from splatpipe.pipeline.mvs.likeness import Picture
 from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, neighbours
 from splatpipe.pipeline.mvs.options import InitializeConfig
@@ -104,7 +104,7 @@ def initialized(
 
 
 def swept(dataset: Path, out: Path) -> DensePoints:
-    return dense_points(dataset, load_views(dataset), 50_000, out, 1, Recorder())
+    return dense_points(dataset, load_views(dataset), Cover(50_000), out, 1, Recorder())
 
 
 @pytest.fixture(scope="module")

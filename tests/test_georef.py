@@ -111,6 +111,7 @@ def ingested(folder: Path, positions: list[dict[str, object]], names: list[str])
         "ingest.photos": folder,
         "ingest.cameras": folder / "cameras.json",
         "source.control": ABSENT,
+        "source.boundary": ABSENT,
     }
 
 

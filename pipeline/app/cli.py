@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from splatpipe.pipeline.app.cli_options import (
+    BoundaryOption,
     ConfigOption,
     DeviceOption,
     FpsOption,
@@ -43,6 +44,7 @@ from splatpipe.pipeline.app.cli_runs import (
     overrides,
     request_of,
     stages_to_rerun,
+    with_boundary,
     with_budgets,
 )
 from splatpipe.pipeline.app.ending import Ending, for_the_user, print_json
@@ -92,6 +94,7 @@ def run(
     assignments: SetOption = None,
     time_budget: TimeBudgetOption = None,
     max_memory: MaxMemoryOption = None,
+    boundary: BoundaryOption = None,
     until: UntilOption = None,
     rerun: RerunOption = None,
     rerun_from: RerunFromOption = None,
@@ -108,6 +111,7 @@ def run(
     with Ending(out, as_json) as done:
         done.notify_by(notify)
         assignments = with_budgets(assignments, time_budget, max_memory)
+        assignments = with_boundary(assignments, boundary)
         resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
         again = stages_to_rerun(rerun or [], rerun_from, until)
         with RunSession(request_of(photos, out, resolved, device, threads), wait) as runner:

@@ -44,6 +44,10 @@ TimeBudgetOption = Annotated[
 MaxMemoryOption = Annotated[
     str | None, typer.Option(metavar="8G|512M", help="Most memory that training may take, 10⁹ bytes a G.")
 ]
+BoundaryOption = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="The area that counts, GeoJSON; what is outside stays coarse. auto, or none."),
+]
 UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
 RerunOption = Annotated[list[str] | None, typer.Option(metavar="STAGE", help="Run this stage again. Repeatable.")]
 RerunFromOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage and all after it again.")]

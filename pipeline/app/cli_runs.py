@@ -55,6 +55,11 @@ def with_budgets(assignments: Sequence[str] | None, time_budget: str | None, max
     return [*budgets, *(assignments or ())]
 
 
+def with_boundary(assignments: Sequence[str] | None, boundary: str | None) -> list[str]:
+    """``--boundary`` as the assignment that it is short for."""
+    return [*([] if boundary is None else [f"georef.boundary={boundary}"]), *(assignments or ())]
+
+
 def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
     from splatpipe.pipeline.engine.session import Request
     from splatpipe.pipeline.engine.source import with_absolute_files

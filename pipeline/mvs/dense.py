@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,6 +55,19 @@ class DensePoints:
 
 
 @dataclass(frozen=True)
+class Cover:
+    """How the points are spread.
+
+    Attributes:
+        most: At most so many, evenly.
+        inside: Which places count; as many again are left where none does. None where all do.
+    """
+
+    most: int
+    inside: Callable[[Float64[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]] | None = None
+
+
+@dataclass(frozen=True)
 class _Capture:
     """What every photo's work needs to know.
 
@@ -74,14 +87,14 @@ class _Capture:
 
 
 def dense_points(
-    dataset: Path, views: Sequence[View], most: int, folder: Path, threads: int, report: Reporter
+    dataset: Path, views: Sequence[View], cover: Cover, folder: Path, threads: int, report: Reporter
 ) -> DensePoints:
     """Points on surfaces where the sparse model has few; the same for any number of threads.
 
     Args:
         dataset: The folder that `undistort` left.
         views: Photos to use, in name order; none that are held out.
-        most: At most so many points, spread evenly.
+        cover: How they are spread.
         folder: Where there is room for a megabyte a photo meanwhile.
         threads: Photos at a time.
         report: Told of progress.
@@ -106,7 +119,12 @@ def dense_points(
                 report.progress(done, len(views), "comparing depths", "photos")
     finally:
         cv2.setNumThreads(threads_before)
-    return thinned(_joined(found), tracks.xyz, most)
+    every = _joined(found)
+    if cover.inside is None:
+        return thinned(every, tracks.xyz, cover.most)
+    within = cover.inside(every.xyz)
+    parts = [every.select(np.flatnonzero(rows)) for rows in (within, ~within)]
+    return _joined([thinned(part, tracks.xyz, cover.most) for part in parts])
 
 
 def _joined(parts: Sequence[DensePoints]) -> DensePoints:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.raster import rasterizer
@@ -32,6 +33,7 @@ def measure_floaters(
     held_out: Container[str],
     dataset: Path,
     options: rasterizer.RenderOptions,
+    area: PlanArea | None = None,
 ) -> dict[str, Any]:
     """The figures of `floaters` in metrics.json; None where the sparse model does not tell.
 
@@ -44,11 +46,18 @@ def measure_floaters(
         held_out: Names of the photos that were not trained on.
         dataset: Their dataset, with the sparse points.
         options: How the model is rendered.
+        area: That counts, in the model's frame; None where all does.
     """
     points, tracks = load_points_and_tracks(dataset)
     seen = [tracks[camera.name] for camera in cameras]
     space = free_space(cameras, points.xyz, seen)
     chosen = near_or_free(gaussians, space)
+    floating, counted = share_of_opacity(gaussians, chosen), seen
+    if area is not None:
+        inside = torch.from_numpy(area.contains(gaussians.means.double().numpy(force=True)))
+        floating, chosen = share_of_opacity(gaussians.select(inside), chosen[inside]), chosen & inside
+        counts = area.contains(points.xyz)
+        counted = [rows[counts[rows]] for rows in seen]
     pairs = neighbouring_pairs(seen)
     places = sorted({place for pair in pairs for place in pair})
     small = {place: reduced_camera(cameras[place], LARGEST_MEGAPIXELS) for place in places}
@@ -59,8 +68,8 @@ def measure_floaters(
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
     apart = disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
     return {
-        "veil": measure_veil(gaussians, cameras, (points.xyz, seen), held_out, options),
-        "free_space_opacity": _rounded(share_of_opacity(gaussians, chosen)) if space.known else None,
+        "veil": measure_veil(gaussians, cameras, (points.xyz, counted), held_out, options),
+        "free_space_opacity": _rounded(floating) if space.known else None,
         "free_space_gaussians": int(chosen.sum()) if space.known else None,
         "free_space_rendered": _rounded(light[0] / light[1]) if space.known and light[1] > 0.0 else None,
         "depth_disagreement": {

@@ -19,6 +19,7 @@ from jaxtyping import Float, Float64
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.plan_area import read_world_area
 from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 from splatpipe.pipeline.survey.residuals import accuracy_table
@@ -69,8 +70,8 @@ def measure_accuracy(
     """What metrics.json has as `accuracy`: georef's tables and points, and the splat's own.
 
     Args:
-        parts: With ``georef.frame``, ``georef.control`` and ``georef.accuracy``; where a dataset alone is evaluated,
-            these are not there.
+        parts: With ``georef.frame``, ``georef.control``, ``georef.accuracy`` and ``georef.boundary``, outside of which
+            no point speaks for the splat; where a dataset alone is evaluated, these are not there.
         cameras: Of the dataset's photos, at the size that depth is rendered at.
         held_out: Names of photos that training did not see.
         depth_of: Renders a photo's median depth.
@@ -83,6 +84,8 @@ def measure_accuracy(
     frame = load_frame(parts["georef.frame"])
     result: dict[str, Any] = {**_read(parts["georef.accuracy"]), "points": georef_points(parts["georef.control"])}
     points = read_surveyed(parts["georef.control"], [camera.name for camera in cameras])
+    if (area := read_world_area(parts.get("georef.boundary"))) is not None:  # outside the splat is coarse
+        points = [point for point in points if area.contains(np.nan_to_num(point.place_m)[None])[0]]
     if frame.kind != "enu" or not any(point.observations for point in points):
         return {**result, "splat": None}
     by_name = {camera.name: camera for camera in cameras}

@@ -10,10 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.splat import metrics
 
@@ -23,18 +25,24 @@ MASKED_GREY = 128
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
-def evaluate_view(view: tuple[Camera, Pixels, Mask | None], render: Pixels, stem: Path) -> dict[str, Any]:
+def evaluate_view(
+    view: tuple[Camera, Pixels, Mask | None], render: Pixels, stem: Path, inside: Mask | None = None
+) -> dict[str, Any]:
     """Measure one view, and keep its pictures.
 
     Args:
         view: The held-out photo at the size of training: camera, photo and mask.
         render: What the model shows instead.
         stem: Path of the pictures without their endings.
+        inside: Pixels that show what lies inside the boundary, which alone count then; None without one.
 
     Returns:
-        Its name, the pictures' common stem, its size, and a figure a measure.
+        Its name, the pictures' common stem, its size, and a figure a measure; with a boundary those of the ``whole``
+        picture, too.
     """
     camera, photo, mask = view
+    whole = {} if inside is None else {"whole": measure(render, photo, mask)}
+    mask = mask if inside is None else inside if mask is None else inside & mask
     _write_png(stem, "photo", photo)
     _write_png(stem, "render", render)
     _write_png(stem, "error", error_picture(render, photo, mask))
@@ -42,7 +50,22 @@ def evaluate_view(view: tuple[Camera, Pixels, Mask | None], render: Pixels, stem
         _write_png(stem, "mask", np.where(mask, 255, 0).astype(np.uint8))
     counted = 1.0 if mask is None else round(float(mask.mean()), 6)
     facts = {"name": camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
-    return facts | {"counted": counted} | measure(render, photo, mask)
+    return facts | {"counted": counted} | measure(render, photo, mask) | whole
+
+
+def shows_inside(area: PlanArea, camera: Camera, depth: Float[np.ndarray, "h w"]) -> Mask:
+    """Which pixels show what lies inside a boundary, as far as the model's own depth tells.
+
+    Args:
+        area: In the model's frame.
+        camera: The view's.
+        depth: Its median depth along the view axis; 0 where there is none.
+    """
+    rows, columns = np.nonzero(depth > 0.0)
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    inside = np.zeros(depth.shape, np.bool_)
+    inside[rows, columns] = area.contains(camera.unproject(pixels, depth[rows, columns].astype(np.float64)))
+    return inside
 
 
 def measure(render: Pixels, photo: Pixels, mask: Mask | None) -> dict[str, float | None]:

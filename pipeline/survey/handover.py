@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import MIP_COMMENT
 from splatpipe.pipeline.survey.crs import utm_of
@@ -48,6 +51,46 @@ def ply_comments(frame: Frame, antialias: bool) -> list[str]:
         f"vertical datum: {frame.vertical_datum}",
         f"crs: {frame.crs or utm_of(origin.latitude, origin.longitude).text} (see georef.json)",
     ]
+
+
+def inside_first(gaussians: Gaussians, area: PlanArea | None) -> tuple[Gaussians, int | None]:
+    """A splat with what lies inside a boundary before its backdrop, so that programs can take the one alone.
+
+    Args:
+        gaussians: In the world frame.
+        area: The boundary; None without one.
+
+    Returns:
+        The splat, and how many lie inside; None without a boundary, where nothing changes.
+    """
+    if area is None:
+        return gaussians, None
+    inside = torch.from_numpy(area.contains(gaussians.means.double().numpy()))
+    rows = torch.cat([torch.nonzero(inside).flatten(), torch.nonzero(~inside).flatten()])
+    return gaussians.select(rows), int(inside.sum())
+
+
+def bounded_comments(inside: int | None, gaussians: int) -> list[str]:
+    """Header lines that tell how many Gaussians lie inside a boundary; none without one."""
+    if inside is None:
+        return []
+    return [f"boundary: the first {inside} Gaussians lie inside, the other {gaussians - inside} are a backdrop"]
+
+
+def boundary_facts(area: PlanArea, part: Path) -> dict[str, Any]:
+    """What `georef.json` says of a boundary: its size and its polygons, in the world frame and as GeoJSON's rings.
+
+    Args:
+        area: In the world frame.
+        part: `georef.boundary`.
+    """
+    degrees = json.loads(part.read_text(encoding="utf-8"))["degrees"]
+    closed = [[[*ring, ring[0]] for ring in polygon] for polygon in degrees]
+    return {
+        "area_m2": round(area.size(), 3),
+        "east_north_m": area.facts()["polygons"],
+        "wgs84": {"type": "MultiPolygon", "coordinates": closed},
+    }
 
 
 def cameras_json(cameras: Sequence[Camera], frame: Frame) -> list[dict[str, Any]]:

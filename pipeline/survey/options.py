@@ -18,6 +18,10 @@ class GeorefConfig(StageConfig):
     control: str = "auto"
     """File of control and check points: `gcp_list.txt` (ODM) or a CSV with a header. `auto`: `gcp_list.txt` or
     `control.csv` in the photo folder or beside it; `none`: no control."""
+    boundary: str = "auto"
+    """GeoJSON file of the area that counts, in WGS 84, in the CRS that it names, or in the run's: Gaussians are spent
+    and figures taken inside, what is outside stays coarse. `auto`: `boundary.geojson` in the photo folder or beside it;
+    `none`: no boundary."""
     crs: Annotated[str, Field(max_length=500)] = "auto"
     """CRS of coordinates that are read out: `EPSG:25832`, with heights `EPSG:25832+7837`, `+proj=…`, `WGS84 UTM 32N`.
     Auto: the control file's, without one the capture's UTM zone."""

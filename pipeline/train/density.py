@@ -11,7 +11,7 @@ published are what is ranked and its threshold, the learning rates, the opacity 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -33,6 +33,7 @@ class DensityStep:
         limit: The most Gaussians that may be left, where any are added.
         iteration: The one that ends.
         unwanted: (n,) Gaussians that have to go, whatever their size and opacity.
+        ranked: What techniques make of the score; None for nothing.
     """
 
     schedule: DensitySchedule
@@ -40,6 +41,7 @@ class DensityStep:
     limit: int
     iteration: int
     unwanted: Bool[Tensor, " n"]
+    ranked: Callable[[Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
 
 
 class Density:
@@ -83,6 +85,7 @@ class Density:
             gone |= step.unwanted
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, self.statistics.score())
+        score = score if step.ranked is None else step.ranked(score)
         growth, counts = grow(gaussians, score, step.limit - len(gaussians) + pruned, schedule, extent, iteration)
         return growth.select(~gone[growth.source]), {**counts, "pruned": pruned}
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.densify import DensitySchedule
 from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
@@ -82,6 +83,12 @@ class Technique:
 
     def after_epoch(self, iteration: int) -> None:
         """Every photo was trained on once more."""
+
+    def ranked(
+        self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
+    ) -> Float[Tensor, " n"]:
+        """The score by which density control ranks Gaussians; 0 for one that is not to be cloned or split."""
+        return score
 
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """Which Gaussians have to go after an iteration; None where it is not one to look."""

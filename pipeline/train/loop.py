@@ -11,6 +11,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
+from splatpipe.pipeline.geometry.plan_area import read_model_area
 from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
@@ -50,6 +51,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     device = choose_device(inputs.machine.device, config.unfit_for_cuda(), report.note)
     dataset = inputs["undistort.dataset"]
     views = load_views(dataset)
+    area = read_model_area(inputs.parts.get("georef.boundary"))
     start = read_start(inputs["initialize.splat"])
     split = load_split(inputs["split.views"])
     kept = set(split.train)
@@ -73,7 +75,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             report.note(plan.described())
 
         def techniques() -> Techniques:
-            return make_techniques(plan, sky, trained_on, dataset, device.tensors)
+            return make_techniques(plan, sky, trained_on, dataset, device.tensors, area)
 
         state = resume(out / CHECKPOINT, plan, techniques, device, report)
         if state is None:

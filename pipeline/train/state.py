@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -160,7 +161,9 @@ class TrainState:
         gone = self.techniques.unwanted(gaussians, iteration)
         if gone is None:
             gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-        step = DensityStep(plan.schedule.density, plan.extent, limit, iteration, gone)
+        schedule = plan.schedule.density
+        ranked = partial(self.techniques.ranked, gaussians=gaussians, schedule=schedule)
+        step = DensityStep(schedule, plan.extent, limit, iteration, gone, ranked)
         growth, counts = self.density.control(gaussians, step)
         return along_curve(growth), counts
 

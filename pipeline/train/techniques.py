@@ -13,10 +13,13 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.backdrop import Backdrop
 from splatpipe.pipeline.train.clearing import Clearing, free_space_of
+from splatpipe.pipeline.train.densify import DensitySchedule
 from splatpipe.pipeline.train.distortion import Distortion
 from splatpipe.pipeline.train.dropout import Dropout
 from splatpipe.pipeline.train.exposure import Exposure
@@ -37,6 +40,7 @@ def make_techniques(
     views: Sequence[View] = (),
     dataset: Path | None = None,
     device: torch.device | None = None,
+    area: PlanArea | None = None,
 ) -> Techniques:
     """Those that a plan asks for, nothing of them trained.
 
@@ -49,6 +53,7 @@ def make_techniques(
         views: Those trained on.
         dataset: Theirs, with the sparse points; None for a training that is thrown away.
         device: Where the model is trained; None for the CPU.
+        area: That counts; None where all does.
 
     Raises:
         StageError: if the dataset is broken.
@@ -69,6 +74,8 @@ def make_techniques(
         made.append(Distortion(options.distortion_weight, options.iterations))
     if options.prune_free_space and dataset is not None:
         made.append(Clearing(free_space_of(views, dataset), schedule))
+    if area is not None:
+        made.append(Backdrop(area, schedule.density))
     for technique in made:
         technique.move_to(device or torch.device("cpu"))
     return Techniques(tuple(made))
@@ -150,6 +157,14 @@ class Techniques:
         """Every photo was trained on once more."""
         for technique in self.each:
             technique.after_epoch(iteration)
+
+    def ranked(
+        self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
+    ) -> Float[Tensor, " n"]:
+        """The score by which density control ranks Gaussians."""
+        for technique in self.each:
+            score = technique.ranked(score, gaussians, schedule)
+        return score
 
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """Which Gaussians have to go after an iteration; None where it is not one to look."""

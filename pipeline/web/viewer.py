@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from jinja2 import Environment
 from markupsafe import Markup
 
@@ -27,6 +27,7 @@ POLICY = (
 )
 MOST_POINTS = 150_000  # that the page carries, 15 bytes each; more are thinned out evenly
 SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis: what is within is the scene
+NEARLY_ALL = 0.9  # of the points in focus: a few on the other side are no reason to begin from afar
 NEAR_PER_SIZE = 1e-3  # where the caller states no near plane
 
 
@@ -74,6 +75,7 @@ class ViewerScene:
         near: Gaussians nearer than this are not drawn, world units; 0 for a share of the scene's size.
         sky: In front of the background; None for none.
         note: A sentence about the frame and its accuracy, for the help.
+        focus: Which sparse points the page begins at, and turns about; None for all.
     """
 
     title: str
@@ -88,6 +90,7 @@ class ViewerScene:
     near: float = 0.0
     sky: ViewerSky | None = None
     note: str = ""
+    focus: Bool[np.ndarray, " n"] | None = None
 
 
 def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
@@ -124,16 +127,24 @@ def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
 
 
 def start_camera(scene: ViewerScene) -> int:
-    """The camera to begin from: the one that shows the most sparse points, the first of equals."""
+    """The camera to begin from: the one that shows the most sparse points, the first of equals.
+
+    Where the page has a focus, many show all of it: the nearest of those that show nearly as much as any.
+    """
     if not len(scene.points):
         return 0
-    return int(np.argmax([len(shown.camera.in_view(scene.points)[0]) for shown in scene.cameras]))
+    if scene.focus is None or not scene.focus.any():
+        return int(np.argmax([len(shown.camera.in_view(scene.points)[0]) for shown in scene.cameras]))
+    seen = [shown.camera.in_view(scene.points[scene.focus])[2] for shown in scene.cameras]
+    enough = NEARLY_ALL * max(len(depths) for depths in seen)
+    return int(np.argmin([np.median(depths) if len(depths) >= max(enough, 1.0) else np.inf for depths in seen]))
 
 
 def _facts(scene: ViewerScene) -> dict[str, Any]:
     points, colours = _thinned(scene)
     centres = np.array([shown.camera.centre() for shown in scene.cameras])
-    least, most = np.quantile(points if len(points) else centres, SIZE_QUANTILES, axis=0)
+    shown = points if scene.focus is None or not scene.focus.any() else scene.points[scene.focus]
+    least, most = np.quantile(shown if len(shown) else centres, SIZE_QUANTILES, axis=0)
     size = float(np.linalg.norm(most - least)) or 1.0
     return {
         "title": scene.title,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from splatpipe.demo import CAPTURE
 from splatpipe.demo.truth import true_surface
+from splatpipe.pipeline.engine.source import ABSENT
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
 from splatpipe.pipeline.sfm.sparse_model import write_model
@@ -166,6 +167,7 @@ def capture_parts(
         "ingest.photos": folder,
         "ingest.cameras": folder / "cameras.json",
         "source.control": folder / "gcp_list.txt",
+        "source.boundary": ABSENT,
     }
 
 

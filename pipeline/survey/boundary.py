@@ -1,0 +1,172 @@
+"""A boundary laid onto the model: within it Gaussians are spent and figures count, what is outside is a backdrop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring
+from splatpipe.pipeline.survey.boundary_file import WGS84, Drawing, read_boundary
+from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
+from splatpipe.pipeline.survey.frames import Frame
+
+FORMAT = 1
+WITHOUT = "Or go without a boundary: --set georef.boundary=none."
+DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+LARGEST_DEGREES = (180.0, 90.0)
+DEGREE_DIGITS = 8  # a millimetre
+FEW_POINTS = 100  # of the sparse model inside: a start that tells little of a building
+
+
+@dataclass(frozen=True, eq=False)
+class Boundary:
+    """A boundary in the world frame.
+
+    Attributes:
+        area: East and north, metres.
+        degrees: The same polygons as longitude and latitude, WGS 84: its vertices, ring by ring.
+        share: Of the sparse points that lie inside, 0..1.
+    """
+
+    area: PlanArea
+    degrees: tuple[tuple[Ring, ...], ...]
+    share: float
+
+
+def lay_boundary(
+    path: Path, frame: Frame, points: Float64[np.ndarray, "n 3"], out: Path, report: Reporter
+) -> dict[str, JSON]:
+    """Write the part `georef.boundary`: the polygons in the world frame and in the model's, none where none are drawn.
+
+    Args:
+        path: The user's file; one that is not there for no boundary.
+        frame: georef's.
+        points: Sparse points in the model's frame.
+        out: The file to write.
+        report: Told of what lies inside.
+
+    Returns:
+        What the stage's summary says of it.
+
+    Raises:
+        SplatpipeError: if the file is broken, the model lies nowhere on the earth, or nothing of it lies inside.
+    """
+    if not path.is_file():  # no number of the frame in it: training does not depend on that, then
+        write_json(out, {"format": FORMAT, "world": None, "model": None, "degrees": None})
+        return {}
+    drawing = read_boundary(path)
+    boundary = placed(drawing, frame, frame.world_from_model.apply(points))
+    _tell(drawing, boundary, len(points), report)
+    value = {
+        "format": FORMAT,
+        "world": boundary.area.facts(),
+        "model": boundary.area.in_source(frame.world_from_model).facts(),
+        "degrees": [[np.round(ring, DEGREE_DIGITS).tolist() for ring in polygon] for polygon in boundary.degrees],
+    }
+    write_json(out, value)
+    return {"boundary_m2": round(boundary.area.size(), 2), "boundary_points": round(boundary.share, 4)}
+
+
+def placed(drawing: Drawing, frame: Frame, points: Float64[np.ndarray, "n 3"]) -> Boundary:
+    """Bring a boundary into the world frame.
+
+    Args:
+        drawing: As it was read.
+        frame: georef's.
+        points: Sparse points in the world frame.
+
+    Raises:
+        SplatpipeError: if the frame lies nowhere, the CRS cannot be used there, or no point lies inside.
+    """
+    if frame.origin is None:
+        raise SplatpipeError(
+            f"The boundary {drawing.name} cannot be laid onto a model without coordinates: {frame.note}".rstrip("."),
+            f"Give the photos' positions (geo.txt) or control points. {WITHOUT}",
+        )
+    text = drawing.crs or _crs_of(drawing, frame)
+    area, degrees = _in_world(drawing, text, frame, swapped=False)
+    inside = area.contains(points)
+    if not inside.any():
+        raise _elsewhere(drawing, text, frame, points, area)
+    return Boundary(area, degrees, float(inside.mean()))
+
+
+def _crs_of(drawing: Drawing, frame: Frame) -> str:
+    """The CRS of a file that names none: WGS 84 by RFC 7946, or the run's where the numbers are no degrees."""
+    rings = [ring for polygon in drawing.polygons for ring in polygon]
+    if all((np.abs(ring) <= LARGEST_DEGREES).all() for ring in rings):
+        return WGS84
+    if frame.crs and not parse_crs(frame.crs).is_geographic:
+        return frame.crs
+    raise SplatpipeError(
+        f"The boundary {drawing.name} names no CRS, and its coordinates are no degrees.",
+        "Save it in WGS 84 (EPSG:4326), or name the run's CRS: --set georef.crs=EPSG:n.",
+    )
+
+
+def _in_world(drawing: Drawing, crs: str, frame: Frame, swapped: bool) -> tuple[PlanArea, tuple[tuple[Ring, ...], ...]]:
+    """The polygons in east and north, metres, and in longitude and latitude; coordinates ``swapped`` on the way."""
+    assert frame.origin is not None
+    every = np.concatenate([ring for polygon in drawing.polygons for ring in polygon])
+    stated = np.column_stack([every[:, ::-1] if swapped else every, np.full(len(every), np.nan)])
+    geodetic = to_geodetic(stated, parse_crs(crs), frame.approximate_crs).geodetic
+    geodetic[:, 2] = frame.origin.height_m  # in plan all heights are one
+    plan = frame.origin.enu_from_geodetic(geodetic)[:, :2]
+    world, degrees, start = [], [], 0
+    for polygon in drawing.polygons:
+        ends = start + np.cumsum([len(ring) for ring in polygon])
+        spans = list(zip([start, *ends[:-1].tolist()], ends.tolist(), strict=True))
+        world.append(tuple(plan[a:b] for a, b in spans))
+        degrees.append(tuple(geodetic[a:b, 1::-1] for a, b in spans))
+        start = int(ends[-1])
+    return PlanArea.seen_from_above(world), tuple(degrees)
+
+
+def _elsewhere(
+    drawing: Drawing, crs: str, frame: Frame, points: Float64[np.ndarray, "n 3"], area: PlanArea
+) -> SplatpipeError:
+    """Where a boundary lies that holds nothing of the model, and why that may be."""
+    vertices = np.concatenate([ring for polygon in area.polygons for ring in polygon])
+    middle = np.median(points[np.isfinite(points).all(axis=1)], axis=0)[:2]
+    apart = vertices - middle
+    nearest = apart[np.argmin(np.square(apart).sum(axis=1))]
+    away = float(np.hypot(*nearest))
+    direction = DIRECTIONS[round(math.atan2(nearest[1], nearest[0]) / (math.pi / 4.0)) % 8]
+    hint = f"Check its place and its CRS, taken for {parse_crs(crs).name}. {WITHOUT}"
+    try:
+        if _in_world(drawing, crs, frame, swapped=True)[0].contains(points).any():
+            hint = "Its coordinates are swapped: GeoJSON has the longitude (or easting) first."
+    except SplatpipeError:  # the other way round they are nowhere
+        pass
+    told = f"{away / 1000.0:,.1f} km" if away >= 1000.0 else f"{away:.0f} m"
+    return SplatpipeError(
+        f"Nothing of the model lies inside the boundary {drawing.name}, {told} {direction} of its middle.", hint
+    )
+
+
+def _tell(drawing: Drawing, boundary: Boundary, points: int, report: Reporter) -> None:
+    if drawing.crossing:
+        x, y = drawing.crossing
+        report.warning(
+            f"The boundary {drawing.name} crosses itself near {x:.10g}, {y:.10g}.",
+            "What is enclosed twice counts as outside; draw it without crossings.",
+        )
+    if drawing.passed_over:
+        report.warning(f"The boundary {drawing.name} has points or lines, too, which bound nothing.")
+    inside = round(boundary.share * points)
+    if inside < FEW_POINTS:
+        report.warning(
+            f"Only {inside} points of the sparse model lie inside the boundary.",
+            "Check its place: positions without corrections (RTK) may be metres off.",
+        )
+    report.note(
+        f"boundary: {boundary.area.size():,.0f} m², {100.0 * boundary.share:.0f} % of the sparse points inside; "
+        "what is outside stays coarse"
+    )

@@ -1,0 +1,220 @@
+"""A boundary as people draw it in QGIS and the like: the polygons of a GeoJSON file, from an untrusted hand.
+
+RFC 7946 (GeoJSON) knows WGS 84 alone; the specification of 2008 before it has a member `crs`, which programs still
+write. Coordinates are east (or longitude) first in both.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.plan_area import Polygon, Ring, signed_area
+
+LARGEST_FILE = 8 << 20  # bytes: a hundred times what a detailed outline takes
+MOST_VERTICES = 20_000  # of all rings: finer than any boundary that was drawn or measured
+DEEPEST = 8  # collections within collections
+LARGEST = 1e9  # of a coordinate: beyond it there is no earth
+EXPECTED = "Draw it as a polygon in QGIS or geojson.io, and save it as GeoJSON."
+WGS84 = "EPSG:4326"
+Vertex = Float64[np.ndarray, " 2"]
+
+_EPSG_NAMES = re.compile(
+    r"(?:urn:(?:x-)?ogc:def:crs:EPSG:[\d.]{0,8}:|https?://www\.opengis\.net/(?:def/crs/EPSG/[\d.]{1,8}/|gml/srs/epsg\.xml#)"
+    r"|EPSG:{1,2})(\d{1,6})",
+    re.IGNORECASE | re.ASCII,
+)
+_CRS84 = re.compile(
+    r"(?:urn:(?:x-)?ogc:def:crs:)?OGC:[\d.]{0,8}:?CRS84h?|.{0,40}/OGC/[\d.]{1,8}/CRS84h?", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What a boundary file holds.
+
+    Attributes:
+        name: The file's, for messages.
+        polygons: As they are stated: east (or longitude), north (or latitude).
+        crs: As ``parse_crs`` takes it; empty where the file names none.
+        passed_over: Points and lines in it, which bound nothing.
+        crossing: Where an outline crosses itself; empty where none does.
+    """
+
+    name: str
+    polygons: tuple[Polygon, ...]
+    crs: str
+    passed_over: int
+    crossing: tuple[float, ...]
+
+
+def read_boundary(path: Path) -> Drawing:
+    """Read a boundary.
+
+    Args:
+        path: A GeoJSON file: a polygon, several, or features with such geometries.
+
+    Raises:
+        SplatpipeError: if it is none, holds no polygon, or is larger, deeper or finer than any boundary.
+    """
+    value = _value(path)
+    try:
+        geometries = list(_geometries(value, 0))
+        polygons = tuple(_polygons(geometries))
+    except _BrokenError as error:
+        raise SplatpipeError(f"The boundary {path.name} {error}.", EXPECTED) from error
+    if not polygons:
+        raise SplatpipeError(f"The boundary {path.name} has no polygon.", EXPECTED)
+    crossing = next((place for polygon in polygons for ring in polygon if (place := crossing_of(ring))), ())
+    others = sum(geometry["type"] not in ("Polygon", "MultiPolygon") for geometry in geometries)
+    return Drawing(path.name, polygons, _crs(value, path.name), others, crossing)
+
+
+class _BrokenError(ValueError):
+    """What is wrong, the end of a sentence."""
+
+
+def _value(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise SplatpipeError(f"The boundary {path.name} has more than {LARGEST_FILE >> 20} MB.", EXPECTED)
+        value = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_no_number)
+    except OSError as error:
+        raise SplatpipeError(f"The boundary {path.name} cannot be read: {error.strerror}.", EXPECTED) from error
+    except (ValueError, RecursionError) as error:  # no text, no JSON, a number of a million digits, a tower of brackets
+        raise SplatpipeError(f"The boundary {path.name} is no GeoJSON.", EXPECTED) from error
+    if not isinstance(value, dict):
+        raise SplatpipeError(f"The boundary {path.name} is no GeoJSON.", EXPECTED)
+    return value
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no number")
+
+
+def _geometries(value: Any, depth: int) -> Iterator[dict[str, Any]]:
+    """The geometries of an object that has some, collections taken apart."""
+    if depth > DEEPEST:
+        raise _BrokenError(f"has collections within collections, more than {DEEPEST} deep")
+    kind = value.get("type") if isinstance(value, dict) else None
+    if kind == "FeatureCollection":
+        parts = value.get("features")
+    elif kind == "GeometryCollection":
+        parts = value.get("geometries")
+    elif kind == "Feature":
+        parts = [] if value.get("geometry") is None else [value["geometry"]]  # a row of a table without a place
+    elif kind in ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon"):
+        yield value
+        return
+    else:
+        raise _BrokenError("is no GeoJSON: something in it has no type that is known")
+    if not isinstance(parts, list):
+        raise _BrokenError(f"has a {kind} that is no list")
+    for part in parts:
+        yield from _geometries(part, depth + 1)
+
+
+def _polygons(geometries: list[dict[str, Any]]) -> Iterator[Polygon]:
+    left = MOST_VERTICES
+    for geometry in geometries:
+        if geometry["type"] not in ("Polygon", "MultiPolygon"):
+            continue
+        stated = geometry.get("coordinates")
+        for rings in [stated] if geometry["type"] == "Polygon" else _listed(stated):
+            polygon = []
+            for ring in _listed(rings):
+                left -= len(_listed(ring))
+                if left < 0:
+                    raise _BrokenError(f"has more than {MOST_VERTICES:,} vertices")
+                polygon.append(_ring(ring))
+            if polygon:  # an empty one is valid, and nothing
+                yield tuple(polygon)
+
+
+def _listed(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise _BrokenError("has coordinates that are no list of positions")
+    return value
+
+
+def _ring(stated: list[Any]) -> Ring:
+    """A ring's vertices, none twice in a row, the first not again at the end."""
+    ring = np.array([_position(position) for position in stated], np.float64).reshape(-1, 2)
+    ring = ring[np.any(ring != np.roll(ring, -1, axis=0), axis=1)] if len(ring) else ring
+    if len(ring) < 3 or signed_area(ring) == 0.0:
+        raise _BrokenError("has a ring without an area")
+    return ring
+
+
+def _position(stated: Any) -> tuple[float, float]:
+    numbers = _listed(stated)[:2]
+    for number in numbers:
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) <= LARGEST:
+            raise _BrokenError("has a coordinate that is no number of this earth")
+    if len(numbers) < 2:
+        raise _BrokenError("has a position without two coordinates")
+    return float(numbers[0]), float(numbers[1])
+
+
+def _crs(value: dict[str, Any], name: str) -> str:
+    """The CRS that a file names by the specification of 2008; empty where it names none."""
+    stated = value.get("crs")
+    if stated is None:
+        return ""
+    properties = stated.get("properties") if isinstance(stated, dict) else None
+    text = properties.get("name") if isinstance(properties, dict) else None
+    if not isinstance(text, str) or stated.get("type") not in ("name", "EPSG"):
+        hint = "Save it in WGS 84 (EPSG:4326), which GeoJSON has by default."
+        raise SplatpipeError(f"The boundary {name} does not name its CRS, but points to it.", hint)
+    if match := _EPSG_NAMES.fullmatch(text.strip()):
+        return f"EPSG:{int(match[1])}"
+    return WGS84 if _CRS84.fullmatch(text.strip()) else text.strip()
+
+
+def crossing_of(ring: Ring) -> tuple[float, ...]:
+    """Where a ring crosses itself, two coordinates; empty where it does not.
+
+    Args:
+        ring: Its vertices, none twice in a row.
+    """
+    following = np.roll(ring, -1, axis=0)
+    low, high = np.minimum(ring, following), np.maximum(ring, following)
+    order = np.argsort(low[:, 0], kind="stable")
+    starts = low[order, 0]
+    for place, k in enumerate(order.tolist()):
+        others = order[place + 1 : np.searchsorted(starts, high[k, 0], side="right")]
+        near = (low[others, 1] <= high[k, 1]) & (high[others, 1] >= low[k, 1])
+        apart = (others - k) % len(ring)
+        others = others[near & (apart != 1) & (apart != len(ring) - 1)]
+        met = others[_meet(ring[k], following[k], ring[others], following[others])]
+        if len(met):
+            there = _meeting(ring[k], following[k], ring[met[0]], following[met[0]])
+            return float(there[0]), float(there[1])
+    return ()
+
+
+def _side(
+    a: Float64[np.ndarray, "*n 2"], b: Float64[np.ndarray, "*n 2"], c: Float64[np.ndarray, "*m 2"]
+) -> Float64[np.ndarray, "*k"]:
+    """On which side of the line from a to b each c lies."""
+    first, second = b - a, c - a
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+
+
+def _meet(a: Vertex, b: Vertex, c: Ring, d: Ring) -> Bool[np.ndarray, " k"]:
+    """Which segments from c to d the one from a to b crosses; touching is none."""
+    return np.asarray((_side(a, b, c) * _side(a, b, d) < 0.0) & (_side(c, d, a) * _side(c, d, b) < 0.0))
+
+
+def _meeting(a: Vertex, b: Vertex, c: Vertex, d: Vertex) -> Vertex:
+    """Where the line from a to b crosses the segment from c to d."""
+    from_c, from_d = float(_side(a, b, c)), float(_side(a, b, d))
+    return np.asarray(c + from_c / (from_c - from_d) * (d - c))

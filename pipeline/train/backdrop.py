@@ -1,0 +1,63 @@
+"""Outside of a boundary the splat stays coarse: density control gives what is there no more than a backdrop's share.
+
+Where Gaussians may be, they go by the same score as everywhere. Those of the inside that wander out count as outside.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.splat.backdrop import backdrop_limit
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.densify import DensitySchedule
+from splatpipe.pipeline.train.hooks import Technique
+
+
+class Backdrop(Technique):
+    """Keeps what is outside coarse.
+
+    Args:
+        area: What counts, in the model's frame.
+        density: The training's schedule of density control.
+    """
+
+    name = "backdrop"
+
+    def __init__(self, area: PlanArea, density: DensitySchedule) -> None:
+        self._area, self._density = area, density
+
+    def ranked(
+        self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
+    ) -> Float[Tensor, " n"]:
+        """The same, but 0 for those outside that would be more than the backdrop has room for."""
+        outside = self._outside_of(gaussians)
+        room = max(0, self._limit(outside) - int(outside.sum()))
+        wanted = torch.nonzero(outside & (score > schedule.gradient)).flatten()
+        best = torch.argsort(score[wanted], descending=True, stable=True)
+        score = score.clone()
+        score[wanted[best[room:]]] = 0.0
+        return score
+
+    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+        """The least opaque of those outside that are more than the backdrop's share; None between steps of density."""
+        if not self._density.is_step(iteration):
+            return None
+        outside = self._outside_of(gaussians)
+        surplus = int(outside.sum()) - self._limit(outside)
+        gone = torch.zeros_like(outside)
+        if surplus > 0:
+            rows = torch.nonzero(outside).flatten()
+            order = torch.argsort(gaussians.opacity_logits[rows], stable=True)
+            gone[rows[order[:surplus]]] = True
+        return gone
+
+    def _outside_of(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
+        means = gaussians.means.detach()
+        inside = self._area.contains(means.double().cpu().numpy())
+        return torch.from_numpy(~inside).to(means.device)
+
+    def _limit(self, outside: Bool[Tensor, " n"]) -> int:
+        return backdrop_limit(len(outside) - int(outside.sum()), self._density.cap)
