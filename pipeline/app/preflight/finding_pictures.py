@@ -1,0 +1,99 @@
+"""Small pictures of the photos that findings are about: few, small, and where it tells more, pixel by pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.app.page_file import shown
+from splatpipe.pipeline.app.preflight.findings import Finding, PhotoFacts, Preflight
+from splatpipe.pipeline.app.report.wording import number
+from splatpipe.pipeline.app.thumbnails import Thumbnail, cut_out, thumbnail
+from splatpipe.pipeline.photos.photo_list import photo_root
+
+SIDE = 260  # pixels of a picture's longer side
+CUT = (260, 195)  # photo pixels of a cut-out: blur of a pixel or two is seen in no shrunk picture
+MOST_A_FINDING = 8
+MOST_PICTURES = 40  # on the page: below a megabyte, and a second or two of decoding
+MOST_CUTS = 8  # of these cut-outs, for which a photo is decoded whole
+CLOSE = ("blurred",)  # findings whose photos are shown pixel by pixel
+SHARP = 0.9  # a neighbour to compare with is as sharp as the others, or nearly
+
+
+@dataclass(frozen=True)
+class FindingPicture:
+    """A picture under a finding.
+
+    Attributes:
+        name: Of the photo, as people can read it.
+        picture: None where the photo cannot be read.
+        fact: What was measured of it, in words; may be empty.
+        beside: It is not one of the finding's, and stands there to compare with.
+    """
+
+    name: str
+    picture: Thumbnail | None
+    fact: str
+    beside: bool = False
+
+
+def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
+    """Pictures for each finding, in their order; the first findings, which are the worst, take what there may be."""
+    photos = {photo.name: photo for photo in preflight.photos}
+    root = photo_root(preflight.folder)
+    left, cuts = MOST_PICTURES, MOST_CUTS
+    every = []
+    for finding in preflight.findings:
+        pictures: list[FindingPicture] = []
+        for name in finding.photos[: min(MOST_A_FINDING, left)]:
+            close = finding.code in CLOSE and cuts > 0
+            cuts -= close
+            pictures.append(_pictured(root, name, finding, photos.get(name), close=close))
+        if finding.code in CLOSE and pictures and cuts > 0:
+            other = _sharp_neighbour(preflight, finding.photos[0])
+            if other is not None:
+                cuts -= 1
+                pictures.insert(1, _pictured(root, other.name, finding, other, close=True, beside=True))
+        left = max(0, left - len(pictures))
+        every.append(pictures)
+    return every
+
+
+def facts_in_words(finding: Finding, photo: PhotoFacts | None) -> str:
+    """What was measured of a photo that has to do with a finding."""
+    if photo is None:
+        return ""
+    if finding.code in CLOSE and photo.sharpness is not None:
+        return f"{photo.sharpness:.0%} as sharp as its neighbours".replace("%", " %")
+    if any(word in finding.code for word in ("expos", "bright", "dark")):
+        if photo.brightness_ev is not None:
+            return f"{photo.brightness_ev:+.1f} EV".replace("-", "−")
+        return f"mean grey level {number(photo.mean_level, 0)} of 255" if photo.mean_level is not None else ""
+    if any(word in finding.code for word in ("size", "camera", "resized", "focal")):
+        return f"{photo.width:,} × {photo.height:,} pixels"
+    return ""
+
+
+def _pictured(
+    root: Path, name: str, finding: Finding, photo: PhotoFacts | None, *, close: bool, beside: bool = False
+) -> FindingPicture:
+    path = root / name
+    inside = ".." not in Path(name).parts and not Path(name).is_absolute()
+    picture = None
+    if inside:
+        picture = cut_out(path, *CUT) if close else thumbnail(path, SIDE)
+    return FindingPicture(shown(name), picture, facts_in_words(finding, photo), beside)
+
+
+def _sharp_neighbour(preflight: Preflight, name: str) -> PhotoFacts | None:
+    """The sharp photo that shows most of what another one shows."""
+    numbers: Mapping[str, int] = {photo.name: i for i, photo in enumerate(preflight.photos)}
+    own = numbers.get(name)
+    beside: Sequence[tuple[int, int]] = [
+        (pair.matches, pair.second if pair.first == own else pair.first)
+        for pair in preflight.pairs
+        if own in (pair.first, pair.second)
+    ]
+    sharp = [(n, i) for n, i in beside if (preflight.photos[i].sharpness or 0.0) >= SHARP]
+    return preflight.photos[max(sharp)[1]] if sharp else None

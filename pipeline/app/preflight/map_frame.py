@@ -1,0 +1,89 @@
+"""The frame of a capture's map: which metres it shows, and where they lie in the drawing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from splatpipe.pipeline.app.preflight.findings import Place, Preflight
+
+WIDTH = 2000  # of the drawing, in its own units: whole numbers are fine enough, and short
+NARROWEST, HIGHEST = 0.4, 1.0  # height over width
+MARGIN = 0.06  # of the longer side, around what is shown
+REACH = 0.5  # of the photos' span: footprints of slanting views and points that lie further out are cut off
+LEAST_SPAN_M = 10.0  # a capture from one spot still has a map
+SCALE_SHARE = 0.25  # of the width, that the scale's bar takes at most
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """East and north to the drawing's right and down.
+
+    Attributes:
+        west: Of the left edge, metres.
+        north: Of the upper edge.
+        metres: Across the drawing.
+        height: Of the drawing, in its units; it is `WIDTH` wide.
+    """
+
+    west: float
+    north: float
+    metres: float
+    height: int
+
+    def point(self, place: Sequence[float]) -> tuple[int, int]:
+        """Where a place lies in the drawing, right and down."""
+        scale = WIDTH / self.metres
+        return round((place[0] - self.west) * scale), round((self.north - place[1]) * scale)
+
+    def holds(self, place: Sequence[float]) -> bool:
+        """Whether a place lies within the drawing."""
+        x, y = self.point(place)
+        return 0 <= x <= WIDTH and 0 <= y <= self.height
+
+    def at_edge(self, place: Sequence[float]) -> tuple[int, int]:
+        """Where the way from the middle to a place beyond the drawing leaves it, a little within."""
+        x, y = self.point(place)
+        right, down = x - WIDTH / 2, y - self.height / 2
+        inside = min(0.47 * WIDTH / max(abs(right), 1e-9), 0.46 * self.height / max(abs(down), 1e-9))
+        return round(WIDTH / 2 + inside * right), round(self.height / 2 + inside * down)
+
+    def path(self, outline: Iterable[Sequence[float]]) -> str:
+        """A closed outline as an SVG path."""
+        return "M" + "L".join(f"{x} {y}" for x, y in map(self.point, outline)) + "Z"
+
+    @property
+    def scale_bar(self) -> tuple[int, float]:
+        """A round length that is easy to compare with: in the drawing's units, and in metres."""
+        most = SCALE_SHARE * self.metres
+        power = 10.0 ** math.floor(math.log10(most))
+        length = next(step * power for step in (5.0, 2.0, 1.0) if step * power <= most)
+        return round(length / self.metres * WIDTH), length
+
+
+def frame_of(preflight: Preflight) -> MapFrame | None:
+    """The frame that shows all photos with a position, what they show, gaps and control near them; None without any."""
+    taken = [photo.position_m[:2] for photo in preflight.photos if photo.position_m is not None]
+    if not taken:
+        return None
+    reach = REACH * max(_span(taken, 0), _span(taken, 1), LEAST_SPAN_M)
+    shown: list[Place] = [place for photo in preflight.photos for place in photo.footprint_m or ()]
+    shown += [place for gap in preflight.gaps for place in gap.outline_m]
+    low, high = ([bound(place[axis] for place in taken) for axis in (0, 1)] for bound in (min, max))
+    for point in (point.position_m for point in preflight.control):
+        if all(low[axis] - reach <= point[axis] <= high[axis] + reach for axis in (0, 1)):
+            shown.append(point)
+    for axis in (0, 1):
+        near = [min(max(place[axis], low[axis] - reach), high[axis] + reach) for place in shown]
+        low[axis], high[axis] = min([low[axis], *near]), max([high[axis], *near])
+    east, north = (high[0] + low[0]) / 2, (high[1] + low[1]) / 2
+    margin = MARGIN * max(high[0] - low[0], high[1] - low[1], LEAST_SPAN_M)
+    wide, tall = high[0] - low[0] + 2 * margin, high[1] - low[1] + 2 * margin
+    tall = max(tall, NARROWEST * wide)
+    wide = max(wide, tall / HIGHEST)
+    return MapFrame(east - wide / 2, north + tall / 2, wide, round(WIDTH * tall / wide))
+
+
+def _span(places: Sequence[Sequence[float]], axis: int) -> float:
+    return max(place[axis] for place in places) - min(place[axis] for place in places)

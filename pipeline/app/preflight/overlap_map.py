@@ -1,0 +1,233 @@
+"""The map of overlap as SVG: what photos show, which of them match, where they were taken, gaps, orphans and control.
+
+Without positions the photos stand in a ring, in the order of their names. Colours are the style's, right in light
+and dark; dots and lines keep their width whatever the screen's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup, escape
+
+from splatpipe.pipeline.app.page_file import shown, told
+from splatpipe.pipeline.app.preflight.coverage import covered, shades
+from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
+from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
+from splatpipe.pipeline.app.report.wording import count, length, plural
+
+MOST_PAIRS = 5_000  # lines; of more, those come first that hold photos which few others hold
+STRENGTHS = ((0, "weak"), (40, "fair"), (120, "strong"))  # from so many matches on
+CLEAR_PAIRS = 120  # lines that may be drawn in full; more of them are fainter, so that what is below shows through
+FAINTEST = 0.25
+MOST_NAMED = 40  # control points with their names on the map
+RADIUS, MIDDLE = 880, 1000  # of the ring
+LONGEST_TITLE = 120  # characters of a name that a pointer is told
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A map.
+
+    Attributes:
+        svg: The element.
+        kind: ``map``, or ``ring`` without positions.
+        layers: What can be hidden: name in the style, title; those of which there is nothing are left out.
+        unplaced: Photos without a position, which are not on the map.
+    """
+
+    svg: Markup
+    kind: str
+    layers: tuple[tuple[str, str], ...]
+    unplaced: int
+
+
+def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> Drawing | None:
+    """Draw a capture.
+
+    Args:
+        preflight: What was found.
+        doubtful: For photos that findings are about, what they say, in a few words.
+
+    Returns:
+        None without photos.
+    """
+    if not preflight.photos:
+        return None
+    frame = frame_of(preflight)
+    if frame is None:
+        places = _ring(len(preflight.photos))
+        drawn = {"pairs": _pairs(preflight.pairs, places, curved=True)}
+        size, kind = (2 * MIDDLE, 2 * MIDDLE), "ring"
+    else:
+        places = {i: frame.point(it.position_m) for i, it in enumerate(preflight.photos) if it.position_m is not None}
+        outlines = [it.footprint_m for it in preflight.photos if it.footprint_m and len(it.footprint_m) > 2]
+        drawn = {
+            "overlap": _overlap(frame, outlines),
+            "footprints": _path("footprint", "".join(map(frame.path, outlines))),
+            "gaps": _gaps(frame, preflight),
+            "pairs": _pairs(preflight.pairs, places, curved=False),
+        }
+        size, kind = (WIDTH, frame.height), "map"
+    drawn["photos"] = _photos(preflight, places, doubtful)
+    if frame is not None:
+        drawn["control"] = _control(frame, preflight)
+    groups = "".join(f'<g class="layer-{name}">{inner}</g>' for name, inner in drawn.items() if inner)
+    titles = {
+        "overlap": "overlap",
+        "footprints": "outlines",
+        "gaps": "gaps",
+        "pairs": "matched pairs",
+        "photos": "photos",
+        "control": "control points",
+    }
+    return Drawing(
+        svg=_svg(size, _summary(preflight, kind), groups + (_scale(frame) if frame is not None else "")),
+        kind=kind,
+        layers=tuple((name, titles[name]) for name, inner in drawn.items() if inner),
+        unplaced=len(preflight.photos) - len(places),
+    )
+
+
+def _svg(size: tuple[int, int], summary: str, inner: str) -> Markup:
+    hatch = (
+        '<defs><pattern id="hatch" width="44" height="44" patternUnits="userSpaceOnUse" '
+        'patternTransform="rotate(45)"><path class="hatch" d="M0 0v44"/></pattern></defs>'
+    )
+    box = f"0 0 {size[0]} {size[1]}"
+    return Markup(f'<svg viewBox="{box}" role="img" aria-label="{escape(summary)}">{hatch}{inner}</svg>')
+
+
+def _summary(preflight: Preflight, kind: str) -> str:
+    """What the picture shows, for those who cannot see it."""
+    what = "Map of the photos" if kind == "map" else "The photos in a ring, in the order of their names"
+    told = [plural(len(preflight.photos), "photo"), plural(len(preflight.pairs), "pair") + " compared"]
+    told += [plural(len(preflight.gaps), "gap"), plural(len(preflight.orphans), "photo") + " that match no other"]
+    return f"{what}: {', '.join(told)}."
+
+
+def _path(name: str, d: str, title: str = "") -> str:
+    inner = f"<title>{escape(told(title))}</title>" if title else ""
+    return f'<path class="{name}" d="{d}">{inner}</path>' if d else ""
+
+
+def _overlap(frame: MapFrame, outlines: Sequence[Sequence[Sequence[float]]]) -> str:
+    paths = shades(covered(frame, outlines)) if outlines else []
+    return "".join(_path(f"cover{step}", d) for step, d in enumerate(paths, start=1))
+
+
+def _gaps(frame: MapFrame, preflight: Preflight) -> str:
+    drawn = []
+    for number, gap in enumerate(preflight.gaps, start=1):
+        if len(gap.outline_m) < 3:
+            continue
+        x, y = (sum(values) / len(gap.outline_m) for values in zip(*map(frame.point, gap.outline_m), strict=True))
+        drawn.append(_path("gap", frame.path(gap.outline_m), gap.text))
+        drawn.append(f'<text class="gap-number" x="{x:.0f}" y="{y:.0f}">{number}</text>')
+    return "".join(drawn)
+
+
+def _pairs(pairs: Sequence[MatchedPair], places: Mapping[int, tuple[int, int]], *, curved: bool) -> str:
+    """The matched pairs, in a path for each strength."""
+    known = [pair for pair in pairs if pair.matches > 0 and pair.first in places and pair.second in places]
+    paths = dict.fromkeys((name for _, name in STRENGTHS), "")
+    for pair in _strongest(known):
+        (x0, y0), (x1, y1) = places[pair.first], places[pair.second]
+        name = [name for least, name in STRENGTHS if pair.matches >= least][-1]
+        if curved:  # towards the middle, the more so the further apart
+            pull = 0.75 * min(1.0, math.hypot(x1 - x0, y1 - y0) / RADIUS)
+            x, y = ((a + b) / 2 * (1 - pull) + MIDDLE * pull for a, b in ((x0, x1), (y0, y1)))
+            paths[name] += f"M{x0} {y0}Q{x:.0f} {y:.0f} {x1} {y1}"
+        else:
+            paths[name] += f"M{x0} {y0}L{x1} {y1}"
+    lines = "".join(_path(f"pair {name}", d) for name, d in paths.items())
+    clear = max(FAINTEST, min(1.0, math.sqrt(CLEAR_PAIRS / max(len(known), 1))))
+    return f'<g opacity="{clear:.2f}">{lines}</g>' if lines else ""
+
+
+def _strongest(pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
+    """The pairs to draw, the weakest first; of too many, each photo's best before the rest."""
+    ranked = sorted(pairs, key=lambda pair: (-pair.matches, pair.first, pair.second))
+    if len(ranked) > MOST_PAIRS:
+        held: dict[int, int] = {}
+        needed = []  # how little the photo of a pair that has fewer lines by then is held
+        for pair in ranked:
+            needed.append(min(held.get(pair.first, 0), held.get(pair.second, 0)))
+            for photo in (pair.first, pair.second):
+                held[photo] = held.get(photo, 0) + 1
+        order = sorted(range(len(ranked)), key=lambda i: (needed[i], i))
+        ranked = [ranked[i] for i in order[:MOST_PAIRS]]
+    return sorted(ranked, key=lambda pair: (pair.matches, pair.first, pair.second))
+
+
+def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtful: Mapping[str, str]) -> str:
+    """A dot a photo: those in doubt, in a piece apart, and orphans are marked, and drawn above the others."""
+    pieces = {photo: number for number, piece in enumerate(preflight.components) for photo in piece}
+    orphans = set(preflight.orphans) if len(preflight.photos) > 1 else set()
+    drawn: dict[str, list[str]] = {"plain": [], "apart": [], "doubtful": [], "orphan": []}
+    for i, (x, y) in places.items():
+        photo = preflight.photos[i]
+        title = shown(photo.name)[:LONGEST_TITLE]
+        kind = "plain"
+        if pieces.get(i, 0) > 0:
+            kind, title = "apart", f"{title}: in piece {pieces[i] + 1}, apart from the rest"
+        if photo.name in doubtful:
+            kind, title = "doubtful", f"{title}: {doubtful[photo.name]}"
+        if i in orphans:
+            kind, title = "orphan", f"{title}: matches no other photo"
+        marks = _path(f"photo {kind}", f"M{x} {y}h0", title)
+        if kind == "orphan":
+            marks += _path("cross", f"M{x - 14} {y - 14}l28 28m-28 0l28 -28")
+        drawn[kind].append(marks)
+    return "".join(mark for marks in drawn.values() for mark in marks)
+
+
+def _control(frame: MapFrame, preflight: Preflight) -> str:
+    drawn = []
+    for point in preflight.control:
+        inside = frame.holds(point.position_m)
+        x, y = frame.point(point.position_m) if inside else frame.at_edge(point.position_m)
+        name = shown(point.name)[:LONGEST_TITLE]
+        title = f"{point.kind} point {name}"
+        if not inside:
+            off = math.dist(point.position_m, (frame.west + frame.metres / 2, frame.north - _tall(frame) / 2))
+            title += f": {length(off)} from the middle of the map, beyond it"
+        elif point.photos is not None:
+            title += f": {count(point.photos)} photos may show it"
+        poor = " poor" if not inside or point.photos == 0 else ""
+        drawn.append(_path(f"control {point.kind}{poor}", f"M{x} {y - 22}l20 36h-40z", title))
+        if len(preflight.control) <= MOST_NAMED:
+            side = "end" if x > 0.85 * WIDTH else "start"
+            away = -30 if side == "end" else 30
+            drawn.append(
+                f'<text class="name" text-anchor="{side}" x="{x + away}" y="{y + 12}">{escape(_short(name))}</text>'
+            )
+    return "".join(drawn)
+
+
+def _tall(frame: MapFrame) -> float:
+    return frame.height / WIDTH * frame.metres
+
+
+def _short(name: str, most: int = 16) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def _scale(frame: MapFrame) -> str:
+    units, metres = frame.scale_bar
+    y = frame.height - 40
+    text = f"{metres:,.0f} m" if metres >= 1.0 else f"{metres:.1f} m"
+    bar = f'<path class="scale" d="M40 {y - 16}v16h{units}v-16"/><text class="name" x="56" y="{y - 16}">{text}</text>'
+    north = f'<path class="scale" d="M{WIDTH - 60} 110v-70m-18 26l18 -26l18 26"/>'
+    return f'{bar}{north}<text class="name" text-anchor="middle" x="{WIDTH - 60}" y="160">N</text>'
+
+
+def _ring(photos: int) -> dict[int, tuple[int, int]]:
+    """Where each photo stands in the ring, from the top to the right."""
+    angles: Iterable[float] = (2.0 * math.pi * i / max(photos, 1) for i in range(photos))
+    return {
+        i: (round(MIDDLE + RADIUS * math.sin(angle)), round(MIDDLE - RADIUS * math.cos(angle)))
+        for i, angle in enumerate(angles)
+    }

@@ -1,0 +1,171 @@
+"""The preflight's page: the verdict first, the map of overlap, findings with pictures, and what a run would take."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Literal
+
+from splatpipe.pipeline.app.page_file import page_text, shown
+from splatpipe.pipeline.app.preflight.finding_pictures import FindingPicture, finding_pictures
+from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, Severity
+from splatpipe.pipeline.app.preflight.overlap_map import overlap_map
+from splatpipe.pipeline.app.report.wording import count, duration, number, plural, size
+from splatpipe.pipeline.engine.durable import write_durably
+
+TEMPLATES = Path(__file__).resolve().parent / "templates"
+MOST_FINDINGS = 200
+MOST_NAMES = 300  # photos of a finding that are named
+MOST_CONTROL = 500  # rows
+LEVELS: Mapping[Severity, Literal["note", "doubt", "bad"]] = {"error": "bad", "warning": "doubt", "note": "note"}
+SIGNS = {"bad": "✗", "doubt": "!", "note": "i"}
+
+
+@dataclass(frozen=True)
+class Told:
+    """A finding as it is drawn.
+
+    Attributes:
+        finding: What was found.
+        level: Its tone.
+        sign: That as one character.
+        pictures: Of some of its photos.
+        names: All its photos, as people can read them, up to a limit.
+        more: Photos beyond it.
+    """
+
+    finding: Finding
+    level: str
+    sign: str
+    pictures: list[FindingPicture]
+    names: list[str]
+    more: int
+
+
+def write_page(preflight: Preflight, path: Path) -> None:
+    """Write the page, whole or not at all.
+
+    Args:
+        preflight: What was found.
+        path: Where to.
+
+    Raises:
+        OSError: if it cannot be written.
+        MachineError: if this installation lacks the page's style.
+    """
+    write_durably(path, check_page(preflight))
+
+
+def check_page(preflight: Preflight) -> str:
+    """The page as one HTML text that needs nothing else.
+
+    Raises:
+        MachineError: if this installation lacks the page's style.
+    """
+    level, headline, text = _verdict(preflight)
+    pictures = finding_pictures(preflight)
+    findings = [_told(it, shown_of) for it, shown_of in zip(preflight.findings, pictures, strict=True)]
+    return page_text(
+        TEMPLATES,
+        "check.html.j2",
+        style="check.css",
+        name=preflight.folder.resolve().name or "photos",
+        version=importlib.metadata.version("splatpipe"),
+        made=_moment(preflight.when_s),
+        took=duration(preflight.seconds),
+        level=level,
+        headline=headline,
+        text=text,
+        findings=findings[:MOST_FINDINGS],
+        findings_more=max(0, len(findings) - MOST_FINDINGS),
+        facts=_facts(preflight),
+        drawing=overlap_map(preflight, _doubts(preflight)),
+        steps=("1", "2", "3–4", "5–9", "10 or more"),
+        gaps=[gap.text for gap in preflight.gaps],
+        control=preflight.control[:MOST_CONTROL],
+        control_more=max(0, len(preflight.control) - MOST_CONTROL),
+        forecasts=[
+            (it.preset, size(it.memory_bytes), duration(it.seconds), duration(it.cpu_seconds), size(it.disk_bytes),
+             it.lacking)
+            for it in preflight.forecasts
+        ],
+        machine=(
+            f"{size(preflight.machine.memory_bytes)} of memory, {plural(preflight.machine.cores, 'processor')}, "
+            f"{size(preflight.machine.free_disk_bytes)} free on the disk"
+        ),
+    )  # fmt: skip
+
+
+def _verdict(preflight: Preflight) -> tuple[str, str, str]:
+    """Level, headline and sentence that the page begins with."""
+    if not preflight.photos:
+        return "bad", "There is no photo to work with", "Nothing that can be read was found in the folder."
+    counts = Counter(finding.severity for finding in preflight.findings)
+    photos = plural(len(preflight.photos), "photo")
+    if counts["error"]:
+        more = f", and {plural(counts['warning'], 'warning')}" if counts["warning"] else ""
+        text = (
+            f"Do not leave yet: with {plural(counts['error'], 'error')}{more}, these {photos} will not do as they are."
+        )
+        return "bad", "This capture cannot be reconstructed as it is", text
+    if counts["warning"]:
+        which = "One point" if counts["warning"] == 1 else f"{counts['warning']:,} points"
+        text = f"The {photos} can be reconstructed; what is told below costs photos, accuracy or completeness."
+        return "doubt", f"{which} to see to before you leave", text
+    return "good", "Nothing stands in the way", f"The {photos} can be reconstructed, as far as can be told beforehand."
+
+
+def _told(finding: Finding, pictures: list[FindingPicture]) -> Told:
+    level = LEVELS[finding.severity]
+    names = [shown(name) for name in finding.photos]
+    return Told(finding, level, SIGNS[level], pictures, names[:MOST_NAMES], max(0, len(names) - MOST_NAMES))
+
+
+def _doubts(preflight: Preflight) -> dict[str, str]:
+    """For each photo that a warning or an error names, what its findings are called."""
+    doubts: dict[str, list[str]] = {}
+    for finding in preflight.findings:
+        if RANK[finding.severity] < RANK["note"]:
+            for name in finding.photos:
+                doubts.setdefault(name, []).append(finding.code.replace("_", " ").replace("-", " "))
+    return {name: ", ".join(dict.fromkeys(codes)) for name, codes in doubts.items()}
+
+
+def _facts(preflight: Preflight) -> list[tuple[str, str]]:
+    photos = preflight.photos
+    pixels = sum(photo.width * photo.height for photo in photos)
+    times = sorted(photo.time for photo in photos if photo.time)
+    placed = sum(photo.position_m is not None for photo in photos)
+    pieces = sum(len(piece) > 1 for piece in preflight.components)
+    matched = sum(pair.matches > 0 for pair in preflight.pairs)
+    facts = [
+        ("Photos", count(len(photos)) + (f", {count(len(preflight.left_out))} left out" if preflight.left_out else "")),
+        ("Pixels", f"{number(pixels / 1e6 / len(photos), 1)} megapixels each, on average" if photos else ""),
+        ("Cameras", count(len({photo.camera for photo in photos}))),
+        ("Taken", _span(times)),
+        ("Positions", "all" if placed == len(photos) else f"{count(placed)} of {count(len(photos))}"),
+        ("Pairs", f"{count(matched)} match of {count(len(preflight.pairs))} compared" if preflight.pairs else ""),
+        ("Pieces", f"{count(pieces)} that do not hang together" if pieces > 1 else ""),
+    ]
+    return [fact for fact in facts if fact[1]]
+
+
+def _span(times: list[str]) -> str:
+    if not times:
+        return ""
+    first, last = (time.replace("T", " ")[:16] for time in (times[0], times[-1]))
+    if first == last:
+        return first
+    return f"{first} to {last[11:] if first[:10] == last[:10] else last}"
+
+
+def _moment(seconds: float) -> str:
+    """A point in time by this machine's clock, with its zone."""
+    try:
+        return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
+    except (OverflowError, OSError, ValueError):
+        return "at an unknown time"
