@@ -10,6 +10,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from splatpipe.pipeline.app.cli_batch import batch
 from splatpipe.pipeline.app.cli_options import (
     BoundaryOption,
     ConfigOption,
@@ -66,6 +67,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.command()(batch)
 
 
 def _show_version(wanted: bool) -> None:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.engine.session import Request
     from splatpipe.stages.options import LineConfig
 
+SPENT_VARIABLE = "SPLATPIPE_SPENT_S"
+
 
 @dataclass(frozen=True)
 class Overrides:
@@ -67,7 +69,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     from splatpipe.stages.forecast import Forecaster
     from splatpipe.stages.line import LINE
 
-    began_s = round(time.monotonic(), 3)
+    began_s = round(time.monotonic() - spent_s(), 3)
     if device not in ("auto", "cpu", "cuda"):
         raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
     if device == "cuda":  # told now, not when training begins; `auto` takes the CPU where CUDA does not work
@@ -82,6 +84,14 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     machine = Machine(device, threads or available_cores(), began_s)
     foresee = Forecaster(config, machine.threads)
     return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, foresee)
+
+
+def spent_s() -> float:
+    """Seconds that commands before this one have spent on the same capture, so that a time budget counts them."""
+    try:
+        return max(0.0, float(os.environ.get(SPENT_VARIABLE, "0")))
+    except ValueError:
+        return 0.0
 
 
 def existing(out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0) -> Request:

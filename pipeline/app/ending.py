@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import tempfile
 import time
@@ -18,6 +19,7 @@ from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, Stage
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runner import Outcome
 
+PART_VARIABLE = "SPLATPIPE_PART"  # set where more stages follow at once, by other commands: a good end needs no report
 STOP_S = 4.0  # after Ctrl-C the report is over, too: an end within five seconds is promised, on a busy machine as well
 
 NOTICE_S = 4.7  # and a notice has what is left of that time,
@@ -53,7 +55,8 @@ class Ending:
         seconds = time.monotonic() - self._started_s
         if isinstance(error, GeneratorExit | SystemExit):
             return
-        if self.outcome is not None and not _insists(error):
+        step = error is None and PART_VARIABLE in os.environ
+        if self.outcome is not None and not step and not _insists(error):
             self._report(error)
         if error is None and self.outcome is not None:
             self._show(self.outcome, seconds)

@@ -116,11 +116,14 @@ class Hold:
 
 
 @contextmanager
-def locked(out: Path, *, wait: bool = False, tell: Tell = lambda _text: None) -> Iterator[Hold]:
+def locked(
+    out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell = lambda _text: None
+) -> Iterator[Hold]:
     """Hold an OUT for writing.
 
     Args:
-        out: Its folder, with ``stages/`` in it.
+        out: Its folder.
+        folder: Of ours in it, which keeps the file.
         wait: Wait for another that works in it.
         tell: Is told whom for.
 
@@ -128,7 +131,7 @@ def locked(out: Path, *, wait: bool = False, tell: Tell = lambda _text: None) ->
         UsageError: if another process works in it.
         MachineError: if its file system has no locks, or cannot be written.
     """
-    path = out / "stages" / LOCK_FILE
+    path = out / folder / LOCK_FILE
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:

@@ -1,0 +1,251 @@
+"""Where a call stands, from what lies on the disk alone: so whoever outlives a kill can tell it as well."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from splatpipe.pipeline.app.batch.pictures import capture_picture
+from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.state import BatchState, CaptureState, Level
+from splatpipe.pipeline.app.batch.tries import Try, TryLog
+from splatpipe.pipeline.app.report import REPORT_FILE
+from splatpipe.pipeline.app.report.holdings import Holdings, open_holdings
+from splatpipe.pipeline.app.report.story import read_story
+from splatpipe.pipeline.app.report.verdict import judge
+from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, SplatpipeError
+from splatpipe.pipeline.engine.machine import available_cores
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE
+
+VIEWER_FILE = "viewer.html"
+STOPPED = "It was stopped with the batch."
+GO_ON = "Repeat the command: it goes on from what is finished."
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a capture's folder of results holds; the fields are those of ``CaptureState``."""
+
+    verdict: str = ""
+    level: Level = ""
+    seconds: float = 0.0
+    figures: Mapping[str, float | int] = field(default_factory=dict)
+    picture: str = ""
+    report: str = ""
+    viewer: str = ""
+
+
+class Account:
+    """Tells where a call stands, again and again; what cannot have changed since is not read again.
+
+    Args:
+        call: Whose plan is written.
+    """
+
+    def __init__(self, call: Call) -> None:
+        self._call = call
+        self._plan = call.plan()
+        self._facts: dict[str, tuple[object, Facts]] = {}
+
+    def state(self) -> BatchState:
+        """Where it stands now."""
+        end = self._call.end()
+        ended = bool(end)
+        captures, left_s = [], {}
+        for planned in self._plan.captures:
+            capture = self._capture(planned, ended=ended)
+            captures.append(capture)
+            if capture.left_s:
+                left_s[capture.name] = capture.left_s
+        free = self._free_bytes()
+        needed = self._needed_bytes(captures)
+        return BatchState(
+            name=self._call.out.name,
+            captures=tuple(captures),
+            as_of_s=time.time(),
+            began_s=self._plan.began_s,
+            ended_s=end.get("ended_s"),
+            exit_code=end.get("exit_code"),
+            message=str(end.get("message", "")),
+            left_s=None if ended or not left_s else self._left_s(left_s),
+            free_bytes=free,
+            needed_bytes=needed,
+            warnings=(*self._plan.warnings, *_short(free, needed)),
+            unlisted=self._plan.unlisted,
+        )
+
+    def _capture(self, planned: PlannedCapture, *, ended: bool) -> CaptureState:
+        if planned.message:
+            failed = CaptureState(planned.name, "failed", planned.stage, reason=planned.message, hint=planned.hint)
+            return self._with_facts(failed, planned, ())
+        if not planned.jobs:
+            return self._with_facts(CaptureState(planned.name, "reused", progress=1.0), planned, ())
+        tries = TryLog(self._call.tries_file(planned.key)).read()
+        return self._with_facts(self._standing(planned, tries, ended=ended), planned, tries)
+
+    def _standing(self, planned: PlannedCapture, tries: Sequence[Try], *, ended: bool) -> CaptureState:
+        """Its state and what belongs to it, by its jobs' tries."""
+        done = {each.stage for each in tries if each.succeeded}
+        rest = [job for job in planned.jobs if job.stage not in done]
+        if planned.jobs[-1].stage in done:
+            return CaptureState(planned.name, "done", progress=1.0, tries=1, earlier=_reasons(tries))
+        stage = rest[0].stage
+        own = [each for each in tries if each.stage == stage]
+        told = CaptureState(planned.name, "waiting", stage, tries=len(own), earlier=_reasons(tries))
+        fraction = 0.0
+        if own and own[-1].alive and not ended:
+            fraction = self._fraction(planned, stage)
+            told = replace(told, state="running")
+        elif own and not own[-1].alive and self._is_over(own):
+            told = replace(told, state="failed", reason=own[-1].reason, hint=own[-1].hint, earlier=_reasons(tries)[:-1])
+        elif ended:
+            told = replace(told, state="stopped", reason=STOPPED, hint=GO_ON)
+        return replace(
+            told,
+            progress=_progress(planned, rest, fraction),
+            left_s=None if told.state in ("failed", "stopped") else _left_s(rest, fraction),
+        )
+
+    def _is_over(self, own: Sequence[Try]) -> bool:
+        """Whether a stage that ended badly is not begun again."""
+        last = own[-1]
+        if self._call.stop_file.exists() and last.exit_code in (None, EXIT_INTERRUPTED, EXIT_TERMINATED):
+            return False  # it was ended with the batch
+        return last.final or len(own) > self._plan.retries
+
+    def _fraction(self, planned: PlannedCapture, stage: str) -> float:
+        """How far a running stage is, by its own events."""
+        story = read_story(self._call.out / planned.name / EVENTS_FILE, running=True)
+        found = story.stages.get(stage)
+        if found is None or found.state != "running" or not found.told.progress:
+            return 0.0
+        with suppress(KeyError, TypeError, ValueError, ZeroDivisionError):
+            return min(1.0, max(0.0, float(found.told.progress["done"]) / float(found.told.progress["total"])))
+        return 0.0
+
+    def _with_facts(self, told: CaptureState, planned: PlannedCapture, tries: Sequence[Try]) -> CaptureState:
+        known = (told.state, told.stage, len(tries), tries[-1].ended_s if tries else None)
+        if self._facts.get(planned.key, (None,))[0] != known:
+            self._facts[planned.key] = (known, self._read(planned, told))
+        facts = self._facts[planned.key][1]
+        under_way = time.time() - tries[-1].began_s if told.state == "running" else 0.0
+        return replace(
+            told,
+            verdict=facts.verdict,
+            level="bad" if told.state == "failed" else facts.level,
+            seconds=round(facts.seconds + under_way, 1),
+            photos=planned.photo_count,
+            figures=facts.figures,
+            picture=facts.picture,
+            report=facts.report,
+            viewer=facts.viewer,
+        )
+
+    def _read(self, planned: PlannedCapture, told: CaptureState) -> Facts:
+        """What its folder holds, with a picture of it."""
+        facts = read_facts(self._call.out, planned.name, told.state in ("done", "reused", "failed"))
+        try:
+            folder = self._call.out
+            picture = capture_picture(folder / planned.name, Path(planned.photos), folder / BATCH_FOLDER / "pictures")
+        except OSError:  # the disk is full
+            return facts
+        return facts if picture is None else replace(facts, picture=picture.relative_to(folder).as_posix())
+
+    def _left_s(self, left_s: Mapping[str, float]) -> float:
+        """Of the whole batch: captures run side by side, as many as the machine has threads for."""
+        threads = max((job.threads for capture in self._plan.captures for job in capture.jobs), default=1)
+        beside = max(1, available_cores() // threads) if self._plan.local else len(left_s)
+        return max(*left_s.values(), sum(left_s.values()) / beside)
+
+    def _free_bytes(self) -> int | None:
+        try:
+            return shutil.disk_usage(self._call.out).free
+        except OSError:
+            return None
+
+    def _needed_bytes(self, captures: Sequence[CaptureState]) -> int:
+        """Disk that is still to be taken."""
+        over = {capture.name for capture in captures if capture.state in ("done", "reused", "failed", "stopped")}
+        needed = 0
+        for planned in self._plan.captures:
+            if planned.name not in over:
+                done = {each.stage for each in TryLog(self._call.tries_file(planned.key)).read() if each.succeeded}
+                needed += sum(job.disk_bytes for job in planned.jobs if job.stage not in done)
+        return needed
+
+
+def read_facts(out: Path, name: str, judged: bool) -> Facts:
+    """What lies in a capture's folder of results; as far as it can be read.
+
+    Args:
+        out: The batch's folder.
+        name: The capture's.
+        judged: With the verdict: nothing is to be said of what still goes on.
+    """
+    folder = out / name
+    facts = Facts(
+        report=_link(name, REPORT_FILE, folder),
+        viewer=_link(name, VIEWER_FILE, folder),
+    )
+    try:
+        holdings = open_holdings(folder)
+        verdict = judge(holdings) if judged else None
+        seconds = sum(float(artifact.manifest["seconds"]) for artifact in holdings.artifacts.values())
+        facts = replace(facts, seconds=seconds, figures=_figures(holdings))
+    except (
+        SplatpipeError,
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+    ):  # damaged: its own report says so
+        return facts
+    return facts if verdict is None else replace(facts, verdict=verdict.headline, level=verdict.level)
+
+
+def _link(name: str, file: str, folder: Path) -> str:
+    return f"{name}/{file}" if (folder / file).is_file() else ""
+
+
+def _figures(holdings: Holdings) -> dict[str, float | int]:
+    """What people ask for first."""
+    found: dict[str, float | int] = {}
+    for stage, names in (("sparse", ("registered",)), ("train", ("gaussians",)), ("evaluate", ("psnr", "ssim"))):
+        summary = holdings.summary(stage)
+        found |= {name: summary[name] for name in names if isinstance(summary.get(name), int | float)}
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        found["check_rmse_3d_m"] = float(holdings.read("georef.accuracy")["tables"]["check"]["rmse_3d_m"])
+    return found
+
+
+def _reasons(tries: Sequence[Try]) -> tuple[str, ...]:
+    """Why tries ended badly, each with its stage."""
+    return tuple(f"{each.stage}: {each.reason}" for each in tries if each.reason)
+
+
+def _progress(planned: PlannedCapture, rest: Sequence[StageJob], fraction: float) -> float:
+    """Of the whole capture; what was there before counts."""
+    total = sum(planned.weights.values())
+    if not total:
+        return 0.0
+    weights = [planned.weights.get(job.stage, 0.0) for job in rest]
+    left = sum(weights) - fraction * weights[0]
+    return round(min(1.0, max(0.0, 1.0 - left / total)), 3)
+
+
+def _left_s(rest: Sequence[StageJob], fraction: float) -> float:
+    return sum(job.seconds for job in rest) - fraction * rest[0].seconds
+
+
+def _short(free: int | None, needed: int) -> tuple[str, ...]:
+    if free is None or free >= needed:
+        return ()
+    return (
+        f"The disk has {free / 1e9:.1f} GB free, and what is still to run takes about {needed / 1e9:.1f} GB: "
+        "a stage that does not fit does not begin.",
+    )

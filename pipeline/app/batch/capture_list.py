@@ -1,0 +1,217 @@
+"""The captures of a batch: a folder of folders, or a list in TOML or CSV with options for each."""
+
+from __future__ import annotations
+
+import csv
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.engine.config import Table, load_file, merge, parse_set
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.photos.names import PHOTO_SUFFIXES
+from splatpipe.pipeline.survey.survey_text import TableKind, delimiter_of, read_lines, written_lines
+from splatpipe.stages.line import LINE
+from splatpipe.stages.options import LineConfig
+
+MAX_CAPTURES = 2000  # of a list: years of flights; more is a folder named by mistake
+MAX_NAME = 100  # characters: with a suffix of ours a file name everywhere
+MAX_LIST_BYTES = 4 << 20
+OWN_NAMES = ("batch.html", "batch.csv", "batch.json")
+KEYS = ("name", "photos", "preset", "config", "time_budget", "max_memory", "set")
+CSV_KIND = TableKind(
+    "list of captures",
+    "Its first line names the columns: photos, and if wanted name, preset, config, time_budget, max_memory, and "
+    "options such as train.iterations.",
+    MAX_LIST_BYTES,
+    MAX_CAPTURES + 100,
+)
+TOML_HINT = 'Write a table [[capture]] for each, with photos = "folder" and, if wanted, name, preset, config, set.'
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture as it was listed.
+
+    Attributes:
+        name: Of its folder of results.
+        photos: Its folder of photos.
+        preset: By name; empty where the command's counts.
+        tables: Options, the later over the earlier, over the preset's and the command's.
+        trouble: What is wrong with its options; such a capture fails alone.
+    """
+
+    name: str
+    photos: Path
+    preset: str = ""
+    tables: tuple[Table, ...] = ()
+    trouble: SplatpipeError | None = None
+
+
+def read_captures(captures: Path, out: Path) -> tuple[Capture, ...]:
+    """The captures that a batch is to run, in the order of the list, or of their names.
+
+    Args:
+        captures: A folder of folders of photos, or a list: ``.toml`` or ``.csv``.
+        out: The batch's folder, which is none of them.
+
+    Raises:
+        UsageError: if it is neither, names none, or names two alike.
+    """
+    path = captures.expanduser().resolve()
+    if path.is_dir():
+        found = _of_folder(path, out.expanduser().resolve())
+    elif not path.exists():
+        raise UsageError(f"There is no {captures}.", hint="Name a folder of capture folders, or a list (.toml, .csv).")
+    elif path.suffix.casefold() == ".toml":
+        found = [_entry(table, path.parent, {}) for table in _of_toml(path)]
+    elif path.suffix.casefold() == ".csv":
+        found = [_entry(row, path.parent, options) for row, options in _of_csv(path)]
+    else:
+        raise UsageError(
+            f"{captures} is neither a folder nor a list of captures.", hint="A list's name ends in .toml or .csv."
+        )
+    if not found:
+        raise UsageError(f"{captures} names no capture.", hint="Put each capture's photos into a folder of its own.")
+    _check_names(found, captures)
+    return tuple(found)
+
+
+def is_photo(path: Path) -> bool:
+    """Whether a file's name is a photo's."""
+    return path.suffix.casefold().lstrip(".") in PHOTO_SUFFIXES
+
+
+def _of_folder(folder: Path, out: Path) -> list[Capture]:
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise UsageError(
+            f"The folder {folder} cannot be read: {error.strerror}.", hint="Check its permissions."
+        ) from error
+    if out == folder:
+        raise UsageError(f"{out} is the folder of the captures.", hint="Choose an OUT beside it.")
+    folders = [
+        entry for entry in entries if entry.is_dir() and not entry.name.startswith(".") and entry.resolve() != out
+    ]
+    if not folders and any(map(is_photo, entries)):
+        raise UsageError(
+            f"{folder} has the photos of one capture.",
+            hint=f"Name the folder above it, or run this one alone: splatpipe run {folder} OUT",
+        )
+    return [Capture(entry.name, entry) for entry in folders]
+
+
+def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
+    """Tables of captures, what holds for all below what one says."""
+    name = f"The list of captures {path.name}"
+    try:
+        if path.stat().st_size > MAX_LIST_BYTES:
+            raise UsageError(f"{name} is too large.", hint=TOML_HINT)
+        told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(f"{name} is not valid TOML: {error}.", hint=TOML_HINT) from error
+    except OSError as error:
+        raise UsageError(f"{name} cannot be read: {error.strerror}.", hint="Check its permissions.") from error
+    captures = told.pop("capture", [])
+    if not isinstance(captures, list) or not all(isinstance(each, Mapping) for each in captures):
+        raise UsageError(f"{name} has no tables [[capture]].", hint=TOML_HINT)
+    for_all = _known(told, name, ("preset", "config", "time_budget", "max_memory", "set"))
+    own = [_known(each, f"Capture {at} of {path.name}", KEYS) for at, each in enumerate(captures, 1)]
+    return [{**for_all, **each, "set": [*for_all.get("set", []), *each.get("set", [])]} for each in own]
+
+
+def _known(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[str, JSON]:
+    """A table, once its keys and their kinds are known to be right."""
+    taken = dict(table)
+    for key, value in taken.items():
+        if key not in keys:
+            raise UsageError(f'{where}: there is no "{key}" here.', hint=f"Known are {', '.join(keys)}.")
+        if key == "set" and isinstance(value, str):
+            taken[key] = [value]
+        elif key == "set" and not (isinstance(value, list) and all(isinstance(text, str) for text in value)):
+            raise UsageError(f"{where}: set is no list of texts.", hint='Write set = ["train.iterations=3000"].')
+        elif key != "set" and not isinstance(value, str):
+            raise UsageError(f"{where}: {key} is no text.", hint=f'Write {key} = "…".')
+    return taken
+
+
+def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]]:
+    """Rows by our names of the columns, and the options that have columns of their own."""
+    try:
+        lines = written_lines(read_lines(path, CSV_KIND), path, CSV_KIND)
+        rows = list(csv.reader([line for _, line in lines], delimiter=delimiter_of(lines[0][1]), strict=True))
+    except SplatpipeError as error:
+        raise UsageError(error.message, hint=error.hint) from error
+    except csv.Error as error:
+        raise UsageError(f"The list of captures {path.name} is no CSV: {error}.", hint=CSV_KIND.expected) from error
+    titles = [title.strip() if "." in title else title.strip().casefold().replace(" ", "_") for title in rows[0]]
+    unknown = [title for title in titles if "." not in title and (title not in KEYS or title == "set")]
+    if unknown or "photos" not in titles or len(set(titles)) < len(titles):
+        what = f'has an unknown column "{unknown[0]}"' if unknown else "has a column twice, or none with photos"
+        raise UsageError(f"The list of captures {path.name} {what}.", hint=CSV_KIND.expected)
+    for (number, _), row in zip(lines[1:], rows[1:], strict=False):
+        if len(row) > len(titles):
+            raise UsageError(f"Line {number} of {path.name} has more cells than there are columns.", CSV_KIND.expected)
+        cells = {title: cell.strip() for title, cell in zip(titles, row, strict=False) if cell.strip()}
+        yield (
+            {key: value for key, value in cells.items() if key in KEYS},
+            {key: value for key, value in cells.items() if key not in KEYS},
+        )
+
+
+def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> Capture:
+    """A capture from its row or table; paths in it count from the list's folder."""
+    if not told.get("photos"):
+        raise UsageError("A capture of the list names no photos.", hint="Name its folder under photos.")
+    photos = folder / Path(str(told["photos"])).expanduser()
+    name = str(told.get("name") or photos.resolve().name)
+    preset = str(told.get("preset", ""))
+    try:
+        return Capture(name, photos, preset, tuple(_tables(told, folder, options)))
+    except SplatpipeError as error:
+        return Capture(name, photos, preset, trouble=error)
+
+
+def _tables(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> Iterator[Table]:
+    if told.get("config"):
+        table = load_file(folder / Path(str(told["config"])).expanduser())
+        table.pop("photos", None), table.pop("splatpipe", None)
+        yield with_files_from(folder, table)
+    if told.get("time_budget"):
+        yield {"train": {"time_budget_s": parse_duration(str(told["time_budget"]), "time_budget")}}
+    if told.get("max_memory"):
+        yield {"train": {"max_memory_bytes": parse_bytes(str(told["max_memory"]), "max_memory")}}
+    assignments = [*told.get("set", []), *(f"{name}={value}" for name, value in options.items())]
+    yield with_files_from(folder, merge(parse_set(text, LineConfig) for text in assignments))
+
+
+def with_files_from(folder: Path, table: Table) -> Table:
+    """Options with the paths of files in them made absolute: those that are not count from a folder."""
+    files = {(stage.name, option) for stage in LINE for option in stage.files}
+    taken = merge([table])
+    for section, option in files:
+        value = taken.get(section, {}).get(option) if isinstance(taken.get(section), Mapping) else None
+        if isinstance(value, str) and value not in ("auto", "none"):
+            taken = merge([taken, {section: {option: str(folder / Path(value).expanduser())}}])
+    return taken
+
+
+def _check_names(captures: Sequence[Capture], listed: Path) -> None:
+    """Each becomes a folder, on any file system."""
+    if len(captures) > MAX_CAPTURES:
+        raise UsageError(f"{listed} names {len(captures):,} captures.", hint=f"At most {MAX_CAPTURES:,} make a batch.")
+    seen: set[str] = set()
+    for name in (capture.name for capture in captures):
+        bad = not name.isprintable() or set(name) & set('/\\:*?"<>|') or name.startswith(".") or name != name.strip()
+        if bad or not name or len(name) > MAX_NAME or name.casefold() in OWN_NAMES:
+            raise UsageError(
+                f"{name[:MAX_NAME]!r} cannot be the name of a folder of results.",
+                hint="Rename the capture's folder, or give the capture another name in a list.",
+            )
+        if name.casefold() in seen:
+            raise UsageError(f'Two captures are called "{name}".', hint="Give one of them another name in a list.")
+        seen.add(name.casefold())

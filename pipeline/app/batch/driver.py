@@ -1,0 +1,297 @@
+"""Runs a call: holds the batch's folder, starts Snakemake and the guard, tells where it stands until it is over."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from splatpipe.pipeline.app.batch.account import Account
+from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, Plan
+from splatpipe.pipeline.app.batch.publication import PAGE_FILE, publish
+from splatpipe.pipeline.app.batch.snakemake_process import (
+    Profile,
+    end_group,
+    last_words,
+    require_snakemake,
+    snakemake_command,
+    snakemake_environment,
+    start_snakemake,
+)
+from splatpipe.pipeline.app.batch.state import RENEWED_EVERY_S, BatchState, CaptureState
+from splatpipe.pipeline.app.batch.workflow import write_workflow
+from splatpipe.pipeline.app.notice import notify
+from splatpipe.pipeline.app.report import REPORT_FILE
+from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, UsageError, exit_code
+from splatpipe.pipeline.engine.lock import locked
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.store import unwritable
+from splatpipe.stages.line import LINE
+
+POLL_S = 1.0
+CHANGED_EVERY_S = 5.0  # progress is told that often; another state of a capture at once
+LOCK_PATIENCE_S = 15.0  # a killed call's guard ends its jobs within that
+NAMES_FILE = "captures.json"  # below BATCH_FOLDER: every capture that was ever listed
+ENDS = {"done": "done", "failed": "failed", "stopped": "stopped"}
+
+
+@contextmanager
+def hold(out: Path) -> Iterator[int]:
+    """Hold a batch's folder; two calls at a time would tell different things of it.
+
+    Yields:
+        The lock's file descriptor, for the guard to inherit.
+
+    Raises:
+        UsageError: if it is no batch's folder, or another call works in it.
+        MachineError: if it cannot be written.
+    """
+    if (out / "stages").exists():
+        raise UsageError(f"{out} is the folder of one run.", hint="Choose another OUT for the batch.")
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is made if it is not there.")
+    try:
+        (out / BATCH_FOLDER).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(out, error) from error
+    with ExitStack() as stack:
+        deadline = time.monotonic() + LOCK_PATIENCE_S
+        while True:
+            try:
+                held = stack.enter_context(locked(out, folder=BATCH_FOLDER))
+                break
+            except UsageError:
+                if time.monotonic() > deadline:
+                    raise
+        yield held.descriptor
+
+
+def fresh_call(out: Path, name: str = "call") -> Call:
+    """An empty folder for a call; what an earlier one left there is over."""
+    folder = (out / BATCH_FOLDER / name).resolve()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return Call(folder)
+
+
+def with_unlisted(plan: Plan) -> Plan:
+    """The plan with the captures of earlier calls that are not listed any more; this call's names are kept."""
+    path = Path(plan.out) / BATCH_FOLDER / NAMES_FILE
+    known: list[JSON] = []
+    with suppress(OSError, ValueError):
+        known = json.loads(path.read_text(encoding="utf-8"))
+    names = [capture.name for capture in plan.captures]
+    gone = [str(name) for name in known if name not in names and (Path(plan.out) / str(name) / "stages").is_dir()]
+    write_durably(path, json.dumps([*names, *gone]))
+    return replace(plan, unlisted=tuple(gone))
+
+
+@dataclass(frozen=True)
+class Told:
+    """Who is told, besides the files.
+
+    Attributes:
+        say: Takes a line for the terminal.
+        command: Of ``--notify``; empty for none.
+    """
+
+    say: Callable[[str], None]
+    command: str = ""
+
+
+class Driver:
+    """Runs a call to its end.
+
+    Args:
+        call: Whose plan is written.
+        profile: Where Snakemake runs jobs.
+        told: Who is told.
+    """
+
+    def __init__(self, call: Call, profile: Profile, told: Told) -> None:
+        self._call, self._profile, self._told = call, profile, told
+        self._plan = call.plan()
+        self._account = Account(call)
+        self._before: dict[str, CaptureState] = {}
+        self._published_s = 0.0
+        self._last: BatchState | None = None
+        self._unwritten = ""
+
+    def run(self, lock: int) -> BatchState:
+        """Run it.
+
+        Args:
+            lock: The batch's, for the guard.
+
+        Returns:
+            Where it stands at its end.
+
+        Raises:
+            SplatpipeError: if the workflow itself could not run; what is told of the captures is true all the same.
+            Stopped: by a signal, once all jobs have ended.
+        """
+        try:
+            self._tell(self._account.state())
+            if any(capture.jobs for capture in self._plan.captures):
+                self._work(lock)
+            self._call.write_end(time.time(), None, "")
+            succeeded = self._account.state().all_succeeded
+            return self._finish(0 if succeeded else EXIT_INPUT, "")
+        except BaseException as error:
+            self._finish(exit_code(error), str(error))
+            raise
+
+    def _finish(self, code: int, message: str) -> BatchState:
+        with suppress(OSError):  # on a full disk
+            self._call.write_end(time.time(), code, message)
+        state = self._account.state()
+        self._tell(state)
+        self._notify("stopped" if code > 128 else "done" if code == 0 else "failed", state.name, PAGE_FILE)
+        return state
+
+    def _work(self, lock: int) -> None:
+        require_snakemake()
+        write_workflow(self._call, self._plan, LINE)
+        with _guarded(self._call, lock) as say:
+            process = start_snakemake(self._call, self._plan, self._profile)
+            say({"group": process.pid, "local": self._profile.local})
+            try:
+                while process.poll() is None:
+                    self._tell(self._account.state())
+                    time.sleep(POLL_S)
+            except BaseException:
+                self._told.say("Ending the batch: what runs is asked to end, and keeps what it has.")
+                end_group(self._call, process.pid, local=self._profile.local, gone=lambda: process.poll() is not None)
+                process.wait()
+                raise
+        self._check(process.returncode)
+
+    def _check(self, code: int) -> None:
+        """Snakemake's bad end is its own where no capture's failure explains it."""
+        state = self._account.state()
+        if code == 0 or any(capture.state == "failed" for capture in state.captures):
+            over = all(capture.state in ("done", "reused", "failed") for capture in state.captures)
+            if over or code == 0:
+                return
+        raise WorkflowError(code, last_words(self._call), self._call.snakemake_log)
+
+    def _tell(self, state: BatchState) -> None:
+        """Tell what has changed: on the terminal and by notice at once, in the files now and then."""
+        changed = [capture for capture in state.captures if _moved(self._before.get(capture.name), capture)]
+        for capture in changed:
+            if capture.state != "waiting":
+                self._told.say(_line(capture))
+        waited_s = time.time() - self._published_s
+        other = self._last is None or replace(state, as_of_s=0.0) != replace(self._last, as_of_s=0.0)
+        if changed or not state.at_work or waited_s >= (CHANGED_EVERY_S if other else RENEWED_EVERY_S):
+            self._publish(state)
+        for capture in changed:
+            before = self._before.get(capture.name)
+            if capture.state in ENDS and (before is None or before.state != capture.state):
+                self._notify(ENDS[capture.state], capture.name, f"{capture.name}/{REPORT_FILE}")
+        self._before = {capture.name: capture for capture in state.captures}
+
+    def _publish(self, state: BatchState) -> None:
+        """A full disk stops nothing here: what runs says so itself, and room may be made."""
+        try:
+            publish(state, self._call.out)
+            self._unwritten = ""
+        except (OSError, MachineError) as error:
+            if str(error) != self._unwritten:
+                self._unwritten = str(error)
+                self._told.say(f"Cannot write where the batch stands: {error}")
+        self._published_s, self._last = time.time(), state
+
+    def _notify(self, state: str, name: str, page: str) -> None:
+        if not self._told.command:
+            return
+        path = self._call.out / page
+        trouble = notify(self._told.command, state, name, path if path.is_file() else None, self._call.out)  # type: ignore[arg-type]
+        if trouble:
+            self._told.say(trouble)
+
+
+class WorkflowError(MachineError):
+    """Snakemake ended, and not because of a capture."""
+
+    exit_code = EXIT_STAGE
+
+    def __init__(self, code: int, said: str, log: Path) -> None:
+        super().__init__(
+            f"Snakemake ended with exit code {code} before the batch was through. {said}".strip(),
+            hint=f"Its log has the details: {log}. Repeat the command to go on.",
+        )
+
+
+@contextmanager
+def _guarded(call: Call, lock: int) -> Iterator[Callable[[JSON], None]]:
+    """A guard for what happens here.
+
+    Yields:
+        Tells it something.
+    """
+    guard = subprocess.Popen(
+        [sys.executable, "-m", "splatpipe.pipeline.app.batch.guard", str(call.folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        pass_fds=(lock,),
+        start_new_session=True,
+    )
+    assert guard.stdin is not None
+    pipe = guard.stdin
+
+    def say(told: JSON) -> None:
+        with suppress(BrokenPipeError):  # somebody killed it: the batch goes on without
+            pipe.write(json.dumps(told).encode() + b"\n")
+            pipe.flush()
+
+    try:
+        yield say
+    finally:
+        say({"done": True})
+        with suppress(BrokenPipeError):
+            pipe.close()
+        guard.wait()
+
+
+def dry_run(call: Call, profile: Profile) -> int:
+    """Let Snakemake say what it would run, on stderr.
+
+    Returns:
+        Its exit code.
+    """
+    require_snakemake()
+    plan = call.plan()
+    write_workflow(call, plan, LINE)
+    command = [*snakemake_command(call, plan, profile), "--dry-run", "--printshellcmds"]
+    done = subprocess.run(
+        command, stdin=subprocess.DEVNULL, stdout=2, cwd=call.folder, env=snakemake_environment(call), check=False
+    )
+    return done.returncode
+
+
+def _moved(before: CaptureState | None, now: CaptureState) -> bool:
+    return before is None or (before.state, before.stage, before.tries) != (now.state, now.stage, now.tries)
+
+
+def _line(capture: CaptureState) -> str:
+    """A capture's news in a line."""
+    where = f" {capture.stage}" if capture.stage and capture.state != "failed" else ""
+    again = f" (try {capture.tries})" if capture.tries > 1 else ""
+    why = " ".join(filter(None, [f"in {capture.stage}:" if capture.stage else "", capture.reason, capture.hint]))
+    told = {"failed": why, "stopped": "", "done": capture.verdict, "reused": capture.verdict}.get(capture.state, "")
+    return f"{capture.name}: {capture.state}{where}{again}{'. ' if told else ''}{told}"
+
+
+def summary(states: Sequence[CaptureState]) -> str:
+    """How many captures ended how."""
+    counts = {name: sum(state.state == name for state in states) for name in ("done", "reused", "failed", "stopped")}
+    return ", ".join(f"{count} {name}" for name, count in counts.items() if count)

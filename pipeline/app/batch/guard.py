@@ -1,0 +1,50 @@
+"""Watches a `splatpipe batch`, a process of its own: when that is killed, it ends the workflow and tells the truth.
+
+    python -m splatpipe.pipeline.app.batch.guard CALL
+
+On stdin it is told of Snakemake's process group, and at the end that all is well; stdin's end without that word is the
+command's death. It inherits the batch's lock, so that the same command, begun again, waits until nothing runs any more.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from splatpipe.pipeline.app.batch.plan import Call
+
+KILLED = "The command itself was killed, by somebody or by a system that ran out of memory; its jobs were ended."
+
+
+def main() -> None:
+    """Wait for the end of the command that the command line names."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # whoever ends the command ends this by it
+    call = Call(Path(sys.argv[1]))
+    group, local = 0, True
+    for line in sys.stdin:
+        told = json.loads(line)
+        if told.get("done"):
+            return
+        group, local = int(told["group"]), bool(told["local"])
+    _mourn(call, group, local)
+
+
+def _mourn(call: Call, group: int, local: bool) -> None:
+    from splatpipe.pipeline.app.batch.account import Account
+    from splatpipe.pipeline.app.batch.publication import publish
+    from splatpipe.pipeline.app.batch.snakemake_process import end_group, group_gone
+
+    if group:
+        end_group(call, group, local=local, gone=lambda: group_gone(group))
+    with suppress(OSError):
+        call.write_end(time.time(), None, KILLED)
+        publish(Account(call).state(), call.out)
+
+
+if __name__ == "__main__":
+    main()

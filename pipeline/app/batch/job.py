@@ -1,0 +1,163 @@
+"""A job of the workflow, a process of its own: one stage of one capture by `splatpipe run --until`, and how it ended.
+
+    python -m splatpipe.pipeline.app.batch.job CALL CAPTURE STAGE THREADS MARKER
+
+It stands between Snakemake and the run so that no end goes untold, a capture that cannot succeed is not tried again,
+and a signal reaches the run once, whoever sent it to whom.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import FrameType
+
+from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.tries import HOPELESS, Ending, TryLog
+from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
+from splatpipe.pipeline.app.ending import PART_VARIABLE
+from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.worker import PR_SET_PDEATHSIG
+
+RESERVE_BYTES = 256 << 20  # of the disk, for what other captures' stages are writing at the same time
+
+
+def main() -> None:
+    """Run the job that the command line names."""
+    end_with_parent()
+    call = Call(Path(sys.argv[1]))
+    key, stage, threads, marker = sys.argv[2], sys.argv[3], int(sys.argv[4]), Path(sys.argv[5])
+    if call.stop_file.exists():
+        sys.exit(EXIT_TERMINATED)
+    plan = call.plan()
+    capture = plan.capture(key)
+    log = TryLog(call.tries_file(key))
+    before = [each for each in log.read() if each.stage == stage]
+    if before and before[-1].final:
+        sys.exit(before[-1].exit_code)
+    job = next(job for job in capture.jobs if job.stage == stage)
+    log.begin(stage)
+    ending = _lacking(Path(plan.out), job) or _run(call, plan, capture, job, threads)
+    log.end(ending)
+    if ending.exit_code:
+        sys.exit(ending.exit_code)
+    marker.parent.mkdir(parents=True, exist_ok=True)
+    marker.touch()
+
+
+def _lacking(out: Path, job: StageJob) -> Ending | None:
+    """Why the stage must not begin; None where it may."""
+    free = shutil.disk_usage(out).free
+    if free >= job.disk_bytes + RESERVE_BYTES:
+        return None
+    needed = (job.disk_bytes + RESERVE_BYTES) / 1e9
+    return Ending(
+        EXIT_MACHINE,
+        f"The disk has {free / 1e9:.1f} GB free, and the stage {job.stage} needs about {needed:.1f}.",
+        "Make room, then repeat the command: what is finished is kept.",
+        final=True,
+    )
+
+
+def _run(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads: int) -> Ending:
+    log = call.log(capture.name)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    spent = sum((each.ended_s or each.began_s) - each.began_s for each in TryLog(call.tries_file(capture.key)).read())
+    last = job is capture.jobs[-1]
+    with log.open("a", encoding="utf-8") as said:
+        process = subprocess.Popen(
+            command_of(call, plan, capture, job, threads),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=said,
+            env={**os.environ, SPENT_VARIABLE: f"{spent:.3f}", **({} if last else {PART_VARIABLE: "1"})},
+            start_new_session=True,
+            preexec_fn=end_with_parent,  # noqa: PLW1509 (one thread)
+        )
+    _pass_on_signals(process)
+    told, _ = process.communicate()
+    return _ending(process.returncode, told)
+
+
+def command_of(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
+    """The `splatpipe run` of a job.
+
+    The last stage's asks for all that the line has: export, which the film's stage does not need, is told of again.
+    """
+    until = plan.until if job is capture.jobs[-1] else job.stage
+    options = {
+        "--preset": capture.preset,
+        "--config": str(call.config_file(capture.key)),
+        "--device": plan.device,
+        "--threads": str(threads),
+        **({"--until": until} if until else {}),
+    }
+    words = [word for option in options.items() for word in option]
+    run = [
+        sys.executable,
+        "-m",
+        "splatpipe.pipeline.app.cli",
+        "run",
+        capture.photos,
+        str(Path(plan.out) / capture.name),
+    ]
+    return [*run, *words, "--json"]
+
+
+def end_with_parent() -> None:
+    """Whoever is killed leaves nobody behind who works on: the run is asked to end, and keeps its checkpoint."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _pass_on_signals(process: subprocess.Popen[bytes]) -> None:
+    passed: list[int] = []
+
+    def pass_on(number: int, _frame: FrameType | None) -> None:
+        if not passed:  # the second would tell a run not even to write its report
+            passed.append(number)
+            process.send_signal(signal.SIGTERM)
+
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, pass_on)
+
+
+def _ending(code: int, told: bytes) -> Ending:
+    if code < 0:
+        name = signal.Signals(-code).name
+        hint = "Its log has what it said last; run out of memory is what SIGKILL mostly means."
+        return Ending(128 - code, f"The command died of {name}.", hint)
+    if code == 0:
+        return Ending(0)
+    error = _error(told)
+    return Ending(
+        code,
+        str(error.get("message", "")) or f"It ended with exit code {code}.",
+        str(error.get("hint", "")),
+        code in HOPELESS,
+    )
+
+
+def _error(told: bytes) -> Mapping[str, JSON]:
+    """The ``error`` of the JSON object that a command prints last."""
+    try:
+        found = json.loads(told.splitlines()[-1])["error"]
+    except (ValueError, KeyError, TypeError, IndexError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except OSError as error:  # the disk is full or gone: there is nowhere else to say so
+        sys.stderr.write(f"{error}\n")
+        sys.exit(EXIT_MACHINE if error.errno else EXIT_STAGE)

@@ -1,0 +1,234 @@
+"""What each capture still needs: its options resolved, its folder of results surveyed, its stages forecast."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from statistics import median
+
+from splatpipe.pipeline.app.batch.capture_list import Capture, is_photo
+from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.cli_runs import Overrides, request_of
+from splatpipe.pipeline.app.report.story import read_story
+from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
+from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, MachineError, SplatpipeError
+from splatpipe.pipeline.engine.lock import is_locked
+from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
+from splatpipe.pipeline.engine.needs import Need
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE
+from splatpipe.pipeline.engine.runner import Line, Standing, survey
+from splatpipe.pipeline.engine.session import Request, survey_line
+from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.engine.store import Part, is_copy
+from splatpipe.stages.forecast import CaptureSize, forecast, machine_speed
+
+SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly alike
+MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
+CLUSTER_THREADS = 8  # of a job that another machine runs; a profile's set-threads says otherwise
+LONGEST_SLUG = 40
+NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000)  # a process that looks and ends
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command says of all captures.
+
+    Attributes:
+        preset: By name, for captures that name none.
+        tables: Options, below a capture's own.
+        until: The last stage; empty for the whole line.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        threads: Of a job; 0 to divide the machine.
+        retries: How often a stage that died is begun again.
+        retry_failed: Try again what failed for its photos or options, too, though nothing changed.
+        local: Whether the jobs run on this machine.
+    """
+
+    preset: str = "standard"
+    tables: tuple[Table, ...] = ()
+    until: str = ""
+    device: str = "auto"
+    threads: int = 0
+    retries: int = 0
+    retry_failed: bool = False
+    local: bool = True
+
+
+@dataclass(frozen=True)
+class _Outlook:
+    """A capture before threads are divided.
+
+    Attributes:
+        planned: What is known of it.
+        needed: Stages that are asked for.
+        names: Those of them that are not valid.
+        foresee: What each stage needs with so many threads.
+    """
+
+    planned: PlannedCapture
+    needed: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    foresee: Callable[[int], Mapping[str, Need]] = field(default=lambda _threads: {})
+
+
+def make_plan(captures: Sequence[Capture], call: Call, settings: Settings) -> Plan:
+    """Look at every capture and say what is to be done; nothing is run, and no capture's trouble is another's.
+
+    Args:
+        captures: As they were listed.
+        call: Takes each capture's resolved options, for its jobs.
+        settings: Of the command.
+    """
+    began_s = time.time()
+    outlooks = [
+        _look(capture, f"{at:04d}-{_slug(capture.name)}", call, settings) for at, capture in enumerate(captures, 1)
+    ]
+    threads = settings.threads or _threads(outlooks, local=settings.local)
+    planned = tuple(_with_jobs(outlook, threads) for outlook in outlooks)
+    return Plan(str(call.out), began_s, planned, settings.until, settings.device, settings.retries, settings.local)
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-")[:LONGEST_SLUG]
+
+
+def _look(capture: Capture, key: str, call: Call, settings: Settings) -> _Outlook:
+    planned = PlannedCapture(capture.name, key, str(capture.photos), capture.preset or settings.preset)
+    try:
+        if capture.trouble is not None:
+            raise capture.trouble
+        return _outlook(capture, planned, call, settings)
+    except SplatpipeError as error:
+        return _Outlook(replace(planned, message=error.message, hint=error.hint))
+    except OSError as error:
+        trouble = MachineError(f"Cannot read {error.filename or capture.photos}: {error.strerror}.", "Check the disk.")
+        return _Outlook(replace(planned, message=trouble.message, hint=trouble.hint))
+
+
+def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Settings) -> _Outlook:
+    tables = (*settings.tables, *capture.tables)
+    config = Overrides(tables).resolve(load_preset(planned.preset))
+    request = request_of(capture.photos.absolute(), call.out / capture.name, config)
+    source = open_source(request.photos, request.out, request.stages, config)
+    paths = [path for path in source.part_files["source.photos"].values() if is_photo(path)]
+    size = capture_size(paths, has_file=source.named.get("source.geo") is not None)
+    line = Line(request.stages, config, {name: Part(source.folder, "") for name in source.part_files}, source.folder)
+    needed = [stage.name for stage in line.needed(settings.until or None)]
+    planned = replace(planned, photos=str(request.photos), photo_count=size.photos)
+    path = call.config_file(planned.key)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_durably(path, dump(merge(tables)))
+    standings = _standings(request, needed)
+    names = _to_run(request, needed, standings)
+    first = next((standing for standing in standings if standing.stage.name in names), None)
+    if first is not None and not settings.retry_failed:
+        planned = _with_kept_failure(planned, first, request.out)
+    foresee = partial(forecast, size, config, speed=machine_speed())
+    return _Outlook(planned, tuple(needed), () if planned.message else names, foresee)
+
+
+def _standings(request: Request, needed: Sequence[str]) -> list[Standing]:
+    if not (request.out / "stages").is_dir():
+        return []
+    return [standing for standing in survey(*survey_line(request)) if standing.stage.name in needed]
+
+
+def _to_run(request: Request, needed: Sequence[str], standings: Sequence[Standing]) -> tuple[str, ...]:
+    """Stages that are not valid; the last one where all are, but not all of what it delivered lies in OUT."""
+    if not standings:
+        return tuple(needed)
+    names = tuple(standing.stage.name for standing in standings if standing.artifact is None)
+    if names:
+        return names
+    delivered = all(
+        (request.out / name).is_file() and is_copy(file, request.out / name)
+        for standing in standings
+        if standing.artifact is not None
+        for name, file in standing.artifact.deliverables(standing.stage).items()
+    )
+    return () if delivered else (needed[-1],)
+
+
+def _with_kept_failure(planned: PlannedCapture, first: Standing, out: Path) -> PlannedCapture:
+    """A stage that could do nothing with its input gets the same input: what it said then holds, and nothing runs."""
+    story = read_story(out / EVENTS_FILE, running=is_locked(out))
+    culprit = story.culprit
+    alike = story.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
+    if culprit is None or culprit.state != "failed" or story.exit_code != EXIT_INPUT or not alike:
+        return planned
+    if (culprit.name, culprit.key) != (first.stage.name, first.key):
+        return planned
+    return replace(planned, message=culprit.message, hint=culprit.hint, stage=culprit.name)
+
+
+def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
+    """What the forecast asks of a capture, from the headers of a few photos.
+
+    Args:
+        paths: Of all photos.
+        has_file: Whether a file has their positions.
+    """
+    from PIL import Image
+
+    from splatpipe.pipeline.photos.exif import read_exif
+
+    sizes, placed = [], has_file
+    step = max(1, len(paths) // SAMPLED)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of odd tags; what is wrong with a photo is told by the run
+        for path in sorted(paths)[::step][:SAMPLED]:
+            try:
+                with Image.open(path) as picture:
+                    sizes.append(picture.width * picture.height / 1e6)
+                    placed = placed or read_exif(picture).gps is not None
+            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+                continue
+    return CaptureSize(len(paths), median(sizes) if sizes else 0.0, placed)
+
+
+def _threads(outlooks: Sequence[_Outlook], *, local: bool) -> int:
+    """Threads of a job: the machine divided by the captures that can be under way at once.
+
+    Many captures side by side are done sooner than one after the other with all threads, of which some always wait.
+    """
+    if not local:
+        return CLUSTER_THREADS
+    cores = available_cores()
+    peaks = [max(_of(outlook, cores, outlook.names).values(), key=_memory) for outlook in outlooks if outlook.names]
+    if not peaks:
+        return 1
+    room = free_memory_bytes()
+    fitting = int(room // (MEMORY_MARGIN * max(map(_memory, peaks)))) if room else len(peaks)
+    return max(1, cores // max(1, min(len(peaks), fitting, cores)))
+
+
+def _of(outlook: _Outlook, threads: int, names: Sequence[str]) -> dict[str, Need]:
+    """What stages need; one that the forecast does not know costs next to nothing."""
+    foreseen = outlook.foresee(threads)
+    return {name: foreseen.get(name, NOTHING) for name in names}
+
+
+def _memory(need: Need) -> int:
+    return need.memory_bytes
+
+
+def _with_jobs(outlook: _Outlook, threads: int) -> PlannedCapture:
+    needs = _of(outlook, threads, outlook.needed)
+    jobs = tuple(
+        StageJob(
+            name,
+            threads,
+            round(MEMORY_MARGIN * needs[name].memory_bytes),
+            needs[name].seconds(threads),
+            needs[name].disk_bytes + needs[name].scratch_bytes,
+        )
+        for name in outlook.names
+    )
+    return replace(outlook.planned, jobs=jobs, weights={name: need.seconds(threads) for name, need in needs.items()})

@@ -1,0 +1,132 @@
+"""`splatpipe batch`: many captures, unattended."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from splatpipe.pipeline.app.cli_options import (
+    ConfigOption,
+    DeviceOption,
+    JsonOption,
+    NotifyOption,
+    OutArgument,
+    PresetOption,
+    SetOption,
+    ThreadsOption,
+    UntilOption,
+)
+from splatpipe.pipeline.app.cli_runs import check_stage, overrides, request_of
+from splatpipe.pipeline.app.ending import print_json
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, exit_code
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.app.batch.planning import Settings
+    from splatpipe.pipeline.app.batch.snakemake_process import Profile
+    from splatpipe.pipeline.app.batch.state import BatchState
+
+RETRIES = 2  # a training that died twice for want of memory got three times as much the last time
+
+CapturesArgument = Annotated[
+    Path, typer.Argument(help="Folder of capture folders, or a list of captures: TOML or CSV.", show_default=False)
+]
+ProfileOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Profile of Snakemake's, to run the jobs elsewhere: Slurm, Kubernetes."),
+]
+RetriesOption = Annotated[int, typer.Option(min=0, max=10, help="How often a stage that died is begun again.")]
+RetryFailedOption = Annotated[
+    bool, typer.Option("--retry-failed", help="Try again what failed for its photos or options, though none changed.")
+]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Say which jobs would run, by Snakemake's dry run.")]
+
+
+def batch(
+    captures: CapturesArgument,
+    out: OutArgument,
+    preset: PresetOption = "standard",
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    until: UntilOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    profile: ProfileOption = None,
+    retries: RetriesOption = RETRIES,
+    retry_failed: RetryFailedOption = False,
+    notify: NotifyOption = None,
+    dry_run: DryRunOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run many captures, unattended: what is finished is reused, what fails stops no other."""
+    from splatpipe.pipeline.app.batch.capture_list import with_files_from
+    from splatpipe.pipeline.app.batch.planning import Settings
+    from splatpipe.pipeline.app.batch.snakemake_process import open_profile
+    from splatpipe.pipeline.app.notice import check_command
+    from splatpipe.pipeline.engine.config import load_preset
+
+    state: BatchState | None = None
+    code = 0
+    try:
+        load_preset(preset)
+        for name in filter(None, (until,)):
+            check_stage(name)
+        if notify is not None:
+            check_command(notify)
+        where = open_profile(profile)
+        tables = tuple(with_files_from(Path.cwd(), table) for table in overrides(config, assignments, None).tables)
+        if where.local:  # what the machine or the options lack is told now
+            request_of(captures, out, overrides(config, assignments, None).resolve(load_preset(preset)), device)
+        settings = Settings(preset, tables, until or "", device, threads, retries, retry_failed, where.local)
+        if dry_run:
+            code = _dry_run(captures, out, settings, where)
+        else:
+            state = _run(captures, out, settings, where, notify or "")
+            code = 0 if state.all_succeeded else EXIT_INPUT
+    except BaseException as error:
+        if as_json and not isinstance(error, typer.Exit):
+            _print(out, state, exit_code(error), error)
+        raise
+    if as_json:
+        _print(out, state, code, None)
+    if code:
+        raise typer.Exit(code)
+
+
+def _run(captures: Path, out: Path, settings: Settings, profile: Profile, command: str) -> BatchState:
+    from splatpipe.pipeline.app.batch.capture_list import read_captures
+    from splatpipe.pipeline.app.batch.driver import Driver, Told, fresh_call, hold, summary, with_unlisted
+    from splatpipe.pipeline.app.batch.planning import make_plan
+    from splatpipe.pipeline.app.batch.publication import PAGE_FILE
+    from splatpipe.pipeline.app.console import say
+
+    listed = read_captures(captures, out)
+    with hold(out.resolve()) as lock:
+        call = fresh_call(out)
+        call.write_plan(with_unlisted(make_plan(listed, call, settings)))
+        state = Driver(call, profile, Told(say, command)).run(lock)
+    say(f"{summary(state.captures)}. {out / PAGE_FILE}")
+    return state
+
+
+def _dry_run(captures: Path, out: Path, settings: Settings, profile: Profile) -> int:
+    from splatpipe.pipeline.app.batch.capture_list import read_captures
+    from splatpipe.pipeline.app.batch.driver import dry_run, fresh_call
+    from splatpipe.pipeline.app.batch.planning import make_plan
+
+    call = fresh_call(out, "dry-run")
+    try:
+        call.write_plan(make_plan(read_captures(captures, out), call, settings))
+        return dry_run(call, profile)
+    finally:
+        shutil.rmtree(call.folder, ignore_errors=True)
+
+
+def _print(out: Path, state: BatchState | None, code: int, error: BaseException | None) -> None:
+    from splatpipe.pipeline.app.batch.state import as_json
+
+    told: dict[str, Any] = {} if state is None else as_json(state)
+    trouble = None if error is None else {"message": str(error), "hint": getattr(error, "hint", "")}
+    print_json({**told, "out": str(out), "exit_code": code, "error": trouble})
