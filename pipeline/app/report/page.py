@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from splatpipe.pipeline.app.places import Places
 from splatpipe.pipeline.app.report.capturing import capture_chapter, registration_chapter
 from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.learning import training_chapter, views_chapter
@@ -65,10 +66,11 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=_places(holdings).plain_value,
     )
     return environment.get_template("report.html.j2").render(
         name=holdings.out.resolve().name or str(holdings.out),
-        photos_dir="" if holdings.photos_dir is None else "/".join(holdings.photos_dir.parts[-2:]),
+        photos_dir="" if holdings.photos_dir is None else holdings.photos_dir.name,
         began=moment(holdings.story.began_s) if holdings.story.began_s else "",
         version=importlib.metadata.version("splatpipe"),
         verdict=judge(holdings),
@@ -80,6 +82,11 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
         style=Markup(style),
         **chapters,
     )
+
+
+def _places(holdings: Holdings) -> Places:
+    options = {} if holdings.config is None else holdings.config.model_dump(mode="json")
+    return Places.of(holdings.out, holdings.photos_dir, options)
 
 
 def _checked(holdings: Holdings) -> bool:

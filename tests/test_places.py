@@ -1,0 +1,67 @@
+"""Pages tell no folders of the machine that made them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from markupsafe import Markup
+
+from splatpipe.pipeline.app.places import Places
+
+OUT = Path("/srv/customers/Brown & Sons/out")
+PHOTOS = Path("/home/jane doe/DCIM/100MEDIA")
+GCP = "/mnt/nas share/jane/survey (2)/gcp list.csv"
+PLACES = Places.of(OUT, PHOTOS, {"georef": {"control": GCP, "crs": "EPSG:32633+5773", "grids": ["~/grids/a b.tif"]}})
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        (f"Cannot write to {OUT}: No space left on device.", "Cannot write to OUT: No space left on device."),
+        (f"The log: {OUT}/splatpipe.log", "The log: OUT/splatpipe.log"),
+        (f"Run again: splatpipe run {PHOTOS} {OUT}", "Run again: splatpipe run PHOTOS OUT"),
+        (f"{PHOTOS}/a b/DJI_0001.JPG is broken.", "PHOTOS/a b/DJI_0001.JPG is broken."),
+        (f"The file {GCP} of georef.control is not there.", "The file gcp list.csv of georef.control is not there."),
+        ("~/grids/a b.tif", "a b.tif"),
+        ("/mnt/nas share/jane/survey (2)/other.csv", "other.csv"),
+        ("See /opt/cuda/lib64/libcudart.so.12, please.", "See libcudart.so.12, please."),
+        ("[Errno 2] No such file: '/root/.cache/x/y.bin'", "[Errno 2] No such file: 'y.bin'"),
+        ("~/secret/keys.txt and ../../jane/work/z.toml", "keys.txt and z.toml"),
+        (f"{OUT.parent}/other job", "other job"),
+    ],
+)
+def test_folders_are_left_out(said: str, shown: str) -> None:
+    assert PLACES.plain(said) == shown
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "1/255 of 3/4, px/m, and/or, 2026/11/22, m/s",
+        "https://docs.kernel.org/admin-guide/cgroup-v2.html",
+        "EPSG:32633 / UTM zone 33N",
+        "/dev/shm is small; /proc/sys/kernel/x",
+        "stages/undistort-01/dataset/images",
+        "data:,a",
+        "",
+        "a / b",
+    ],
+)
+def test_what_is_no_folder_stays(said: str) -> None:
+    assert PLACES.plain(said) == said
+
+
+def test_markup_of_our_own_is_left_alone() -> None:
+    picture = Markup("data:image/jpeg;base64,a+/home/b/c=")
+    assert PLACES.plain_value(picture) is picture
+    assert PLACES.plain_value(7) == 7
+
+
+def test_a_root_as_out_names_nothing_else() -> None:
+    assert Places.of(Path("/"), Path("/photos")).plain("a/b /photos/x.jpg") != "aOUTb"
+
+
+@pytest.mark.parametrize("hostile", ["/" * 20_000, "/a" * 20_000, "../" * 20_000, "~/" * 20_000, "/ " * 20_000])
+def test_long_texts_take_no_time(hostile: str) -> None:
+    assert isinstance(PLACES.plain(hostile), str)
