@@ -8,7 +8,6 @@ parent, whatever kills that.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import json
 import os
@@ -24,12 +23,12 @@ from pathlib import Path
 from types import FrameType
 from typing import IO
 
+from splatpipe.pipeline.engine.children import CHILDREN_MEMORY, die_with_parent
 from splatpipe.pipeline.engine.errors import ERRORS, MachineError, SplatpipeError, StageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, StageConfig, load_body
 
-PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # of libraries' errors, in small letters
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
 
@@ -88,7 +87,12 @@ def execute(task: Task, send: IO[str]) -> None:
             send.write(json.dumps(message) + "\n")
             send.flush()
 
+    children = 0  # the most that the body's own processes took side by side
+
     def sink(event: Event) -> None:
+        nonlocal children
+        if event.kind == "metric" and event.data["name"] == CHILDREN_MEMORY:
+            children = max(children, int(event.data["value"]))
         tell({"event": asdict(event)})
 
     started = _Usage.now()
@@ -107,7 +111,9 @@ def execute(task: Task, send: IO[str]) -> None:
         failure = as_splatpipe_error(task.stage, error)
         tell({"failed": {"type": type(failure).__name__, "message": failure.message, "hint": failure.hint}})
     else:
-        tell({"done": {"summary": dict(summary), **started.until_now()}})
+        usage = started.until_now()
+        usage["peak_memory_bytes"] += children
+        tell({"done": {"summary": dict(summary), **usage}})
 
 
 def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
@@ -148,14 +154,20 @@ class _Usage:
         return_free_heap()  # of the stages before, so that none is charged with what another has freed
         with contextlib.suppress(OSError):  # restarts the kernel's record of this process's peak memory
             Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-        return _Usage(time.monotonic(), time.process_time())
+        return _Usage(time.monotonic(), _cpu_seconds())
 
     def until_now(self) -> dict[str, float | int]:
         return {
             "seconds": round(time.monotonic() - self.wall_s, 3),
-            "cpu_seconds": round(time.process_time() - self.cpu_s, 3),
+            "cpu_seconds": round(_cpu_seconds() - self.cpu_s, 3),
             "peak_memory_bytes": peak_memory_bytes(),
         }
+
+
+def _cpu_seconds() -> float:
+    """Of this process and of those that it started and that have ended."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
 
 
 def peak_memory_bytes() -> int:
@@ -173,13 +185,6 @@ def peak_memory_of(process: int | str) -> int | None:
         lines = Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
     return None
-
-
-def _die_with_parent(parent: int) -> None:
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def _requests(stream: IO[str]) -> Iterator[Task]:
@@ -218,7 +223,7 @@ def _listen() -> None:
 
 def main() -> None:
     """Serve the parent named on the command line until it says goodbye."""
-    _die_with_parent(int(sys.argv[1]))
+    die_with_parent(int(sys.argv[1]))
     _listen()
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from jaxtyping import UInt8
 
-from splatpipe.pipeline.engine.parallel import watched
+from splatpipe.pipeline.engine.children import CHILDREN_MEMORY, run_children
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.sfm.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.reduction import copy_photos
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
 TILE = 16  # photos; pairs are matched tile by tile, so that a block needs few photos' descriptors
-BLOCK_PAIRS = 64  # COLMAP keeps as many photos' search trees in memory
+PAIRS_A_PROCESS = 12  # at least: a process starts in half a second and builds the search trees of its photos anew
+MATCHER = "splatpipe.pipeline.sfm.matching_process"
 
 
 class StoredDescriptors(Sequence[UInt8[np.ndarray, "_ 128"]]):
@@ -44,37 +45,67 @@ def look_alike(features: Path, seed: int) -> Costs:
 
 
 def match_pairs(features: Path, work: Path, pairs: Sequence[Pair], seed: int, threads: int, report: Reporter) -> None:
-    """Match and verify pairs in a copy of the database.
+    """Match and verify pairs, a process of one thread for each of ``threads``.
 
-    COLMAP works in a thread of its own, so that this one can tell of the progress and hear of interruptions.
+    Threads of one process must not match side by side: the linear algebra in pycolmap's wheels (OpenBLAS built for
+    one thread, without its locks) gives two of them the same buffer now and then, and both pairs lose many matches.
+
+    Args:
+        features: The database with keypoints and descriptors; only read.
+        work: The database to write: photos, and the verified geometry of each pair that was matched.
+        pairs: (i, j) of photos, counted from 0.
+        seed: Of the verification.
+        threads: Processes at a time.
+        report: Told of the progress.
     """
-    shutil.copyfile(features, work)
-    listing = work.with_name("pairs.txt")
-    with pycolmap.Database.open(work) as database:
+    tiled = sorted(pairs, key=lambda pair: (pair[0] // TILE, pair[1] // TILE, pair))
+    count = max(1, min(threads, len(tiled) // PAIRS_A_PROCESS))
+    shares = [tiled[len(tiled) * k // count : len(tiled) * (k + 1) // count] for k in range(count)]
+    places = [work.with_name(f"{work.stem}-{k}.db") for k in range(count)]
+    try:
+        for place, share in zip(places, shares, strict=True):
+            _write_share(features, place, share)
+        with ExitStack() as stack:
+            opened = [stack.enter_context(pycolmap.Database.open(place)) for place in places]
+
+            def look() -> None:
+                done = sum(int(database.num_matched_image_pairs()) for database in opened)
+                report.progress(done, len(pairs), "matching", "pairs")
+
+            commands = [(MATCHER, str(place), str(_list_of(place)), str(seed)) for place in places]
+            report.metric(CHILDREN_MEMORY, run_children(commands, look, "matching photos"))
+        _join(features, places, work)
+    finally:
+        for place in places:
+            _list_of(place).unlink(missing_ok=True)
+            place.unlink(missing_ok=True)
+
+
+def _list_of(place: Path) -> Path:
+    return place.with_suffix(".txt")
+
+
+def _write_share(features: Path, place: Path, share: Sequence[Pair]) -> None:
+    """The database of one process: the photos of its pairs, under numbers for names, which lists need no quotes for."""
+    wanted = sorted({number + 1 for pair in share for number in pair})
+    with pycolmap.Database.open(features) as source, pycolmap.Database.open(place) as database:
+        copy_photos(source, database, set(wanted))
+        for number in wanted:
+            database.write_descriptors(number, source.read_descriptors(number))
         for image in database.read_all_images():
-            image.name = str(image.image_id)  # the list of pairs has no way to quote a name with blanks
+            image.name = str(image.image_id)
             database.update_image(image)
-        tiled = sorted(pairs, key=lambda pair: (pair[0] // TILE, pair[1] // TILE, pair))
-        listing.write_text("".join(f"{i + 1} {j + 1}\n" for i, j in tiled), encoding="ascii")
-        stop = pycolmap.CancellationToken()
-        watched(
-            lambda: _match_pairs(work, listing, seed, threads, stop),
-            lambda: report.progress(database.num_matched_image_pairs(), len(pairs), "matching", "pairs"),
-            stop.cancel,
-        )
+    _list_of(place).write_text("".join(f"{i + 1} {j + 1}\n" for i, j in share), encoding="ascii")
 
 
-def _match_pairs(work: Path, listing: Path, seed: int, threads: int, stop: pycolmap.CancellationToken) -> None:
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = threads
-    matching.use_gpu = False
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = listing
-    pairing.block_size = BLOCK_PAIRS
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    pycolmap.set_random_seed(seed)
-    pycolmap.match_image_pairs(work, matching, pairing, verification, pycolmap.Device.cpu, stop)
+def _join(features: Path, places: Sequence[Path], work: Path) -> None:
+    with pycolmap.Database.open(features) as source, pycolmap.Database.open(work) as database:
+        copy_photos(source, database)
+        for place in places:
+            with pycolmap.Database.open(place) as share:
+                numbers, geometries = share.read_two_view_geometries()
+            for pair_id, geometry in zip(numbers, geometries, strict=True):
+                database.write_two_view_geometry(*pycolmap.pair_id_to_image_pair(pair_id), geometry)
 
 
 def write_verified(work: Path, features: Path, target: Path) -> dict[Pair, int]:

@@ -6,7 +6,7 @@ place it as well as thousands. Mapping costs as its matches do, so the others co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -136,8 +136,10 @@ def write_reduced(database: Path, target: Path, chosen: Mapping[int, Bool[np.nda
     return kept, total
 
 
-def copy_photos(source: pycolmap.Database, target: pycolmap.Database) -> None:
-    """Copy cameras, rigs, frames, images and keypoints under their numbers."""
+def copy_photos(
+    source: pycolmap.Database, target: pycolmap.Database, keypoints_of: Container[int] | None = None
+) -> None:
+    """Copy cameras, rigs, frames, images and keypoints (of all photos, or of some) under their numbers."""
     for camera in sorted(source.read_all_cameras(), key=lambda camera: camera.camera_id):
         target.write_camera(camera, use_camera_id=True)
     for rig in sorted(source.read_all_rigs(), key=lambda rig: rig.rig_id):
@@ -146,4 +148,5 @@ def copy_photos(source: pycolmap.Database, target: pycolmap.Database) -> None:
         target.write_frame(frame, use_frame_id=True)
     for image in sorted(source.read_all_images(), key=lambda image: image.image_id):
         target.write_image(image, use_image_id=True)
-        target.write_keypoints(image.image_id, source.read_keypoints(image.image_id))
+        if keypoints_of is None or image.image_id in keypoints_of:
+            target.write_keypoints(image.image_id, source.read_keypoints(image.image_id))

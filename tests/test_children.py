@@ -1,0 +1,76 @@
+"""Processes of a stage's own: they run side by side, and none is left, whatever ends the stage."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from splatpipe.pipeline.engine.children import run_children
+from splatpipe.pipeline.engine.errors import StageError
+
+CODE = "timeit"  # runs its arguments as statements; the first of them is our process number, which does no harm
+SLEEP = (CODE, "import time, splatpipe.pipeline.engine.children as c; c.die_with_parent({parent}); time.sleep(300)")
+WAIT_S = 60.0
+
+
+def sleeping() -> tuple[str, ...]:
+    return (SLEEP[0], SLEEP[1].format(parent=os.getpid()))
+
+
+def children_of(pid: int) -> list[int]:
+    listed = subprocess.run(["ps", "-o", "pid=,comm=", "--ppid", str(pid)], capture_output=True, text=True, check=False)
+    return [int(line.split()[0]) for line in listed.stdout.splitlines() if line.split()[1] != "ps"]
+
+
+def is_alive(pid: int) -> bool:
+    shown = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
+    return bool(shown.strip()) and not shown.strip().startswith("Z")
+
+
+def test_they_run_to_their_ends_and_their_memory_is_told() -> None:
+    looks = []
+    peak = run_children([(CODE, "pass"), (CODE, "pass")], lambda: looks.append(1), "idling")
+    assert looks and peak > 2 * 4 << 20  # two interpreters
+
+
+def test_one_that_dies_ends_the_others_and_is_told() -> None:
+    with pytest.raises(StageError, match=r"that was idling ended by signal 9\.") as caught:
+        run_children([sleeping(), (CODE, "import os; os.kill(os.getpid(), 9)")], lambda: None, "idling")
+    assert "--threads 1" in caught.value.hint
+    assert not children_of(os.getpid())
+
+
+def test_an_interruption_ends_them_at_once() -> None:
+    seen: list[int] = []
+
+    def look() -> None:
+        seen[:] = children_of(os.getpid())
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_children([sleeping(), sleeping()], look, "idling")
+    assert seen and not any(map(is_alive, seen))
+
+
+def test_they_die_with_the_process_that_started_them() -> None:
+    statement = SLEEP[1].format(parent="os.getppid()").replace("import time", "import os, time")
+    script = (
+        "from splatpipe.pipeline.engine.children import run_children\n"
+        f"run_children([('{CODE}', {statement!r})], lambda: None, '')"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script])
+    end = time.monotonic() + WAIT_S
+    while not (born := children_of(parent.pid)):
+        assert time.monotonic() < end and parent.poll() is None
+        time.sleep(0.05)
+    time.sleep(1.0)  # it has to have asked the kernel
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    while any(map(is_alive, born)):
+        assert time.monotonic() < end
+        time.sleep(0.05)
