@@ -114,7 +114,7 @@ def test_it_fits_the_screen_and_asks_for_nothing(
     said = words(watched)
     assert said.index("This capture cannot be reconstructed as it is") < said.index("Two strips lie too far apart.")
     assert "41 % as sharp as its neighbours" in said and "−1.6 EV" in said and "cannot be read" in said
-    assert "8 h 20 min" in said and "9.80 GB" in said and "It lacks 1.8 GB of memory." in said
+    assert "8.3 h" in said and "17 h" in said and "9.80 GB" in said and "It lacks 1.8 GB of memory." in said
     assert watched.page.locator(".verdict li").count() == watched.page.locator("article.told").count() == 4
     every = "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
     assert watched.page.evaluate(every)

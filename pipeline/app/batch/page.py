@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from splatpipe.pipeline.app.batch.state import STALE_S, BatchState, CaptureState, Level, State
 from splatpipe.pipeline.app.page_file import page_text, relative_link, shown
-from splatpipe.pipeline.app.report.wording import duration, plural, size
+from splatpipe.pipeline.app.report.wording import duration, plural, roughly, size
 from splatpipe.pipeline.app.thumbnails import Thumbnail, thumbnail
 from splatpipe.pipeline.engine.durable import write_durably
 
@@ -22,9 +22,9 @@ GROUPS: Sequence[tuple[State, str]] = (  # first what somebody has to see to
     ("failed", "Failed"),
     ("running", "Running"),
     ("stopped", "Stopped"),
-    ("waiting", "Waiting"),
     ("done", "Done"),
     ("reused", "Finished before"),
+    ("waiting", "Waiting"),
 )
 STAGE_WORDS: Mapping[State, str] = {"running": "in {}", "failed": "in {}", "stopped": "in {}", "waiting": "before {}"}
 
@@ -100,7 +100,8 @@ def batch_page(state: BatchState, folder: Path) -> str:
     side = SMALL_SIDE if len(state.captures) > MANY else PICTURE_SIDE
     groups = []
     for standing, title in GROUPS:
-        cards = tuple(_card(it, folder, side) for it in state.captures if it.state == standing)
+        those = sorted((it for it in state.captures if it.state == standing), key=lambda it: it.level != "bad")
+        cards = tuple(_card(it, folder, side) for it in those)
         if cards:
             groups.append(Group(standing, title, cards))
     level, headline = _headline(state)
@@ -154,7 +155,7 @@ def _text(state: BatchState) -> str:
     if state.ended_s is not None:
         told.append(f"Ended {_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")
     elif state.left_s is not None:
-        told.append(f"About {duration(state.left_s)} to go, until {_moment(until_s + state.left_s)} (forecast).")
+        told.append(f"About {roughly(state.left_s)} to go, until {_moment(until_s + state.left_s)} (forecast).")
     if state.free_bytes is not None and (state.at_work or not state.all_succeeded):
         needed = f"; what is still to run takes about {size(state.needed_bytes)}" if state.needed_bytes else ""
         told.append(f"{size(state.free_bytes)} are free on the disk{needed}.")
@@ -171,7 +172,7 @@ def _card(capture: CaptureState, folder: Path, side: int) -> Card:
     percent = round(100 * min(max(capture.progress, 0.0), 1.0))
     left = f"{percent} %"
     if capture.left_s is not None:
-        left += f", about {duration(capture.left_s)} left"
+        left += f", about {roughly(capture.left_s)} left"
     begun = capture.state != "waiting" or capture.progress > 0.0
     return Card(
         name=shown(capture.name),

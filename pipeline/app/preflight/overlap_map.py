@@ -22,6 +22,7 @@ MOST_PAIRS = 5_000  # lines; of more, those come first that hold photos which fe
 STRENGTHS = ((0, "weak"), (40, "fair"), (120, "strong"))  # from so many matches on
 CLEAR_PAIRS = 120  # lines that may be drawn in full; more of them are fainter, so that what is below shows through
 FAINTEST = 0.25
+MANY = 400  # photos, whose dots are smaller
 MOST_NAMED = 40  # control points with their names on the map
 RADIUS, MIDDLE = 880, 1000  # of the ring
 LONGEST_TITLE = 120  # characters of a name that a pointer is told
@@ -84,20 +85,22 @@ def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> Drawing | 
         "control": "control points",
     }
     return Drawing(
-        svg=_svg(size, _summary(preflight, kind), groups + (_scale(frame) if frame is not None else "")),
+        svg=_svg(
+            size, _summary(preflight, kind), len(places) > MANY, groups + (_scale(frame) if frame is not None else "")
+        ),
         kind=kind,
         layers=tuple((name, titles[name]) for name, inner in drawn.items() if inner),
         unplaced=len(preflight.photos) - len(places),
     )
 
 
-def _svg(size: tuple[int, int], summary: str, inner: str) -> Markup:
+def _svg(size: tuple[int, int], summary: str, many: bool, inner: str) -> Markup:
     hatch = (
         '<defs><pattern id="hatch" width="44" height="44" patternUnits="userSpaceOnUse" '
         'patternTransform="rotate(45)"><path class="hatch" d="M0 0v44"/></pattern></defs>'
     )
-    box = f"0 0 {size[0]} {size[1]}"
-    return Markup(f'<svg viewBox="{box}" role="img" aria-label="{escape(summary)}">{hatch}{inner}</svg>')
+    facts = f'viewBox="0 0 {size[0]} {size[1]}" class="{"many" if many else "few"}"'
+    return Markup(f'<svg {facts} role="img" aria-label="{escape(summary)}">{hatch}{inner}</svg>')
 
 
 def _summary(preflight: Preflight, kind: str) -> str:
@@ -166,17 +169,17 @@ def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtfu
     """A dot a photo: those in doubt, in a piece apart, and orphans are marked, and drawn above the others."""
     pieces = {photo: number for number, piece in enumerate(preflight.components) for photo in piece}
     orphans = set(preflight.orphans) if len(preflight.photos) > 1 else set()
-    drawn: dict[str, list[str]] = {"plain": [], "apart": [], "doubtful": [], "orphan": []}
+    drawn: dict[str, list[str]] = {"plain": [], "doubtful": [], "apart": [], "orphan": []}
     for i, (x, y) in places.items():
         photo = preflight.photos[i]
         title = shown(photo.name)[:LONGEST_TITLE]
         kind = "plain"
-        if pieces.get(i, 0) > 0:
-            kind, title = "apart", f"{title}: in piece {pieces[i] + 1}, apart from the rest"
         if photo.name in doubtful:
             kind, title = "doubtful", f"{title}: {doubtful[photo.name]}"
+        if pieces.get(i, 0) > 0:
+            kind, title = "apart", f"{title}, in piece {pieces[i] + 1}, apart from the rest"
         if i in orphans:
-            kind, title = "orphan", f"{title}: matches no other photo"
+            kind, title = "orphan", f"{title}, matches no other photo"
         marks = _path(f"photo {kind}", f"M{x} {y}h0", title)
         if kind == "orphan":
             marks += _path("cross", f"M{x - 14} {y - 14}l28 28m-28 0l28 -28")

@@ -14,7 +14,7 @@ from splatpipe.pipeline.app.page_file import page_text, shown
 from splatpipe.pipeline.app.preflight.finding_pictures import FindingPicture, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, Severity
 from splatpipe.pipeline.app.preflight.overlap_map import overlap_map
-from splatpipe.pipeline.app.report.wording import count, duration, number, plural, size
+from splatpipe.pipeline.app.report.wording import count, duration, number, plural, roughly, size
 from splatpipe.pipeline.engine.durable import write_durably
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
@@ -89,7 +89,7 @@ def check_page(preflight: Preflight) -> str:
         control=preflight.control[:MOST_CONTROL],
         control_more=max(0, len(preflight.control) - MOST_CONTROL),
         forecasts=[
-            (it.preset, size(it.memory_bytes), duration(it.seconds), duration(it.cpu_seconds), size(it.disk_bytes),
+            (it.preset, size(it.memory_bytes), roughly(it.seconds), roughly(it.cpu_seconds), size(it.disk_bytes),
              it.lacking)
             for it in preflight.forecasts
         ],
@@ -147,7 +147,10 @@ def _facts(preflight: Preflight) -> list[tuple[str, str]]:
         ("Pixels", f"{number(pixels / 1e6 / len(photos), 1)} megapixels each, on average" if photos else ""),
         ("Cameras", count(len({photo.camera for photo in photos}))),
         ("Taken", _span(times)),
-        ("Positions", "all" if placed == len(photos) else f"{count(placed)} of {count(len(photos))}"),
+        (
+            "Positions",
+            "all" if placed == len(photos) else f"{count(placed) if placed else 'none'} of {count(len(photos))}",
+        ),
         ("Pairs", f"{count(matched)} match of {count(len(preflight.pairs))} compared" if preflight.pairs else ""),
         ("Pieces", f"{count(pieces)} that do not hang together" if pieces > 1 else ""),
     ]

@@ -51,6 +51,16 @@ def duration(seconds: object) -> str:
     return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
+def roughly(seconds: object) -> str:
+    """A time that was forecast, no finer than it is known."""
+    if not _finite(seconds):
+        return NONE
+    minutes = seconds / 60
+    if minutes < 90:
+        return f"{max(1, round(minutes))} min"
+    return f"{minutes / 60:.1f} h" if minutes < 570 else f"{minutes / 60:.0f} h"
+
+
 def size(value: object) -> str:
     """Bytes, by powers of ten."""
     if not _finite(value):

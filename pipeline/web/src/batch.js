@@ -10,6 +10,7 @@ const age = document.querySelector("[data-age]");
 const silent = document.querySelector("[data-silent]");
 const pause = document.querySelector("[data-pause]");
 let paused = false;
+let leaving = false;
 
 /** A time in words, to the second or the minute. */
 function words(milliseconds) {
@@ -28,7 +29,9 @@ function tick() {
   const old = Date.now() - written;
   if (old >= 0) age.textContent = ` (${words(old)} ago)`; // the reader's clock may differ
   silent.hidden = old < silence;
-  if (!paused && !busy() && !document.hidden && Date.now() - opened >= every) location.reload();
+  if (paused || leaving || busy() || document.hidden || Date.now() - opened < every) return;
+  leaving = true;
+  location.reload();
 }
 
 pause.hidden = false;
