@@ -90,6 +90,8 @@ def snakemake_command(call: Call, plan: Plan, profile: Profile) -> list[str]:
     command += ["--retries", str(plan.retries), "--scheduler", "greedy", "--rerun-triggers", "input"]
     if profile.folder is not None:
         command += ["--profile", str(profile.folder)]
+    if not profile.local and not profile.says("cores"):  # no job elsewhere gets more threads than this
+        command += ["--cores", str(max((job.threads for each in plan.captures for job in each.jobs), default=1))]
     if profile.local:
         memory = free_memory_bytes() // MEGABYTE
         limits = ["gpu=1", *([f"mem_mb={memory}"] if memory else [])]

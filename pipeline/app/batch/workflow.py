@@ -1,7 +1,8 @@
 """The workflow of a call for Snakemake: a rule a stage, with the jobs that the plan names and no others.
 
-Ours stays the only cache: each call has a folder of its own in which no output is there yet, so that neither times of
-files nor what Snakemake remembers decides anything. An output is a marker that the job leaves when its stage is there.
+Ours stays the only cache: each call has a folder of its own, and outputs of names of their own, of which none is there
+yet, so that neither times of files nor what Snakemake remembers decides anything. An output is a marker that the job
+leaves when its stage is there.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ BEFORE = {{capture: dict(zip(list(jobs)[1:], jobs)) for capture, jobs in JOBS.it
 
 
 def before(wildcards, stage):
-    return [f"done/{{wildcards.capture}}/{{name}}" for name in [BEFORE[wildcards.capture].get(stage)] if name]
+    return [f"{done}/{{wildcards.capture}}/{{name}}" for name in [BEFORE[wildcards.capture].get(stage)] if name]
 
 
 wildcard_constraints:
@@ -37,7 +38,7 @@ wildcard_constraints:
 
 rule all:
     input:
-        [f"done/{{capture}}/{{list(jobs)[-1]}}" for capture, jobs in JOBS.items()],
+        [f"{done}/{{capture}}/{{list(jobs)[-1]}}" for capture, jobs in JOBS.items()],
 """
 
 _RULE = """
@@ -46,7 +47,7 @@ rule {stage}:
     input:
         lambda wildcards: before(wildcards, "{stage}"),
     output:
-        "done/{{capture}}/{stage}",
+        "{done}/{{capture}}/{stage}",
     priority: {priority}
     threads: lambda wildcards: JOBS[wildcards.capture]["{stage}"][0]
     resources:
@@ -73,18 +74,21 @@ def workflow_text(call: Call, plan: Plan, stages: Sequence[Stage]) -> str:
         for capture in plan.captures
         if capture.jobs
     }
+    done = f"done-{plan.began_s:.3f}"  # a storage that outlives the call has those of earlier ones
     wanted = {name for stages_of in jobs.values() for name in stages_of}
     words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder)]
     job = shlex.join(words).replace("\\", "\\\\").replace('"', '\\"').replace("{", "{{").replace("}", "}}")
     rules = [
         # Broken photos are told first; then what is nearest to its end goes first, so that captures are finished one
         # after the other and not all in the morning.
-        _RULE.format(stage=stage.name, priority=place or len(stages), job=job, gpu=_gpu(stage.name, plan.device))
+        _RULE.format(
+            done=done, stage=stage.name, priority=place or len(stages), job=job, gpu=_gpu(stage.name, plan.device)
+        )
         for place, stage in enumerate(stages)
         if stage.name in wanted
     ]
     lines = ",\n".join(f"    {json.dumps(key)}: {json.dumps(of_capture)}" for key, of_capture in jobs.items())
-    return _HEAD.format(jobs=f"{{\n{lines}\n}}") + "".join(rules)
+    return _HEAD.format(done=done, jobs=f"{{\n{lines}\n}}") + "".join(rules)
 
 
 def _resources(threads: int, memory_bytes: int, seconds: float, disk_bytes: int) -> list[int]:
