@@ -59,11 +59,13 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     with same_bits(inputs.machine.threads):
         floaters = measure_floaters(gaussians, cameras, set(held_out), inputs["undistort.dataset"], options, area)
         accuracy = measure_accuracy(inputs.parts, cameras, held_out, partial(render_depth, gaussians, options=options))
-    result = {"test_views": len(per_view), "mean": means, "floaters": floaters, "accuracy": accuracy}
+    result: dict[str, Any] = {"test_views": len(per_view), "mean": means, "floaters": floaters, "accuracy": accuracy}
     if area is not None:
         result["whole"] = mean_measures([view["whole"] for view in per_view])
     result["per_view"] = per_view
     write_json(out / "metrics.json", result)
     summary: dict[str, Any] = {"test_views": len(per_view)}
     summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
+    if area is not None:
+        summary["whole_psnr"] = result["whole"]["psnr"]
     return summary | {"veil": floaters["veil"]["mean"], "device": device.name}

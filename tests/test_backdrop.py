@@ -181,6 +181,20 @@ def test_figures_are_of_the_inside_and_the_whole_picture_is_told_beside(inputs: 
         assert view["counted"] == pytest.approx((mask > 0).mean(), abs=1e-6) and 0.1 < view["counted"] < 0.9
 
 
+def test_a_photo_that_hardly_shows_the_inside_is_no_witness(inputs: Inputs, tmp_path: Path) -> None:
+    boundary = json.loads(inputs["georef.boundary"].read_text())
+    boundary["model"]["polygons"][0][0] = (HALF - [1.9, 0.0]).tolist()  # a strip of the wall that two photos show
+    (tmp_path / "boundary.json").write_text(json.dumps(boundary))
+    bounded = replace(inputs, parts={**inputs.parts, "georef.boundary": tmp_path / "boundary.json"})
+    evaluate.run(EvaluateConfig(), bounded, tmp_path, tiny_scene.Recorder())
+    result = json.loads((tmp_path / "metrics.json").read_text())
+    told = [view["psnr"] for view in result["per_view"] if view["psnr"] is not None]
+    for view in result["per_view"]:
+        assert (view["psnr"] is None) == (view["counted"] < 0.01) and view["whole"]["psnr"] is not None
+    assert 0 < len(told) < len(result["per_view"])
+    assert result["mean"]["psnr"] == pytest.approx(sum(told) / len(told), abs=2e-6)
+
+
 def test_the_inside_comes_first_and_the_page_begins_there(inputs: Inputs, tmp_path: Path) -> None:
     evaluate.run(EvaluateConfig(), inputs, inputs.photos_dir, tiny_scene.Recorder())
     export.run(ExportConfig(), inputs, tmp_path, tiny_scene.Recorder())

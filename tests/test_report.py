@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -330,12 +331,21 @@ def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
     manifest.write_text(manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
 
 
+def show_nothing_inside(told: dict[str, Any]) -> None:
+    """As evaluate leaves it where no held-out photo shows the inside of the boundary."""
+    told["whole"] = dict(told["mean"])
+    for measures in (told["mean"], *told["per_view"]):
+        measures.update(psnr=None, psnr_cc=None, ssim=None)
+
+
 @pytest.mark.parametrize(
     ("part", "change", "level", "said"),
     [
         ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=17.0), "bad", "a poor likeness"),
         ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=22.0), "doubt", "a fair likeness"),
         ("evaluate.metrics", lambda told: told.update(per_view=[]), "doubt", "No photo was held out"),
+        ("evaluate.metrics", lambda told: told.update(whole=told["mean"]), "good", "dB inside the boundary"),
+        ("evaluate.metrics", show_nothing_inside, "doubt", "No held-out photo shows what lies inside the boundary"),
         ("evaluate.metrics", lambda told: told["floaters"]["veil"].update(mean=0.2), "doubt", "20.0 % of the light"),
         (
             "evaluate.metrics",

@@ -54,9 +54,8 @@ def measure_floaters(
     chosen = near_or_free(gaussians, space)
     floating, counted = share_of_opacity(gaussians, chosen), seen
     if area is not None:
-        inside = torch.from_numpy(area.contains(gaussians.means.double().numpy(force=True)))
+        inside, counts = _inside(area, gaussians), area.contains(points.xyz)
         floating, chosen = share_of_opacity(gaussians.select(inside), chosen[inside]), chosen & inside
-        counts = area.contains(points.xyz)
         counted = [rows[counts[rows]] for rows in seen]
     pairs = neighbouring_pairs(seen)
     places = sorted({place for pair in pairs for place in pair})
@@ -79,6 +78,10 @@ def measure_floaters(
             "pixels": apart.pixels,
         },
     }
+
+
+def _inside(area: PlanArea, gaussians: Gaussians) -> Bool[Tensor, " n"]:
+    return torch.from_numpy(area.contains(gaussians.means.double().numpy(force=True)))
 
 
 def _flagged(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> Gaussians:

@@ -22,6 +22,7 @@ from splatpipe.pipeline.splat import metrics
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
 EQUAL_DB = 100.0  # stands for the infinite PSNR of pictures that are equal: JSON has no infinity
 MASKED_GREY = 128
+LEAST_INSIDE = 0.01  # of a picture: a photo that shows less inside a boundary tells nothing of it
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
@@ -50,7 +51,10 @@ def evaluate_view(
         _write_png(stem, "mask", np.where(mask, 255, 0).astype(np.uint8))
     counted = 1.0 if mask is None else round(float(mask.mean()), 6)
     facts = {"name": camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
-    return facts | {"counted": counted} | measure(render, photo, mask) | whole
+    figures = measure(render, photo, mask)
+    if inside is not None and counted < LEAST_INSIDE:
+        figures = dict.fromkeys(figures)
+    return facts | {"counted": counted} | figures | whole
 
 
 def shows_inside(area: PlanArea, camera: Camera, depth: Float[np.ndarray, "h w"]) -> Mask:

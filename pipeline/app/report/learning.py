@@ -70,6 +70,8 @@ def views_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
         return None
     metrics = holdings.read("evaluate.metrics")
     views = sorted(metrics["per_view"], key=lambda view: view["psnr"] if view.get("psnr") is not None else -1.0)
+    if "whole" in metrics:  # what shows nothing inside the boundary is not the worst, but no witness
+        views = sorted(views, key=lambda view: view.get("psnr") is None)
     measures = [(name, *told) for name, told in MEASURES.items() if any(view.get(name) is not None for view in views)]
     chapter: Chapter = {
         "titles": [title for _, title, _ in measures],
@@ -77,6 +79,7 @@ def views_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
         "rows_more": max(0, len(views) - MOST_ROWS),
         "mean": [number(metrics["mean"].get(name), digits) for name, _, digits in measures],
         "count": len(views),
+        "bounded": "whole" in metrics,
         "floaters": _floaters(metrics.get("floaters") or {}),
         "shown": [],
         "charts": [],

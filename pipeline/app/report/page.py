@@ -138,7 +138,8 @@ def _cards(holdings: Holdings) -> list[tuple[str, str, str]]:
             break
     if evaluate.get("psnr") is not None:
         text = f"SSIM {number(evaluate.get('ssim'), 2)}, {count(evaluate.get('test_views'))} held-out photos"
-        cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text))
+        inside = ", inside the boundary" if evaluate.get("whole_psnr") is not None else ""
+        cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text + inside))
     if train:
         cards.append(("Gaussians", count(train.get("gaussians")), ""))
     seconds = [float(artifact.manifest["seconds"]) for artifact in holdings.artifacts.values()]

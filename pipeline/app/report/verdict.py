@@ -226,14 +226,18 @@ def _views(holdings: Holdings) -> Finding | None:
     if "evaluate" not in holdings.artifacts:
         return None
     metrics = holdings.read("evaluate.metrics")
-    mean, views = metrics["mean"], metrics["per_view"]
+    bounded = " inside the boundary" if "whole" in metrics else ""
+    mean, views = metrics["mean"], [view for view in metrics["per_view"] if view["psnr"] is not None]
+    if bounded and metrics["per_view"] and not views:
+        text = "No held-out photo shows what lies inside the boundary, so nothing tells how good it is."
+        return Finding("doubt", "Held-out photos", text)
     if not views:
         return Finding("doubt", "Held-out photos", "No photo was held out, so nothing tells how good the pictures are.")
     worst_of = min(views, key=_likeness)
     value, worst = _likeness(mean), _likeness(worst_of)
     level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
     told = {"good": "a good likeness", "doubt": "a fair likeness", "bad": "a poor likeness"}[level]
-    text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB "
+    text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded} "
     text += f"({value:.1f} without what exposure did), SSIM {number(mean['ssim'], 2)}: {told}"
     if level == "good" and worst < PSNR_DOUBT_DB:
         return Finding(
