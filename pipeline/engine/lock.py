@@ -116,9 +116,7 @@ class Hold:
 
 
 @contextmanager
-def locked(
-    out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell = lambda _text: None
-) -> Iterator[Hold]:
+def locked(out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell = lambda _text: None) -> Iterator[Hold]:
     """Hold an OUT for writing.
 
     Args:

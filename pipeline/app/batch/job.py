@@ -23,9 +23,9 @@ from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJ
 from splatpipe.pipeline.app.batch.tries import HOPELESS, Ending, TryLog
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
 from splatpipe.pipeline.app.ending import PART_VARIABLE
+from splatpipe.pipeline.engine.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.engine.worker import PR_SET_PDEATHSIG
 
 RESERVE_BYTES = 256 << 20  # of the disk, for what other captures' stages are writing at the same time
 
