@@ -1,8 +1,10 @@
-"""Positions that cannot be right, judged by those of the other photos."""
+"""What is doubtful about photos, as it is told; positions that cannot be right, judged by those of the other photos."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,6 +13,25 @@ METRES_A_DEGREE = 111_195.0  # of a sphere: these distances only tell what is fa
 FAR_M = 500.0  # no drone photographs one building from further
 FAR_SPREADS = 20.0  # times the median distance from the middle: long corridors are captures, too
 MIN_POSITIONS = 3  # of two, nobody knows which is wrong
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Something that may be wrong with a capture, as a run warns of it and a preflight tells it.
+
+    Attributes:
+        code: What it is, for programs.
+        message: One sentence.
+        hint: What to do about it.
+        photos: Names of those that it is about; empty where it is about the whole capture.
+        weight: A ``note`` costs neither photos nor accuracy.
+    """
+
+    code: str
+    message: str
+    hint: str = ""
+    photos: tuple[str, ...] = ()
+    weight: Literal["warning", "note"] = "warning"
 
 
 def find_wrong(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:

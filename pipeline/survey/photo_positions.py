@@ -122,7 +122,7 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
     conventions = _conventions(photos)
     for photo in photos:
         place = (places or {}).get(photo.name)
-        stated = [gps for gps in (_file_gps(place), photo.exif.gps, _xmp_gps(photo.xmp)) if gps and not gps.void]
+        stated = [gps for gps in (_file_gps(place), photo.exif.gps, xmp_place(photo.xmp)) if gps and not gps.void]
         good = [gps for gps in stated if is_on_earth(gps.latitude, gps.longitude)]
         if stated and not good:
             wrong[photo.name] = NOWHERE
@@ -308,7 +308,7 @@ def _xmp_altitude(xmp: Mapping[str, str]) -> float | None:
     return xmp_number(xmp, "drone-dji:AbsoluteAltitude", *ALTITUDE_BOUNDS_M)
 
 
-def _xmp_gps(xmp: Mapping[str, str]) -> Gps | None:
+def xmp_place(xmp: Mapping[str, str]) -> Gps | None:
     """The position that XMP states; DJI spells the longitude both ways."""
     latitude = xmp_number(xmp, "drone-dji:GpsLatitude", -1e6, 1e6)
     longitude = xmp_number(xmp, "drone-dji:GpsLongitude", -1e6, 1e6)

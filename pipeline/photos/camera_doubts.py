@@ -1,0 +1,121 @@
+"""Photos that do not go with the others: of another camera, another zoom, another size."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from splatpipe.pipeline.photos.camera_groups import CameraGroup, camera_name, picture_scale
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.doubts import Doubt
+from splatpipe.pipeline.photos.names import some
+
+MINORITY = 0.25  # of the photos: a camera that took more of them was meant to
+
+
+def camera_doubts(
+    photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int]
+) -> list[Doubt]:
+    """What speaks against one camera, one zoom, and photos as it wrote them.
+
+    Args:
+        photos: Those that take part.
+        groups: Their cameras.
+        camera_of: The camera of each photo.
+    """
+    resized = {photo.name: _resizing(photo) for photo in photos}
+    sizes = Counter(resized.values())
+    common = sizes.most_common(1)[0][0] if sizes else ""
+    odd = [name for name, what in resized.items() if what and what != common]
+    doubts = _mixed_cameras(photos, groups, camera_of, set(odd))
+    if common:
+        which = "All photos" if sizes[common] == len(photos) else f"{sizes[common]} of {len(photos)} photos"
+        doubts.append(
+            Doubt(
+                "resized",
+                f"{which} are {common}.",
+                "Photos as the camera wrote them show more, and their metadata fit; these count as reduced.",
+                weight="note",
+            )
+        )
+    for what in sorted({resized[name] for name in odd}):
+        names = sorted(name for name in odd if resized[name] == what)
+        doubts.append(
+            Doubt("resized", f"{some(names)}: {what}, unlike the others.", "Take the original files.", tuple(names))
+        )
+    return doubts
+
+
+def _resizing(photo: CheckedPhoto) -> str:
+    """What was done to a photo's size, as EXIF tells; empty where nothing was."""
+    taken = photo.exif.width, photo.exif.height
+    if taken[0] is None or taken[1] is None:
+        return ""
+    scale = picture_scale(photo.exif, photo.width, photo.height)
+    if scale == 1.0:
+        return ""
+    done = "cropped" if scale is None else "resized"
+    return f"{done} to {photo.width} × {photo.height} px from {taken[0]} × {taken[1]}"
+
+
+def _mixed_cameras(
+    photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int], resized: set[str]
+) -> list[Doubt]:
+    """The cameras of few photos one by one, those of many once."""
+    if len(groups) < 2:
+        return []
+    members: dict[int, list[CheckedPhoto]] = {}
+    for photo in photos:
+        members.setdefault(camera_of[photo.name], []).append(photo)
+    main = max(members, key=lambda number: len(members[number]))
+    doubts = []
+    many = [number for number, own in members.items() if len(own) > MINORITY * len(photos)]
+    if len(many) > 1:
+        told = "; ".join(f"{len(members[number])} photos of {_described(members[number][0])}" for number in many)
+        doubts.append(
+            Doubt("cameras", f"The capture mixes cameras: {told}.", "Each is calibrated by itself.", weight="note")
+        )
+    for number, own in sorted(members.items()):
+        names = tuple(photo.name for photo in own if photo.name not in resized)
+        if number in many or number == main or not names:
+            continue
+        code, what = _difference(own[0], members[main][0])
+        doubts.append(
+            Doubt(
+                code,
+                f"{some(names)}: {what}.",
+                "A camera of few photos cannot be calibrated well: leave them out, or fly again with one camera.",
+                names,
+            )
+        )
+    return doubts
+
+
+def _difference(photo: CheckedPhoto, other: CheckedPhoto) -> tuple[str, str]:
+    """How a photo of a small group differs from one of the largest."""
+    mine, theirs = _body(photo), _body(other)
+    if mine != theirs:
+        if mine[:2] == theirs[:2]:
+            return "cameras", f"another {camera_name(*mine[:2])} than the others, by its serial number"
+        return "cameras", f"taken with {_described(photo)}, the others with {_described(other)}"
+    if sorted((photo.width, photo.height)) != sorted((other.width, other.height)):
+        return "resized", f"{photo.width} × {photo.height} px, the others {other.width} × {other.height}"
+    if (photo.exif.focal_mm, photo.exif.focal_35mm) != (other.exif.focal_mm, other.exif.focal_35mm):
+        return "focal-length", f"a focal length of {_focal(photo)}, the others {_focal(other)}"
+    return "cameras", "not taken as the others were (turned, or with the lens's distortion taken out)"
+
+
+def _body(photo: CheckedPhoto) -> tuple[str, str, str]:
+    return photo.exif.make, photo.exif.model, photo.exif.serial
+
+
+def _described(photo: CheckedPhoto) -> str:
+    name = camera_name(photo.exif.make, photo.exif.model)
+    focal = _focal(photo)
+    return f"a {name}" + (f" ({focal})" if focal != "unknown" else "")
+
+
+def _focal(photo: CheckedPhoto) -> str:
+    if photo.exif.focal_mm is not None:
+        return f"{photo.exif.focal_mm:g} mm"
+    return "unknown" if photo.exif.focal_35mm is None else f"{photo.exif.focal_35mm:g} mm (35 mm equivalent)"

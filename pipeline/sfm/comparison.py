@@ -1,0 +1,89 @@
+"""How photos differ from their neighbours in what both show: in detail, and in brightness.
+
+Each pair of photos that match is compared where they match, so that what they show cancels out. A photo's own share in
+these differences is what most of its neighbours say; those that are found odd themselves do not count the second time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.photos.detail import DIRECTIONS
+from splatpipe.pipeline.sfm.pairs import Pair
+from splatpipe.pipeline.sfm.quick_match import Agreement, Glimpse
+
+LEAST_PLACES = 8  # matches that a pair is compared by
+ALIKE_SIZES = 1.5  # of a keypoint in both photos, relative to them: further apart, one photo has more detail of right
+PASSES = 3
+ODD_DETAIL = 0.6  # of a logarithm of energies: photos that dull are no standard for others
+ODD_LEVEL_EV = 0.7
+
+
+def duller(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Float64[np.ndarray, "n directions"]:
+    """How much less fine detail each photo has than its neighbours where both show the same, by direction.
+
+    Returns:
+        Natural logarithms of a ratio of energies, above 0 for a duller photo, about the median of all; NaN for photos
+        that nothing is compared with.
+    """
+    differences = {}
+    for pair, agreed in found.items():
+        value = _detail_difference(glimpses[pair[0]], glimpses[pair[1]], agreed)
+        if value is not None:
+            differences[pair] = value
+    return _own_share(differences, len(glimpses), DIRECTIONS, ODD_DETAIL)
+
+
+def brighter_ev(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Float64[np.ndarray, " n"]:
+    """Exposure values by which each photo shows the same things brighter than its neighbours do; NaN where unknown."""
+    differences = {}
+    for (i, j), agreed in found.items():
+        steps = glimpses[i].levels[agreed.first] - glimpses[j].levels[agreed.second]
+        known = steps[np.isfinite(steps)]
+        if len(known) >= LEAST_PLACES:
+            value = float(np.median(known))
+            differences[i, j] = np.array([value]), np.array([-value])
+    return _own_share(differences, len(glimpses), 1, ODD_LEVEL_EV)[:, 0]
+
+
+def _detail_difference(
+    first: Glimpse, second: Glimpse, agreed: Agreement
+) -> tuple[Float64[np.ndarray, " directions"], Float64[np.ndarray, " directions"]] | None:
+    """How much duller the first photo is, in its directions, and the second, in its own."""
+    ratio = (first.sizes[agreed.first] / first.width) / (second.sizes[agreed.second] / second.width)
+    alike = (ratio > 1.0 / ALIKE_SIZES) & (ratio < ALIKE_SIZES)
+    here, there = first.detail[agreed.first], second.detail[agreed.second]
+    rows = np.flatnonzero(alike & np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1))
+    if len(rows) < LEAST_PLACES:
+        return None
+    turn = second.angles_deg[agreed.second[rows]] - first.angles_deg[agreed.first[rows]]
+    shift = np.rint(turn / (180.0 / DIRECTIONS)).astype(np.int64)[:, None]
+    own = np.arange(DIRECTIONS)
+    in_first = np.take_along_axis(there[rows], (own + shift) % DIRECTIONS, axis=1) - here[rows]
+    in_second = np.take_along_axis(here[rows], (own - shift) % DIRECTIONS, axis=1) - there[rows]
+    return np.median(in_first, axis=0).astype(np.float64), np.median(in_second, axis=0).astype(np.float64)
+
+
+def _own_share(
+    differences: Mapping[Pair, tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]],
+    count: int,
+    size: int,
+    odd: float,
+) -> Float64[np.ndarray, "count size"]:
+    """Each photo's median difference from its neighbours; from those that are not odd, where it has enough of them."""
+    neighbours: list[list[tuple[int, Float64[np.ndarray, " k"]]]] = [[] for _ in range(count)]
+    for (i, j), (of_first, of_second) in sorted(differences.items()):
+        neighbours[i].append((j, of_first))
+        neighbours[j].append((i, of_second))
+    own = np.full((count, size), np.nan)
+    is_odd = np.zeros(count, dtype=bool)
+    for _ in range(PASSES):
+        for photo, told in enumerate(neighbours):
+            if told:
+                trusted = [value for other, value in told if not is_odd[other]] or [value for _, value in told]
+                own[photo] = np.median(trusted, axis=0)
+        is_odd = (np.abs(np.nan_to_num(own)) > odd).any(axis=1)
+    return own

@@ -1,0 +1,158 @@
+"""A quick look at which photos show the same thing, at low resolution: enough to tell who overlaps whom, no more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.detail import (
+    Brightness,
+    brightness_of,
+    detail_at,
+    levels_at,
+    read_grey,
+    signature_of,
+)
+from splatpipe.pipeline.sfm.keypoints import DESCRIPTOR_NORM, reduced
+from splatpipe.pipeline.sfm.pairs import Pair
+
+LONGEST_PX = 640  # of the pictures that are matched: a fifth of a second a photo
+MOST_KEYPOINTS = 1000
+RATIO = 0.85  # of the angles to the best and to the second best descriptor, looser than COLMAP's 0.8: RANSAC follows
+LEAST_MATCHES = 12  # that agree on a two-view geometry; chance gives 8 and a few
+LEAST_SHARE = 0.2  # of the candidates: fewer agree by chance among many
+TOLERANCE_PX = 1.5  # at the low resolution
+ROUNDS = 1000  # of RANSAC
+CONFIDENCE = 0.999
+TURN_DEG = 180.0
+
+
+@dataclass(frozen=True)
+class Glimpse:
+    """What is kept of a photo.
+
+    Attributes:
+        places: (n, 2) keypoints in the stored grid, pixels.
+        sizes: Their diameters, likewise.
+        angles_deg: Their orientations, from x towards y.
+        descriptors: Square-rooted SIFT, unit length.
+        detail: Of each keypoint, as ``detail_at`` has it.
+        levels: Of each keypoint, as ``levels_at`` has it.
+        brightness: Of the photo.
+        signature: The photo at a few pixels.
+        width: Of the stored grid.
+        height: Likewise.
+    """
+
+    places: Float64[np.ndarray, "n 2"]
+    sizes: Float64[np.ndarray, " n"]
+    angles_deg: Float64[np.ndarray, " n"]
+    descriptors: Float32[np.ndarray, "n 128"]
+    detail: Float32[np.ndarray, "n directions"]
+    levels: Float32[np.ndarray, " n"]
+    brightness: Brightness
+    signature: Float32[np.ndarray, "side side"]
+    width: int
+    height: int
+
+    def rooted(self) -> UInt8[np.ndarray, "n 128"]:
+        """The descriptors as the line has them."""
+        return np.asarray(np.minimum(np.rint(self.descriptors * DESCRIPTOR_NORM), 255), np.uint8)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Rows of keypoints of two photos that agree on a two-view geometry: of the first, of the second."""
+
+    first: Int64[np.ndarray, " m"]
+    second: Int64[np.ndarray, " m"]
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+NOTHING = Agreement(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def glimpse(photo: CheckedPhoto) -> Glimpse:
+    """Read a photo, find its largest keypoints at low resolution, and measure detail and brightness around them.
+
+    Raises:
+        SplatpipeError: if the file is gone or is no longer the one that was checked.
+    """
+    grey = read_grey(photo)
+    small = reduced(grey, LONGEST_PX)
+    detector = cv2.SIFT_create(enable_precise_upscale=True)
+    found = sorted(detector.detect(small, None), key=lambda keypoint: -keypoint.size)[:MOST_KEYPOINTS]
+    values = np.zeros((0, 128), np.float32)
+    if found:
+        found, values = detector.compute(small, found)
+    places = np.array([keypoint.pt for keypoint in found], np.float64).reshape(-1, 2) + 0.5
+    full = np.array([photo.width / small.shape[1], photo.height / small.shape[0]])
+    seen = places * np.array([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
+    sums = np.maximum(values.sum(axis=1, keepdims=True), 1e-6)
+    return Glimpse(
+        places=places * full,
+        sizes=np.array([keypoint.size for keypoint in found], np.float64) * float(full.mean()),
+        angles_deg=np.array([keypoint.angle for keypoint in found], np.float64),
+        descriptors=np.sqrt(values / sums).astype(np.float32),
+        detail=detail_at(grey, seen),
+        levels=levels_at(grey, seen),
+        brightness=brightness_of(grey),
+        signature=signature_of(grey),
+        width=photo.width,
+        height=photo.height,
+    )
+
+
+def match_glimpses(glimpses: Sequence[Glimpse], pairs: Iterable[Pair], threads: int) -> dict[Pair, Agreement]:
+    """Match pairs of photos; each with what agrees, nothing included."""
+    listed = sorted(set(pairs))
+    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+        found = pool.map(lambda pair: agreement(glimpses[pair[0]], glimpses[pair[1]]), listed)
+        return dict(zip(listed, found, strict=True))
+
+
+def agreement(first: Glimpse, second: Glimpse) -> Agreement:
+    """Keypoints of two photos that are mutually nearest and agree on a fundamental matrix."""
+    rows, columns = _mutual(first.descriptors, second.descriptors)
+    if len(rows) < LEAST_MATCHES:
+        return NOTHING
+    scale = LONGEST_PX / max(first.width, first.height), LONGEST_PX / max(second.width, second.height)
+    here, there = first.places[rows] * scale[0], second.places[columns] * scale[1]
+    cv2.setRNGSeed(0)
+    _, mask = cv2.findFundamentalMat(here, there, cv2.USAC_FAST, TOLERANCE_PX, CONFIDENCE, ROUNDS)
+    if mask is None:
+        return NOTHING
+    good = np.flatnonzero(mask.ravel())
+    if len(good) < max(LEAST_MATCHES, LEAST_SHARE * len(rows)):
+        return NOTHING
+    return Agreement(rows[good], columns[good])
+
+
+def counts(found: Mapping[Pair, Agreement]) -> dict[Pair, int]:
+    """How many keypoints agree, by pair."""
+    return {pair: len(agreed) for pair, agreed in found.items()}
+
+
+def _mutual(
+    first: Float32[np.ndarray, "n 128"], second: Float32[np.ndarray, "m 128"]
+) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
+    """Rows that are each other's nearest, by far."""
+    if min(len(first), len(second)) < 2:
+        return NOTHING.first, NOTHING.second
+    cosines = first @ second.T
+    nearest = cosines.argmax(axis=1)
+    rows = np.flatnonzero(cosines.argmax(axis=0)[nearest] == np.arange(len(first)))
+    best = cosines[rows, nearest[rows]]
+    others = cosines[rows]
+    others[np.arange(len(rows)), nearest[rows]] = -1.0
+    angles = np.arccos(np.clip(np.stack([best, others.max(axis=1)]), -1.0, 1.0))
+    kept = angles[0] < RATIO * angles[1]
+    return rows[kept], nearest[rows][kept]

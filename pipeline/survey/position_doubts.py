@@ -1,0 +1,181 @@
+"""What the photos' positions make doubtful before anything is matched: from their metadata alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.doubts import Doubt, median_distance_m
+from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.survey.photo_positions import (
+    DATUM_STEP_M,
+    NOWHERE,
+    Position,
+    PositionList,
+    is_on_earth,
+    xmp_place,
+)
+
+CONTRADICTION_M = 10.0  # between a photo's EXIF and XMP; corrected positions (PPK) move by less
+WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
+RTK_SHARE = 0.5  # of the photos with a fix: then the others have lost it
+ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
+LEAST_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
+
+
+def position_doubts(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Doubt]:
+    """What is doubtful, one entry a kind.
+
+    Args:
+        photos: Those that take part.
+        positions: What was read of them.
+    """
+    return [
+        *_none_on_earth(positions),
+        *_missing(photos, positions),
+        *_contradicting(photos),
+        *_altitudes(positions.positions),
+        *_datums(positions),
+        *_lost_fix(positions.positions),
+    ]
+
+
+def _none_on_earth(positions: PositionList) -> list[Doubt]:
+    doubts = []
+    if positions.impossible:
+        doubts.append(
+            Doubt(
+                "position-impossible",
+                f"The position is none that can be on Earth: {some(positions.impossible)}.",
+                "These photos take part without their position.",
+                positions.impossible,
+            )
+        )
+    elsewhere = {name: why for name, why in positions.wrong.items() if why != NOWHERE}
+    if elsewhere:
+        told = [f"{printable(name)} {why}" for name, why in elsewhere.items()]
+        more = f"; and {len(told) - 10} more" if len(told) > 10 else ""
+        doubts.append(
+            Doubt(
+                "position-far",
+                f"Positions that cannot be right: {'; '.join(told[:10])}{more}.",
+                "These photos take part without their position.",
+                tuple(sorted(elsewhere)),
+            )
+        )
+    return doubts
+
+
+def _missing(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Doubt]:
+    stated = {position.name for position in positions.positions} | set(positions.wrong)
+    without = tuple(photo.name for photo in photos if photo.name not in stated)
+    if not without:
+        return []
+    if len(without) == len(photos):
+        return [
+            Doubt(
+                "position-missing",
+                "No photo has a position: the result will have neither scale nor place.",
+                "Control points or scale bars give both; or was the receiver off, or the EXIF lost in a copy?",
+                weight="note",
+            )
+        ]
+    which = some(without) if len(without) <= len(photos) / 2 else f"{len(without)} of {len(photos)} photos"
+    single = without if len(without) <= len(photos) / 2 else ()
+    hint = "Was the receiver's fix lost, or the EXIF in a copy? They take part without it."
+    return [Doubt("position-missing", f"Without a position: {which}.", hint, single)]
+
+
+def _contradicting(photos: Sequence[CheckedPhoto]) -> list[Doubt]:
+    """Photos whose EXIF and XMP state different places, where those of most agree."""
+    apart: dict[str, float] = {}
+    for photo in photos:
+        gps, other = photo.exif.gps, xmp_place(photo.xmp)
+        if gps is None or other is None or not is_on_earth(gps.latitude, gps.longitude):
+            continue
+        if is_on_earth(other.latitude, other.longitude):
+            places = [(gps.latitude, gps.longitude)], [(other.latitude, other.longitude)]
+            apart[photo.name] = median_distance_m(*places)
+    names = tuple(sorted(name for name, metres in apart.items() if metres > CONTRADICTION_M))
+    if not names:
+        return []
+    if len(names) > len(apart) / 2:
+        step = float(np.median(list(apart.values())))
+        text = f"EXIF and the drone's XMP place the photos {step:,.0f} m apart."
+        return [Doubt("position-contradiction", text, "EXIF's places are used; were they written anew?")]
+    furthest = max(names, key=apart.__getitem__)
+    text = f"EXIF and XMP state different places: {some(names)} (up to {apart[furthest]:,.0f} m apart)."
+    return [Doubt("position-contradiction", text, "EXIF's are used: correct them, or write the originals back.", names)]
+
+
+def _altitudes(positions: Sequence[Position]) -> list[Doubt]:
+    """Altitudes far off the others'."""
+    stated = {each.name: each.altitude_m for each in positions if each.altitude_m is not None}
+    doubts = []
+    without = tuple(each.name for each in positions if each.altitude_m is None)
+    if stated and without and len(without) <= len(positions) / 2:
+        text = f"Without an altitude: {some(without)}."
+        doubts.append(Doubt("altitude-missing", text, "Their heights count as unknown.", without))
+    if len(stated) < 3:
+        return doubts
+    values = np.array(list(stated.values()), dtype=np.float64)
+    off = np.abs(values - np.median(values))
+    limit = max(LEAST_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
+    odd = tuple(name for name, metres in zip(stated, off.tolist(), strict=True) if metres > limit)
+    if odd:
+        text = f"Altitudes far from the others' ({np.median(values):.0f} m): {some(odd)}."
+        doubts.append(Doubt("altitude-far", text, "Correct them, or leave the photos out.", odd))
+    return doubts
+
+
+def _datums(positions: PositionList) -> list[Doubt]:
+    kinds = Counter((each.vertical, each.altitude_source) for each in positions.positions if each.altitude_source)
+    doubts = []
+    if len(kinds) > 1:
+        told = ", ".join(f"{count} {_datum(*kind)}" for kind, count in kinds.most_common())
+        doubts.append(
+            Doubt(
+                "altitude-datums",
+                f"Altitudes are of different kinds: {told}.",
+                "Heights of different datums differ by up to a hundred metres: give positions of one in geo.txt.",
+            )
+        )
+    step = positions.altitude_step_m
+    if step is not None and abs(step) > DATUM_STEP_M:
+        doubts.append(
+            Doubt(
+                "altitude-datums",
+                f"The altitudes in EXIF and in the drone's XMP differ by {step:.1f} m: they have different datums.",
+                "EXIF's are used.",
+            )
+        )
+    return doubts
+
+
+def _datum(vertical: str, source: str | None) -> str:
+    where = {"file": "from the file of positions", "exif": "from EXIF", "xmp": "from XMP"}.get(source or "", "")
+    return f"{where} ({vertical if vertical != 'unknown' else 'datum not stated'})"
+
+
+def _lost_fix(positions: Sequence[Position]) -> list[Doubt]:
+    """Photos without the fix that most have; by the receiver's own word, else by its standard deviations."""
+    if not positions:
+        return []
+    fixed = {each.name: _is_fixed(each) for each in positions}
+    lost = tuple(name for name, has in fixed.items() if not has)
+    if not lost or len(lost) > (1.0 - RTK_SHARE) * len(positions):
+        return []
+    sigmas: Mapping[str, float] = {each.name: each.sigma_horizontal_m for each in positions}
+    worst = max(sigmas[name] for name in lost)
+    text = f"RTK was lost: {some(lost)} (their positions are good to {worst:.2g} m; the others' to "
+    text += f"{np.median([sigmas[name] for name in fixed if fixed[name]]):.2g} m)."
+    return [Doubt("rtk-lost", text, "They count for less; PPK, or flying them again with a fix, mends it.", lost)]
+
+
+def _is_fixed(position: Position) -> bool:
+    if position.rtk is not None and position.rtk != "fixed":
+        return False
+    return position.sigma_horizontal_m <= WELL_KNOWN_M

@@ -1,0 +1,125 @@
+"""Photos whose positions were swapped: neither the way of the flight nor what the photos show agrees with them.
+
+Photos that show the same thing were taken near each other, and the better they match the nearer; and who flies takes
+the short way from photo to photo. Each swap of two positions is tried against both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.sfm.pairs import Pair
+
+FURTHEST = 4.0  # times the usual distance of photos that match: a false match must not outweigh all others
+LEAST_PARTNERS = 3  # that each of the two matches
+LEAST_NEARER = 0.02  # of the two photos' distances to their partners; right ones give 0.003 at most
+CLEARLY_NEARER = 0.08  # where no times tell the way
+LEAST_SHORTER, CLEARLY_SHORTER = 0.3, 1.5  # of the way, in usual steps between two photos
+HARDLY_NEARER = 0.008  # is enough where the way is clearly shorter
+MOST_SWAPS = 20  # more are no swaps but chaos
+MOST_PHOTOS = 3000  # all pairs of photos are looked at
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What is known of the photos' places.
+
+    Attributes:
+        places_m: (n, 3) east, north, up; NaN where not known.
+        times_s: When each was taken, NaN where not known.
+        matches: Keypoints that agree, by pair.
+    """
+
+    places_m: Float64[np.ndarray, "n 3"]
+    times_s: Float64[np.ndarray, " n"]
+    matches: Mapping[Pair, int]
+
+    def order(self) -> Int64[np.ndarray, " m"]:
+        """Photos with place and time, in the order in which they were taken; equal times in the photos' order."""
+        known = np.flatnonzero(np.isfinite(self.places_m).all(axis=1) & np.isfinite(self.times_s))
+        return np.asarray(known[np.argsort(self.times_s[known], kind="stable")], np.int64)
+
+
+def find_swapped(flight: Flight) -> list[Pair]:
+    """Pairs of photos (i, j), i < j, that very likely have each other's position, the clearest first."""
+    located = np.flatnonzero(np.isfinite(flight.places_m).all(axis=1))
+    if not 4 <= len(located) <= MOST_PHOTOS:
+        return []
+    row = {int(photo): number for number, photo in enumerate(located)}
+    places = flight.places_m[located].copy()
+    weights = np.zeros((len(located), len(located)))
+    for (i, j), count in flight.matches.items():
+        if i in row and j in row and count:
+            weights[row[i], row[j]] = weights[row[j], row[i]] = np.sqrt(count)
+    order = np.array([row[int(photo)] for photo in flight.order()], np.int64)
+    has_order = len(order) >= max(4, len(located) // 2)
+    swapped: list[Pair] = []
+    while len(swapped) < MOST_SWAPS:
+        best = _best_swap(places, weights, order if has_order else None)
+        if best is None:
+            break
+        places[list(best)] = places[list(best)[::-1]]
+        i, j = sorted(int(located[number]) for number in best)
+        if (i, j) in swapped:
+            break
+        swapped.append((i, j))
+    return swapped
+
+
+def _best_swap(
+    places: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, "n n"], order: Int64[np.ndarray, " m"] | None
+) -> tuple[int, int] | None:
+    nearer = _nearer(places, weights)
+    partners = (weights > 0.0).sum(axis=1)
+    enough = np.minimum(partners[:, None], partners[None, :]) >= LEAST_PARTNERS
+    if order is None:
+        good = enough & (nearer > CLEARLY_NEARER)
+        score = nearer
+    else:
+        shorter = _shorter(places, order)
+        good = enough & (nearer > LEAST_NEARER) & (shorter > LEAST_SHORTER)
+        good |= enough & (nearer > HARDLY_NEARER) & (shorter > CLEARLY_SHORTER)
+        score = nearer * np.maximum(shorter, 0.0)
+    if not good.any():
+        return None
+    at = int(np.where(good, score, -np.inf).argmax())
+    return at // len(places), at % len(places)
+
+
+def _nearer(places: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, "n n"]) -> Float64[np.ndarray, "n n"]:
+    """By what share two photos come nearer to those that they match, if they swap positions."""
+    distances = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
+    if not (weights > 0.0).any():
+        return np.zeros_like(weights)
+    usual = max(float(np.median(distances[weights > 0.0])), 1e-6)
+    distances = np.minimum(distances / usual, FURTHEST)
+    own = (weights * distances).sum(axis=1)
+    now = own[:, None] + own[None, :]
+    there = weights @ distances  # [a, b]: photo a at the place of b
+    return np.asarray((now - there - there.T - 2.0 * weights * distances) / np.maximum(now, 1e-9))
+
+
+def _shorter(places: Float64[np.ndarray, "n 3"], order: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "n n"]:
+    """By how many usual steps the way through all photos gets shorter, if two swap positions."""
+    way = places[order]
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    usual = max(float(np.median(steps)), 1e-6)
+    count = len(way)
+    distances = np.linalg.norm(way[:, None] - way[None, :], axis=2)
+    cost = np.zeros((count, count))  # [a, b]: of the steps around slot a, were b's place there
+    cost[1:] += distances[:-1]
+    cost[:-1] += distances[1:]
+    own = np.diagonal(cost)
+    gain = own[:, None] + own[None, :] - cost - cost.T
+    beside = np.arange(count - 1)  # of neighbours, the step between them stays as long as it is
+    correction = 2.0 * steps
+    gain[beside, beside + 1] -= correction
+    gain[beside + 1, beside] -= correction
+    full = np.full((len(places), len(places)), -np.inf)
+    full[np.ix_(order, order)] = gain / usual
+    np.fill_diagonal(full, -np.inf)
+    return full
