@@ -54,6 +54,7 @@ class Exif:
         height: Likewise.
         gps: Position, or None when EXIF has none.
         serial: Of the camera's body; empty when unknown.
+        exposure_ev: Exposure value at ISO 100 that shutter, aperture and sensitivity are right for, or None.
     """
 
     make: str = ""
@@ -67,6 +68,7 @@ class Exif:
     height: int | None = None
     gps: Gps | None = None
     serial: str = ""
+    exposure_ev: float | None = None
 
 
 def read_exif(picture: Image.Image) -> Exif:
@@ -92,6 +94,7 @@ def read_exif(picture: Image.Image) -> Exif:
         height=int(height) if height is not None else None,
         gps=_gps(_tags(picture, ExifTags.IFD.GPSInfo)),
         serial=_text(tags.get(TAG.BodySerialNumber)),
+        exposure_ev=_exposure_ev(tags),
     )
 
 
@@ -140,6 +143,16 @@ def _time(tags: Mapping[int, Any]) -> str | None:
         decimals = f".{digits[:6]}" if digits.isascii() and digits.isdigit() else ""
         return time.isoformat() + decimals
     return None
+
+
+def _exposure_ev(tags: Mapping[int, Any]) -> float | None:
+    """log2(N²/t) - log2(S/100), as EXIF 2.32 (annex C, APEX) defines it."""
+    seconds = _number(tags.get(TAG.ExposureTime), 1e-7, 1e4)
+    aperture = _number(tags.get(TAG.FNumber), 0.1, 1e3)
+    speed = _number(tags.get(TAG.ISOSpeedRatings), 1, 1e7)
+    if seconds is None or aperture is None or speed is None:
+        return None
+    return math.log2(aperture**2 / seconds) - math.log2(speed / 100.0)
 
 
 def _focal_plane(tags: Mapping[int, Any]) -> float | None:

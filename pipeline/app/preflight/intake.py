@@ -1,0 +1,181 @@
+"""The photos of a capture as ingest takes them, with all that their metadata say: the preflight's first look."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.app.preflight.findings import Finding, LeftOutPhoto
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.source import Source
+from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.photos.camera_doubts import camera_doubts
+from splatpipe.pipeline.photos.camera_groups import CameraGroup, group_cameras
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.doubts import Doubt
+from splatpipe.pipeline.photos.duplicates import split_duplicates
+from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.photos.photo_list import Photo, photo_root
+from splatpipe.pipeline.photos.preparation import Preparation, check_photos
+from splatpipe.pipeline.photos.scan import LeftOut, scan_folder
+from splatpipe.pipeline.sfm.layout import make_layout, make_views
+from splatpipe.pipeline.sfm.pairs import Layout
+from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
+from splatpipe.pipeline.survey.position_doubts import position_doubts
+from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
+
+if TYPE_CHECKING:
+    from splatpipe.stages.options import LineConfig
+
+LEAST_PHOTOS = 2  # as many as ingest asks for
+
+
+@dataclass(frozen=True)
+class Intake:
+    """What there is.
+
+    Attributes:
+        photos: Those that can be used, sorted by name.
+        left_out: The others.
+        groups: Their cameras.
+        camera_of: The camera of each photo.
+        positions: What they state of their places.
+        layout: The same in metres, as pairs are chosen by it.
+    """
+
+    photos: tuple[CheckedPhoto, ...]
+    left_out: tuple[LeftOutPhoto, ...]
+    groups: tuple[CameraGroup, ...]
+    camera_of: Mapping[str, int]
+    positions: PositionList
+    layout: Layout
+
+
+def take_in(source: Source, config: LineConfig, threads: int, report: Reporter) -> tuple[Intake, list[Finding]]:
+    """Check every photo whole, and what their metadata say.
+
+    Args:
+        source: The user's folder.
+        config: Of the run that would follow.
+        threads: That work at a time.
+        report: Told of progress.
+    """
+    root = photo_root(source.folder)
+    work = Preparation(config.ingest, threads, root, report)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # libraries warn of odd metadata tags in a text of their own
+        scan = scan_folder(root)
+        checked, broken = check_photos(scan, work)
+    photos, duplicates = split_duplicates(checked)
+    findings = [*_unreadable([*scan.left_out, *broken]), *_duplicates(duplicates)]
+    if len(photos) < LEAST_PHOTOS:
+        findings.append(_too_few(len(photos)))
+    groups, camera_of = group_cameras(photos)
+    findings += [from_doubt(doubt) for doubt in camera_doubts(photos, groups, camera_of)]
+    places, troubles = _file_places(source, config, photos)
+    positions = read_positions(photos, places)
+    findings += [*troubles, *(from_doubt(doubt) for doubt in position_doubts(photos, positions))]
+    left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
+    intake = Intake(
+        tuple(photos),
+        tuple(LeftOutPhoto(entry.name, entry.reason) for entry in left_out),
+        tuple(groups),
+        camera_of,
+        positions,
+        _layout(photos, groups, camera_of, positions),
+    )
+    return intake, findings
+
+
+def from_doubt(doubt: Doubt) -> Finding:
+    """A doubt as the preflight tells it."""
+    return Finding(doubt.code, doubt.weight, doubt.message, doubt.hint, doubt.photos)
+
+
+def listed(photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int]) -> list[Photo]:
+    """The photos as ingest's list has them; none is converted."""
+    return [
+        Photo(
+            photo.name,
+            photo.sha256,
+            photo.width,
+            photo.height,
+            camera_of[photo.name],
+            photo.exif.time,
+            photo.exif.orientation,
+        )
+        for photo in photos
+    ]
+
+
+def _layout(
+    photos: Sequence[CheckedPhoto],
+    groups: Sequence[CameraGroup],
+    camera_of: Mapping[str, int],
+    positions: PositionList,
+) -> Layout:
+    own = listed(photos, camera_of)
+    entries: Sequence[dict[str, JSON]] = positions_json(positions)["positions"]
+    sizes: Float64[np.ndarray, "n 2"] = np.array(
+        [[p.width / 2.0, p.height / 2.0] / np.float64(groups[camera_of[p.name]].focal_px) for p in photos]
+    ).reshape(-1, 2)
+    layout = make_layout(own, entries)
+    views = make_views(own, entries, sizes) if entries else None
+    return Layout(layout.names, layout.times, layout.positions_m, layout.sigmas_m, layout.directions, views)
+
+
+def _file_places(
+    source: Source, config: LineConfig, photos: Sequence[CheckedPhoto]
+) -> tuple[Mapping[str, FilePlace], list[Finding]]:
+    """What the file of positions says, where there is one; a run would end with what is wrong with it."""
+    path = source.part_path("source.geo")
+    if not path.is_file() or not photos:
+        return {}, []
+    names = [photo.name for photo in photos]
+    try:
+        places = read_places(path, names, approximate=bool(config.georef.approximate_crs))
+    except SplatpipeError as error:
+        return {}, [Finding("positions-file", "error", error.message, error.hint)]
+    if not places.unknown:
+        return places.by_name, []
+    text = f"{path.name} names photos that are not there, or twice: {some(places.unknown)}."
+    return places.by_name, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
+
+
+def _unreadable(entries: Sequence[LeftOut]) -> list[Finding]:
+    """One finding a reason."""
+    by_reason: dict[str, list[str]] = {}
+    for entry in entries:
+        by_reason.setdefault(entry.reason, []).append(entry.name)
+    hint = "It takes no part in a run: copy it again from the card, or take the photo again."
+    return [
+        Finding("unreadable", "warning", f"{some(names)} {reason}.", hint, tuple(sorted(names)))
+        for reason, names in sorted(by_reason.items())
+    ]
+
+
+def _duplicates(entries: Sequence[LeftOut]) -> list[Finding]:
+    if not entries:
+        return []
+    told = [f"{printable(entry.name)} {entry.reason}" for entry in entries]
+    more = f"; and {len(told) - 5} more" if len(told) > 5 else ""
+    names = tuple(sorted(entry.name for entry in entries))
+    text = f"Photos are there twice: {'; '.join(told[:5])}{more}."
+    return [Finding("duplicate", "warning", text, "They are left out; was a card copied twice?", names)]
+
+
+def _too_few(count: int) -> Finding:
+    told = "None of the pictures can be used." if count == 0 else "There is only one usable photo."
+    hint = "A reconstruction needs many overlapping photos of one place."
+    return Finding("too-few", "error", told, hint)
+
+
+def root_of(source: Source) -> Path:
+    """The folder that the photos' names are relative to."""
+    return photo_root(source.folder)

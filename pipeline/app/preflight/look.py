@@ -1,0 +1,125 @@
+"""Looking at the photos themselves: blur, exposure, copies that were saved anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.app.preflight.findings import Finding
+from splatpipe.pipeline.photos.check import CheckedPhoto
+from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.sfm.quick_match import Glimpse
+
+DULL = 0.85  # of a logarithm of energies: a shake of 3 px gives 1.1 and more, sharp photos 0.5 at most
+DULL_SPREADS = 4.0  # times the usual deviation between photos, where a whole capture is shaken
+MANY = 0.08  # of the photos: then it is the capture's, and told once
+MAD_TO_SIGMA = 1.4826  # of Gaussian noise
+JUMP_EV = 1.1  # against the neighbours; light and automatic exposure change by 1.0 in good captures
+CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of pixels without drawing, and by how much more than in most photos
+DARK_LEVEL, BRIGHT_LEVEL = 14.0, 244.0  # mean grey levels of a photo that shows nothing
+SAME_PICTURE = 1.0  # grey levels between small pictures of one photo that was saved twice
+
+
+def sharpness(duller: Float64[np.ndarray, "n directions"]) -> Float64[np.ndarray, " n"]:
+    """Amplitude of fine detail over that of neighbours, in the direction in which it is least; NaN where unknown."""
+    known = np.isfinite(duller).any(axis=1)
+    worst = np.where(known, np.max(np.where(np.isfinite(duller), duller, -np.inf), axis=1), np.nan)
+    return np.asarray(np.exp(-worst / 2.0))
+
+
+def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n directions"]) -> list[Finding]:
+    """Photos that show less fine detail than their neighbours do of the same things."""
+    worst = -2.0 * np.log(sharpness(duller))
+    known = worst[np.isfinite(worst)]
+    if not len(known):
+        return []
+    usual = float(np.median(known))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(known - usual)))
+    limit = max(DULL, usual + DULL_SPREADS * spread)
+    dull = np.flatnonzero(np.nan_to_num(worst) > limit)
+    soft = np.flatnonzero(np.nan_to_num(worst) > DULL)
+    findings = []
+    if len(soft) > max(2.0, MANY * len(photos)) and len(soft) > len(dull):
+        findings.append(
+            Finding(
+                "blurred",
+                "warning",
+                f"{len(soft)} of {len(photos)} photos are clearly less sharp than their neighbours, all along.",
+                "Fly slower, or with a shorter shutter.",
+            )
+        )
+    if len(dull):
+        names = tuple(photos[k].name for k in dull)
+        least = float(np.exp(-worst[dull].max() / 2.0))
+        text = f"Blurred: {some(names)} (down to {least:.0%} of their neighbours' detail)."
+        findings.append(Finding("blurred", "warning", text, "Take them again, or leave them out.", names))
+    return findings
+
+
+def find_exposures(
+    photos: Sequence[CheckedPhoto], glimpses: Sequence[Glimpse], brighter_ev: Float64[np.ndarray, " n"]
+) -> list[Finding]:
+    """Photos that are much brighter or darker than their neighbours where both show the same, or show hardly anything."""
+    findings = []
+    jumps = np.flatnonzero(np.abs(np.nan_to_num(brighter_ev)) > JUMP_EV)
+    for k in jumps:
+        name, step = photos[k].name, float(brighter_ev[k])
+        text = f"{printable(name)} is {abs(step):.1f} EV {'brighter' if step > 0 else 'darker'} than its neighbours"
+        text += f" where both show the same{_by_settings(photos, int(k), step)}."
+        hint = "Fix the exposure for a flight, or leave the photo out."
+        code = "overexposed" if step > 0 else "underexposed"
+        findings.append(Finding(code, "warning", text, hint, (name,)))
+    told = set(jumps.tolist())
+    for code, shares, level, wrong in (
+        ("overexposed", [g.brightness.white for g in glimpses], "white", lambda mean: mean > BRIGHT_LEVEL),
+        ("underexposed", [g.brightness.black for g in glimpses], "black", lambda mean: mean < DARK_LEVEL),
+    ):
+        usual = float(np.median(shares)) if shares else 0.0
+        found = [
+            k
+            for k, share in enumerate(shares)
+            if k not in told
+            and ((share > CLIPPED and share > usual + CLIPPED_MORE) or wrong(glimpses[k].brightness.mean_level))
+        ]
+        if usual > CLIPPED:
+            text = f"Most photos are {level} over more than half of their pixels."
+            findings.append(Finding(code, "warning", text, "Correct the exposure: nothing can be matched there."))
+        elif found:
+            names = tuple(photos[k].name for k in found)
+            text = f"Hardly any drawing, {level} for the most part: {some(names)}."
+            findings.append(Finding(code, "warning", text, "Take them again, or leave them out.", names))
+    return findings
+
+
+def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:
+    """Whether shutter, aperture and sensitivity say the same, against the photos taken before and after."""
+    own = photos[at].exif.exposure_ev
+    beside = [photos[k].exif.exposure_ev for k in (at - 2, at - 1, at + 1, at + 2) if 0 <= k < len(photos)]
+    known = [value for value in beside if value is not None]
+    if own is None or not known:
+        return ""
+    by_settings = float(np.median(known)) - own
+    return ", as its exposure settings say" if by_settings * step > 0.5 * step * step else ""
+
+
+def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[Glimpse]) -> list[Finding]:
+    """Photos that are another one saved anew: the same picture and time, other bytes."""
+    if len(photos) < 2:
+        return []
+    small = np.stack([glimpse.signature.ravel() for glimpse in glimpses])
+    copies: dict[str, str] = {}
+    for k in range(1, len(photos)):
+        apart = np.sqrt(((small[:k] - small[k]) ** 2).mean(axis=1))
+        j = int(apart.argmin())
+        times = photos[j].exif.time, photos[k].exif.time
+        if apart[j] < SAME_PICTURE and (times[0] == times[1] or None in times):
+            copies[photos[k].name] = photos[j].name
+    if not copies:
+        return []
+    told = [f"{printable(name)} is {printable(twin)} saved anew" for name, twin in list(copies.items())[:5]]
+    more = f"; and {len(copies) - 5} more" if len(copies) > 5 else ""
+    text = f"Photos are there twice: {'; '.join(told)}{more}."
+    hint = "Leave the copies out: they count double, and a held-out photo may be among the trained ones."
+    return [Finding("duplicate", "warning", text, hint, tuple(sorted(copies)))]

@@ -1,0 +1,170 @@
+"""Which photos hang together: a quick match at low resolution, and what it says against overlap and positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from splatpipe.pipeline.app.preflight.findings import Finding, Gap
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.sfm.pairs import (
+    Costs,
+    Layout,
+    Pair,
+    choose_pairing,
+    components,
+    nearest,
+    positions_tell,
+    select_pairs,
+)
+from splatpipe.pipeline.sfm.quick_match import Agreement, Glimpse, match_glimpses
+from splatpipe.pipeline.sfm.retrieval import look_alike_costs
+from splatpipe.pipeline.survey.flight_gaps import MissingStrip, find_missing
+from splatpipe.pipeline.survey.swapped_positions import Flight, find_swapped
+
+EXHAUSTIVE_UP_TO = 40  # photos: 780 pairs, five seconds
+NEIGHBOURS = 8  # partners a photo by positions or sequence; the run takes 20
+LOOK_ALIKES = 4  # besides, whatever positions say: these may be wrong
+AGAIN = 16  # partners for photos that found none
+THIN_PARTNERS = 2.5  # matched photos each, by the median: fewer, and a run loses photos
+WELL_TOGETHER = 0.9  # of the photos in one piece; else the capture falls apart
+LEAST_TOGETHER = 0.2  # of them: less, and there is nothing to reconstruct
+OUTLINE_SHARE = 0.35  # of a gap's length: half the width that is drawn for it
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """What the quick match found.
+
+    Attributes:
+        found: What agrees, by pair that was tried.
+        pieces: Photos that hang together, the largest first.
+    """
+
+    found: Mapping[Pair, Agreement]
+    pieces: tuple[tuple[int, ...], ...]
+
+    @property
+    def matches(self) -> dict[Pair, int]:
+        """Keypoints that agree, by pair."""
+        return {pair: len(agreed) for pair, agreed in self.found.items()}
+
+    def partners(self, count: int) -> list[int]:
+        """How many photos each one matches."""
+        own = [0] * count
+        for pair, agreed in self.found.items():
+            for photo in pair:
+                own[photo] += bool(len(agreed))
+        return own
+
+
+def match_quickly(layout: Layout, glimpses: Sequence[Glimpse], threads: int, report: Reporter) -> Overlap:
+    """Match neighbours by what is known of the photos, look-alikes, and more of them for those that find no partner."""
+    count = len(layout)
+
+    @cache
+    def alike() -> Costs:
+        return look_alike_costs([glimpse.rooted() for glimpse in glimpses], seed=0)
+
+    pairing = choose_pairing(layout, EXHAUSTIVE_UP_TO)
+    if count <= EXHAUSTIVE_UP_TO:
+        pairing = "exhaustive"
+    report.progress(0, 1, "matching quickly", "rounds")
+    pairs = set(select_pairs(layout, pairing, NEIGHBOURS, alike))
+    if pairing != "exhaustive":
+        pairs |= nearest(range(count), alike(), LOOK_ALIKES)
+    found = match_glimpses(glimpses, pairs, threads)
+    lonely = [k for piece in pieces_of(found, count)[1:] for k in piece]
+    if lonely and pairing != "exhaustive":
+        more = nearest(lonely, alike(), AGAIN) - pairs
+        found |= match_glimpses(glimpses, more, threads)
+    report.progress(1, 1, "matching quickly", "rounds")
+    return Overlap(found, pieces_of(found, count))
+
+
+def pieces_of(found: Mapping[Pair, Agreement], count: int) -> tuple[tuple[int, ...], ...]:
+    """Photos (numbers) that hang together, the largest piece first."""
+    labels = components([pair for pair, agreed in found.items() if len(agreed)], count)
+    pieces: dict[int, list[int]] = {}
+    for photo, label in enumerate(labels.tolist()):
+        pieces.setdefault(label, []).append(photo)
+    return tuple(sorted((tuple(piece) for piece in pieces.values()), key=lambda piece: (-len(piece), piece)))
+
+
+def overlap_findings(names: Sequence[str], overlap: Overlap) -> list[Finding]:
+    """Orphans, pieces, and overlap that is thin throughout."""
+    count = len(names)
+    pieces = overlap.pieces
+    if count < 2:
+        return []
+    if len(pieces[0]) < max(2.0, LEAST_TOGETHER * count):
+        text = f"Hardly any photos show the same thing: at most {len(pieces[0])} of {count} hang together."
+        hint = "Photos must overlap by two thirds, be sharp, and show texture: this cannot be reconstructed."
+        return [Finding("no-overlap", "error", text, hint)]
+    findings = []
+    alone = tuple(sorted(names[piece[0]] for piece in pieces if len(piece) == 1))
+    if alone:
+        text = f"Matches no other photo: {some(alone)}." if len(alone) <= count / 10 else ""
+        text = text or f"{len(alone)} of {count} photos match no other one at low resolution."
+        hint = "A run will most likely lose them: take more photos around them, with two thirds of overlap."
+        findings.append(Finding("orphan", "warning", text, hint, alone if len(alone) <= count / 10 else ()))
+    islands = [piece for piece in pieces[1:] if len(piece) > 1]
+    if islands:
+        told = "; ".join(some([names[k] for k in piece], 4) for piece in islands[:3])
+        text = f"The photos fall into {len(islands) + 1} pieces that do not overlap: {told}"
+        text += " …" if len(islands) > 3 else ""
+        hint = "Take photos between the pieces, so that one leads to the other."
+        findings.append(Finding("pieces", "warning", f"{text}.", hint))
+    usual = float(np.median(overlap.partners(count)))
+    if usual < THIN_PARTNERS and count > 3:
+        text = f"The overlap is thin: a photo matches {usual:.0f} others by the median."
+        findings.append(Finding("thin-overlap", "warning", text, "Fly with more overlap: two thirds each way."))
+    return findings
+
+
+def flight_of(layout: Layout, overlap: Overlap) -> Flight:
+    """The way of the flight; without places where these scatter no wider than their errors."""
+    places = layout.positions_m if positions_tell(layout) else np.full_like(layout.positions_m, np.nan)
+    return Flight(places, layout.times, overlap.matches)
+
+
+def swap_findings(names: Sequence[str], flight: Flight) -> list[Finding]:
+    """Photos that have each other's position."""
+    findings = []
+    for pair in find_swapped(flight):
+        first, second = (names[k] for k in pair)
+        apart = float(np.linalg.norm(flight.places_m[pair[0]] - flight.places_m[pair[1]]))
+        text = f"{printable(first)} and {printable(second)} seem to have each other's position ({apart:.0f} m apart):"
+        text += " what they show and the order of the flight say so."
+        hint = "Swap their positions back, or set them in geo.txt."
+        findings.append(Finding("position-swapped", "warning", text, hint, tuple(sorted((first, second)))))
+    return findings
+
+
+def gap_findings(names: Sequence[str], flight: Flight) -> tuple[list[Finding], list[Gap]]:
+    """Strips of photos that are missing along the way."""
+    findings, gaps = [], []
+    for strip in find_missing(names, flight):
+        before, after = printable(names[strip.before]), printable(names[strip.after])
+        text = f"About {strip.missing} photos are missing between {before} and {after}"
+        if strip.numbers:
+            text = f"{strip.missing} photos are missing between {before} and {after}, by their numbers"
+        if np.isfinite(strip.apart_m):
+            text += f": {strip.apart_m:.0f} m apart, {strip.usual_m:.0f} m elsewhere"
+            gaps.append(Gap(_outline(flight, strip), f"{strip.missing} photos missing"))
+        hint = "Look whether they are on the card; else fly this strip again."
+        findings.append(Finding("gap", "warning", f"{text}.", hint))
+    return findings, gaps
+
+
+def _outline(flight: Flight, strip: MissingStrip) -> tuple[tuple[float, float], ...]:
+    """A box along the gap."""
+    start, end = flight.places_m[strip.before, :2], flight.places_m[strip.after, :2]
+    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
+    aside = np.array([-along[1], along[0]]) * max(strip.usual_m, OUTLINE_SHARE * strip.apart_m)
+    corners = (start + aside, end + aside, end - aside, start - aside)
+    return tuple((round(float(corner[0]), 2), round(float(corner[1]), 2)) for corner in corners)
