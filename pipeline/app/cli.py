@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from splatpipe.pipeline.app.cli_batch import batch
+from splatpipe.pipeline.app.cli_check import check
 from splatpipe.pipeline.app.cli_options import (
     BoundaryOption,
     ConfigOption,
@@ -314,6 +315,9 @@ def doctor(as_json: JsonOption = False) -> None:
         print_json(findings)
     else:
         show_table([(name, str(value)) for name, value in findings.items()], ("what", "found"))
+
+
+app.command()(check)
 
 
 def _stop(number: int, _frame: FrameType | None) -> NoReturn:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -123,7 +122,7 @@ def _layout(
     own = listed(photos, camera_of)
     entries: Sequence[dict[str, JSON]] = positions_json(positions)["positions"]
     sizes: Float64[np.ndarray, "n 2"] = np.array(
-        [[p.width / 2.0, p.height / 2.0] / np.float64(groups[camera_of[p.name]].focal_px) for p in photos]
+        [np.array([p.width, p.height]) / (2.0 * groups[camera_of[p.name]].focal_px) for p in photos]
     ).reshape(-1, 2)
     layout = make_layout(own, entries)
     views = make_views(own, entries, sizes) if entries else None
@@ -174,8 +173,3 @@ def _too_few(count: int) -> Finding:
     told = "None of the pictures can be used." if count == 0 else "There is only one usable photo."
     hint = "A reconstruction needs many overlapping photos of one place."
     return Finding("too-few", "error", told, hint)
-
-
-def root_of(source: Source) -> Path:
-    """The folder that the photos' names are relative to."""
-    return photo_root(source.folder)

@@ -38,7 +38,7 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
     usual = float(np.median(known))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(known - usual)))
     limit = max(DULL, usual + DULL_SPREADS * spread)
-    dull = np.flatnonzero(np.nan_to_num(worst) > limit)
+    dull = np.flatnonzero(np.nan_to_num(worst) > limit).tolist()
     soft = np.flatnonzero(np.nan_to_num(worst) > DULL)
     findings = []
     if len(soft) > max(2.0, MANY * len(photos)) and len(soft) > len(dull):
@@ -61,36 +61,40 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
 def find_exposures(
     photos: Sequence[CheckedPhoto], glimpses: Sequence[Glimpse], brighter_ev: Float64[np.ndarray, " n"]
 ) -> list[Finding]:
-    """Photos that are much brighter or darker than their neighbours where both show the same, or show hardly anything."""
+    """Photos much brighter or darker than their neighbours where both show the same, and photos that show nothing."""
     findings = []
-    jumps = np.flatnonzero(np.abs(np.nan_to_num(brighter_ev)) > JUMP_EV)
+    jumps = np.flatnonzero(np.abs(np.nan_to_num(brighter_ev)) > JUMP_EV).tolist()
     for k in jumps:
         name, step = photos[k].name, float(brighter_ev[k])
         text = f"{printable(name)} is {abs(step):.1f} EV {'brighter' if step > 0 else 'darker'} than its neighbours"
-        text += f" where both show the same{_by_settings(photos, int(k), step)}."
+        text += f" where both show the same{_by_settings(photos, k, step)}."
         hint = "Fix the exposure for a flight, or leave the photo out."
         code = "overexposed" if step > 0 else "underexposed"
         findings.append(Finding(code, "warning", text, hint, (name,)))
-    told = set(jumps.tolist())
-    for code, shares, level, wrong in (
-        ("overexposed", [g.brightness.white for g in glimpses], "white", lambda mean: mean > BRIGHT_LEVEL),
-        ("underexposed", [g.brightness.black for g in glimpses], "black", lambda mean: mean < DARK_LEVEL),
-    ):
-        usual = float(np.median(shares)) if shares else 0.0
-        found = [
-            k
-            for k, share in enumerate(shares)
-            if k not in told
-            and ((share > CLIPPED and share > usual + CLIPPED_MORE) or wrong(glimpses[k].brightness.mean_level))
-        ]
-        if usual > CLIPPED:
-            text = f"Most photos are {level} over more than half of their pixels."
-            findings.append(Finding(code, "warning", text, "Correct the exposure: nothing can be matched there."))
-        elif found:
-            names = tuple(photos[k].name for k in found)
-            text = f"Hardly any drawing, {level} for the most part: {some(names)}."
-            findings.append(Finding(code, "warning", text, "Take them again, or leave them out.", names))
+    told = set(jumps)
+    means = [glimpse.brightness.mean_level for glimpse in glimpses]
+    whites, blacks = [g.brightness.white for g in glimpses], [g.brightness.black for g in glimpses]
+    findings += _empty(photos, "overexposed", whites, [mean > BRIGHT_LEVEL for mean in means], told)
+    findings += _empty(photos, "underexposed", blacks, [mean < DARK_LEVEL for mean in means], told)
     return findings
+
+
+def _empty(
+    photos: Sequence[CheckedPhoto], code: str, shares: Sequence[float], beyond: Sequence[bool], told: set[int]
+) -> list[Finding]:
+    """Photos that are white, or black, for the most part; those that were told do not count again."""
+    level = "white" if code == "overexposed" else "black"
+    usual = float(np.median(shares)) if shares else 0.0
+    if usual > CLIPPED:
+        text = f"Most photos are {level} over more than half of their pixels."
+        return [Finding(code, "warning", text, "Correct the exposure: nothing can be matched there.")]
+    clipped = [share > max(CLIPPED, usual + CLIPPED_MORE) for share in shares]
+    found = [k for k in range(len(photos)) if k not in told and (clipped[k] or beyond[k])]
+    if not found:
+        return []
+    names = tuple(photos[k].name for k in found)
+    text = f"Hardly any drawing, {level} for the most part: {some(names)}."
+    return [Finding(code, "warning", text, "Take them again, or leave them out.", names)]
 
 
 def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:

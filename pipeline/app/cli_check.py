@@ -1,0 +1,79 @@
+"""``splatpipe check``: the preflight, in the field before leaving."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from splatpipe.pipeline.app.cli_options import ConfigOption, JsonOption, PhotosArgument, SetOption, ThreadsOption
+from splatpipe.pipeline.app.cli_runs import overrides
+from splatpipe.pipeline.app.ending import Ending
+from splatpipe.pipeline.engine.errors import EXIT_INPUT
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.app.preflight.findings import Preflight
+
+PAGE = "check.html"
+PRESETS = ("preview", "standard", "high")
+SIGNS = {"error": "✗", "warning": "!", "note": "·"}
+
+PageOption = Annotated[
+    Path, typer.Option("--output", "-o", help="The page; else check.html in the folder where you are.")
+]
+
+
+def check(
+    photos: PhotosArgument,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    page: PageOption = Path(PAGE),
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what is wrong with a capture while you are still there; what a run would take."""
+    page = page.expanduser()
+    with Ending(page, as_json) as done:
+        from splatpipe.pipeline.app.console import RunConsole
+        from splatpipe.pipeline.app.preflight.examination import examine_capture
+        from splatpipe.pipeline.app.preflight.findings import as_json as told_as_json
+        from splatpipe.pipeline.app.preflight.page import write_page
+        from splatpipe.pipeline.engine.config import load_preset
+        from splatpipe.pipeline.engine.events import EventReporter
+        from splatpipe.pipeline.engine.machine import available_cores
+
+        asked = overrides(config, assignments, None)
+        configs = {preset: asked.resolve(load_preset(preset)) for preset in PRESETS}
+        console = RunConsole()
+        try:
+            report = EventReporter("check", console)
+            preflight = examine_capture(photos, configs, threads or available_cores(), report)
+        finally:
+            console.close()
+        write_page(preflight, page)
+        failed = preflight.worst == "error"
+        done.told = {
+            **told_as_json(preflight),
+            "exit_code": EXIT_INPUT if failed else 0,
+            "outputs": [str(page)],
+        }
+        _show(preflight, page)
+    if failed:
+        raise typer.Exit(EXIT_INPUT)
+
+
+def _show(preflight: Preflight, page: Path) -> None:
+    from splatpipe.pipeline.app.console import say
+
+    for finding in preflight.findings:
+        say(f"{SIGNS[finding.severity]} {finding.message} {finding.hint}".rstrip())
+    for forecast in preflight.forecasts:
+        text = f"{forecast.preset}: {forecast.memory_bytes / 1e9:.1f} GB of memory, {forecast.seconds / 60.0:.0f} min, "
+        text += f"{forecast.disk_bytes / 1e9:.1f} GB on the disk"
+        say(f"  {text}" + (f"; lacks {forecast.lacking}" if forecast.lacking else ""))
+    verdict = {
+        "error": "This capture cannot be reconstructed as it is",
+        "warning": "It can be reconstructed; see above what is lost",
+    }
+    say(f"{len(preflight.photos)} photos. {verdict.get(preflight.worst or '', 'Nothing is wrong with it')}. {page}")

@@ -1,0 +1,221 @@
+"""A capture examined before it is run: all of the preflight, in the order in which it gets dearer."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.app.preflight.findings import (
+    ControlPlace,
+    Finding,
+    Gap,
+    MachineFacts,
+    MatchedPair,
+    PhotoFacts,
+    Preflight,
+    PresetForecast,
+    worst_first,
+)
+from splatpipe.pipeline.app.preflight.intake import LEAST_PHOTOS, Intake, take_in
+from splatpipe.pipeline.app.preflight.look import find_blurred, find_copies, find_exposures, sharpness
+from splatpipe.pipeline.app.preflight.overlap import (
+    Overlap,
+    flight_of,
+    gap_findings,
+    match_quickly,
+    overlap_findings,
+    swap_findings,
+)
+from splatpipe.pipeline.app.preflight.places import control_findings, focal_findings, footprint, origin_of
+from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
+from splatpipe.pipeline.engine.needs import whole
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.engine.source import Source, open_source
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.photos.detail import DIRECTIONS
+from splatpipe.pipeline.sfm.comparison import brighter_ev, duller
+from splatpipe.pipeline.sfm.keypoints import single_threaded_opencv
+from splatpipe.pipeline.sfm.quick_match import Glimpse, glimpse
+
+if TYPE_CHECKING:
+    from splatpipe.stages.options import LineConfig
+
+NOTHING = Overlap({}, ())
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the photos themselves say.
+
+    Attributes:
+        findings: Of them.
+        overlap: Of the quick match.
+        gaps: In it.
+        sharpness: Of each photo against its neighbours.
+        brighter_ev: Likewise.
+        levels: Mean grey level of each.
+    """
+
+    findings: tuple[Finding, ...]
+    overlap: Overlap
+    gaps: tuple[Gap, ...]
+    sharpness: Float64[np.ndarray, " n"]
+    brighter_ev: Float64[np.ndarray, " n"]
+    levels: tuple[float, ...]
+
+
+def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: int, report: Reporter) -> Preflight:
+    """All that can be said of a capture within a minute or two.
+
+    Args:
+        photos: The user's folder.
+        configs: Of the run that would follow, by preset; the first one's files count.
+        threads: That work at a time.
+        report: Told of progress.
+
+    Raises:
+        SplatpipeError: if there is no such folder, or a file that an option names.
+    """
+    from splatpipe.stages.line import LINE
+
+    began_s, when_s = time.monotonic(), time.time()
+    folder = photos.expanduser().resolve()
+    config = next(iter(configs.values()))
+    # No OUT is written: any folder that does not lie in the photos stands for one.
+    source = open_source(photos, folder.with_name(f"{folder.name}-out"), LINE, config)
+    intake, findings = take_in(source, config, threads, report)
+    look = look_at(intake, threads, report)
+    control, told = _control(source, config, intake)
+    findings += [*look.findings, *focal_findings(intake), *told]
+    forecasts, machine = forecast_presets(intake, configs, threads)
+    return Preflight(
+        folder=source.folder,
+        photos=_facts(intake, look),
+        left_out=intake.left_out,
+        findings=worst_first(findings),
+        origin=origin_of(intake),
+        pairs=tuple(MatchedPair(i, j, count) for (i, j), count in sorted(look.overlap.matches.items())),
+        components=look.overlap.pieces,
+        gaps=look.gaps,
+        control=control,
+        forecasts=forecasts,
+        machine=machine,
+        when_s=when_s,
+        seconds=round(time.monotonic() - began_s, 3),
+    )
+
+
+def look_at(intake: Intake, threads: int, report: Reporter) -> Look:
+    """Read the photos, match them quickly, and compare them where they match."""
+    count = len(intake.photos)
+    unknown = np.full(count, np.nan)
+    if count < LEAST_PHOTOS:
+        return Look((), NOTHING, (), unknown, unknown, (float("nan"),) * count)
+    names = [photo.name for photo in intake.photos]
+    glimpses: list[Glimpse] = []
+    with single_threaded_opencv():
+        for found in ordered_map(glimpse, intake.photos, threads):
+            glimpses.append(found)
+            report.progress(len(glimpses), count, "looking at photos", "photos")
+        overlap = match_quickly(intake.layout, glimpses, threads, report)
+    dull = duller(glimpses, overlap.found)
+    assert dull.shape == (count, DIRECTIONS)
+    steps = brighter_ev(glimpses, overlap.found)
+    flight = flight_of(intake.layout, overlap)
+    missing, gaps = gap_findings(names, flight)
+    findings = [
+        *find_blurred(intake.photos, dull),
+        *find_exposures(intake.photos, glimpses, steps),
+        *find_copies(intake.photos, glimpses),
+        *overlap_findings(names, overlap),
+        *swap_findings(names, flight),
+        *missing,
+    ]
+    levels = tuple(found.brightness.mean_level for found in glimpses)
+    return Look(tuple(findings), overlap, tuple(gaps), sharpness(dull), steps, levels)
+
+
+def _control(source: Source, config: LineConfig, intake: Intake) -> tuple[tuple[ControlPlace, ...], list[Finding]]:
+    path = source.part_path("source.control")
+    if not path.is_file():
+        return (), []
+    half_pixel = 0.5 if config.georef.pixel_origin == "centre" else 0.0
+    findings, places = control_findings(path, bool(config.georef.approximate_crs), intake, half_pixel)
+    return tuple(places), findings
+
+
+def forecast_presets(
+    intake: Intake, configs: Mapping[str, LineConfig], threads: int
+) -> tuple[tuple[PresetForecast, ...], MachineFacts]:
+    """What a run with each preset would need, and whether this machine has it."""
+    from splatpipe.stages.forecast import CaptureSize, forecast, machine_speed
+
+    disk = shutil.disk_usage(Path.cwd())
+    machine = MachineFacts(available_memory_bytes(), available_cores(), disk.free)
+    if len(intake.photos) < LEAST_PHOTOS:
+        return (), machine
+    megapixels = float(np.median([photo.width * photo.height for photo in intake.photos])) / 1e6
+    size = CaptureSize(len(intake.photos), megapixels, bool(intake.layout.located().mean() > 0.5))
+    speed = machine_speed()
+    told = []
+    for preset, config in configs.items():
+        need = whole(forecast(size, config, threads, speed=speed))
+        disk_bytes = need.disk_bytes + need.scratch_bytes
+        lacking = []
+        if 0 < machine.memory_bytes < need.memory_bytes:
+            lacking.append(
+                f"{need.memory_bytes / 1e9:.1f} GB of memory, and there are {machine.memory_bytes / 1e9:.1f}"
+            )
+        if disk.free < disk_bytes:
+            lacking.append(f"{disk_bytes / 1e9:.1f} GB on the disk, and {disk.free / 1e9:.1f} are free here")
+        told.append(
+            PresetForecast(
+                preset,
+                need.memory_bytes,
+                need.cpu_seconds,
+                need.seconds(threads),
+                disk_bytes,
+                "; ".join(lacking),
+            )
+        )
+    return tuple(told), machine
+
+
+def _facts(intake: Intake, look: Look) -> tuple[PhotoFacts, ...]:
+    places = intake.layout.positions_m
+    partners = look.overlap.partners(len(intake.photos))
+    return tuple(
+        PhotoFacts(
+            name=photo.name,
+            width=photo.width,
+            height=photo.height,
+            orientation=photo.exif.orientation,
+            camera=intake.camera_of[photo.name],
+            time=photo.exif.time,
+            position_m=_rounded(places[k]),
+            footprint_m=footprint(intake.layout.views, k),
+            sharpness=_number(look.sharpness[k]),
+            brightness_ev=_number(look.brighter_ev[k]),
+            mean_level=_number(look.levels[k]),
+            matched=partners[k],
+        )
+        for k, photo in enumerate(intake.photos)
+    )
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 3) if np.isfinite(value) else None
+
+
+def _rounded(place: Float64[np.ndarray, " 3"]) -> tuple[float, float, float] | None:
+    if not np.isfinite(place).all():
+        return None
+    east, north, up = (round(float(value), 2) for value in place)
+    return east, north, up

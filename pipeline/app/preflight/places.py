@@ -1,0 +1,182 @@
+"""Where photos were taken, what they show of the ground, whether their views leave the focal length open; control."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.app.preflight.findings import ControlPlace, Finding, Place
+from splatpipe.pipeline.app.preflight.intake import Intake
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.photos.names import NameFinder, some
+from splatpipe.pipeline.sfm.footprints import FURTHEST, LEAST_HEIGHT_M, Views
+from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
+from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
+from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
+from splatpipe.pipeline.survey.position_doubts import WELL_KNOWN_M
+
+DOWN_DEG = -75.0  # pitch of the gimbal: further up, walls are seen, and the focal length with them
+ONE_HEIGHT = 0.1  # spread of the heights above take-off over their median
+OUTSIDE_SHARE = 0.3  # of the marks beyond their photos: they were made in photos of another size, and a run ends there
+ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
+REACH_SPACINGS, LEAST_REACH_M = 3.0, 60.0  # around photos of which it is not known where they look
+
+
+def origin_of(intake: Intake) -> tuple[float, float] | None:
+    """Latitude and longitude that the layout's metres count from."""
+    first = next(iter(intake.positions.positions), None)
+    return None if first is None else (first.latitude, first.longitude)
+
+
+def footprint(views: Views | None, photo: int) -> tuple[Place, ...] | None:
+    """Corners of what a photo shows of the ground, as far as it reaches; None where that is not known."""
+    if views is None or not bool(views.known()[photo]):
+        return None
+    signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    rays = np.concatenate([signs * views.half_size[photo], np.ones((4, 1))], axis=1) @ views.enu_from_camera[photo].T
+    height = max(float(views.centres_m[photo, 2] - views.ground_m[photo]), LEAST_HEIGHT_M)
+    reach = FURTHEST * height
+    corners = []
+    for ray in rays:
+        flat = float(np.hypot(ray[0], ray[1]))
+        distance = height * flat / -ray[2] if ray[2] < 0.0 else np.inf
+        step = ray[:2] / max(flat, 1e-9) * min(distance, reach)
+        corner = views.centres_m[photo, :2] + step
+        corners.append((round(float(corner[0]), 2), round(float(corner[1]), 2)))
+    return tuple(corners)
+
+
+def focal_findings(intake: Intake) -> list[Finding]:
+    """A flight that looks straight down from one height leaves the focal length open, and with it the heights."""
+    stated = intake.positions.positions
+    pitches = [each.pitch_deg for each in stated if each.pitch_deg is not None]
+    if len(pitches) < max(3, len(intake.photos) // 2) or max(pitches) > DOWN_DEG:
+        return []
+    heights = [each.relative_altitude_m for each in stated if each.relative_altitude_m is not None]
+    if heights and np.median(heights) > 0.0 and np.ptp(heights) > ONE_HEIGHT * float(np.median(heights)):
+        return []
+    good = [each for each in stated if max(each.sigma_horizontal_m, each.sigma_vertical_m) <= WELL_KNOWN_M]
+    if len(good) > len(stated) / 2:
+        return []
+    text = "All photos look straight down from one height: that leaves the focal length open, and heights with it."
+    hint = "Add some photos at 45° or from another height, or control points with heights, or a calibrated lens."
+    return [Finding("nadir-only", "warning", text, hint)]
+
+
+def control_findings(
+    path: Path, approximate: bool, intake: Intake, half_pixel: float
+) -> tuple[list[Finding], list[ControlPlace]]:
+    """Read the control file as a run does, and hold it against the photos.
+
+    Args:
+        path: The file.
+        approximate: Whether a CRS whose grid is missing may be used.
+        intake: The photos.
+        half_pixel: What brings the file's pixels to those of the stored grid.
+    """
+    try:
+        file = read_control_file(path)
+        crs = parse_crs(file.crs)
+    except SplatpipeError as error:
+        return [Finding("control-broken", "error", error.message, error.hint)], []
+    findings = _mark_findings(path.name, file, intake, half_pixel)
+    if not intake.positions.positions:
+        return findings, []
+    rows = np.array([[p.x, p.y, np.nan if p.z is None else p.z] for p in file.points], dtype=np.float64)
+    try:
+        located = to_geodetic(rows, crs, approximate).geodetic
+    except SplatpipeError as error:
+        return [*findings, Finding("control-broken", "error", error.message, error.hint)], []
+    origin = origin_of(intake)
+    assert origin is not None
+    east = np.radians(located[:, 1] - origin[1]) * np.cos(np.radians(origin[0])) * EARTH_RADIUS_M
+    north = np.radians(located[:, 0] - origin[0]) * EARTH_RADIUS_M
+    points = np.stack([east, north], axis=1)
+    places = [
+        ControlPlace(
+            point.name,
+            "check" if point.role == "check" else "control",
+            (round(float(at[0]), 2), round(float(at[1]), 2)),
+            _shown_by(at, intake),
+            len({mark.photo for mark in point.marks}),
+        )
+        for point, at in zip(file.points, points, strict=True)
+    ]
+    return [*findings, *_outside(path.name, places, points, intake)], places
+
+
+def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: float) -> list[Finding]:
+    sizes = {photo.name: (photo.width, photo.height) for photo in intake.photos}
+    find = NameFinder(sorted(sizes))
+    marks = [(point.name, mark, find(mark.photo)) for point in file.points for mark in point.marks]
+    missing = sorted({mark.photo for _, mark, photo in marks if photo is None})
+    outside = []
+    for point, mark, photo in marks:
+        if photo is not None:
+            width, height = sizes[photo]
+            x, y = mark.x + half_pixel, mark.y + half_pixel
+            if not (0.0 <= x <= width and 0.0 <= y <= height):
+                outside.append(f"{point} in {photo}")
+    findings = []
+    if marks and all(photo is None for _, _, photo in marks):
+        text = f"None of the photos that {name} names is in this capture: {some(missing)}."
+        return [Finding("control-broken", "error", text, "Check that the file belongs to these photos.")]
+    if missing:
+        text = f"{name} names {len(missing)} photos that are not in this capture: {some(missing)}."
+        findings.append(Finding("control-marks", "warning", text, "Their marks are left out: correct the names."))
+    if outside:
+        severe = len(outside) > OUTSIDE_SHARE * len(marks)
+        text = f"{len(outside)} of {len(marks)} marks of {name} lie outside of their photos: {some(outside)}."
+        hint = "Were they made in photos of another size, or turned ones?"
+        findings.append(Finding("control-marks", "error" if severe else "warning", text, hint))
+    return findings
+
+
+def _shown_by(at: Float64[np.ndarray, " 2"], intake: Intake) -> int | None:
+    """How many photos may show a place of the ground; None where it is not known how they were taken."""
+    views = intake.layout.views
+    if views is None:
+        return None
+    known = np.flatnonzero(views.known())
+    point = np.stack([np.append(at, views.ground_m[k]) for k in known])
+    in_camera = np.einsum("kx,kxc->kc", point - views.centres_m[known], views.enu_from_camera[known])
+    depth = in_camera[:, 2]
+    inside = (np.abs(in_camera[:, :2]) <= views.half_size[known] * np.maximum(depth, 0.0)[:, None]).all(axis=1)
+    return int(np.count_nonzero(inside & (depth > 0.0)))
+
+
+def _outside(
+    name: str, places: Sequence[ControlPlace], points: Float64[np.ndarray, "n 2"], intake: Intake
+) -> list[Finding]:
+    """Points that no photo can show."""
+    positions = intake.layout.positions_m[intake.layout.located(), :2]
+    if not len(positions) or not len(points):
+        return []
+    distances = np.linalg.norm(points[:, None] - positions[None], axis=2)
+    nearest = distances.min(axis=1)
+    if float(np.median(nearest)) > ELSEWHERE_M:
+        text = f"The points of {name} lie {np.median(nearest) / 1000.0:,.1f} km from the photos."
+        return [Finding("control-outside", "error", text, "Check the CRS and the zone, and that east comes first.")]
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2) if len(positions) <= 2000 else None
+    spacing = 0.0
+    if apart is not None and len(positions) > 1:
+        np.fill_diagonal(apart, np.inf)
+        spacing = float(np.median(apart.min(axis=1)))
+    reach = max(LEAST_REACH_M, REACH_SPACINGS * spacing)
+    off = [
+        place.name
+        for place, metres in zip(places, nearest.tolist(), strict=True)
+        if metres > FURTHEST * reach or (not place.marks and _is_beyond(place.photos, metres, reach))
+    ]
+    if not off:
+        return []
+    text = f"Points of {name} that no photo can show: {some(off)}."
+    return [Finding("control-outside", "warning", text, "Check their coordinates, or take photos around them.")]
+
+
+def _is_beyond(photos: int | None, metres: float, reach_m: float) -> bool:
+    """Whether no photo shows a point, by their footprints or, where these are not known, by its distance."""
+    return metres > reach_m if photos is None else photos == 0
