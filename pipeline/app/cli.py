@@ -37,6 +37,7 @@ from splatpipe.pipeline.app.cli_options import (
     UntilOption,
     WaitOption,
     WhatOption,
+    expanded,
 )
 from splatpipe.pipeline.app.cli_runs import (
     Overrides,
@@ -305,16 +306,25 @@ def options(preset: PresetOption = "standard") -> None:
 
 
 @app.command()
-def doctor(as_json: JsonOption = False) -> None:
-    """Say what this machine can do."""
-    from splatpipe.pipeline.app.console import show_table
+def doctor(
+    out: Annotated[
+        Path | None, typer.Argument(callback=lambda path: path and expanded(path), help="Where runs are to write.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what this machine can do, and what to think of before a run on it."""
+    from splatpipe.pipeline.app.cautions import cautions
+    from splatpipe.pipeline.app.console import say, show_table
     from splatpipe.pipeline.app.doctor import examine
 
-    findings = examine()
+    place = out or Path.cwd()
+    findings, warnings = examine(place), cautions(place)
     if as_json:
-        print_json(findings)
-    else:
-        show_table([(name, str(value)) for name, value in findings.items()], ("what", "found"))
+        print_json({**findings, "warnings": [caution.as_json() for caution in warnings]})
+        return
+    show_table([(name, str(value)) for name, value in findings.items()], ("what", "found"))
+    for caution in warnings:
+        say(f"! {caution.message} {caution.hint}")
 
 
 app.command()(check)

@@ -7,14 +7,26 @@ from typing import Annotated
 
 import typer
 
-
-def _expand(path: Path) -> Path:
-    return path.expanduser()
+from splatpipe.pipeline.engine.errors import UsageError
 
 
-PhotosArgument = Annotated[Path, typer.Argument(help="Folder of photos, or one with images/ and sparse/0 (COLMAP).")]
+def expanded(path: Path) -> Path:
+    """A path with ``~`` for a user's folder; as it is where nobody has one, as in a container.
+
+    Raises:
+        UsageError: if it begins with ``~`` and there is no such folder.
+    """
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        raise UsageError(f"There is no home folder for {path}.", hint="Give the whole path, or set HOME.") from error
+
+
+PhotosArgument = Annotated[
+    Path, typer.Argument(callback=expanded, help="Folder of photos, or one with images/ and sparse/0 (COLMAP).")
+]
 OutArgument = Annotated[
-    Path, typer.Argument(callback=_expand, help="Folder for the results; a run goes on where it was stopped.")
+    Path, typer.Argument(callback=expanded, help="Folder for the results; a run goes on where it was stopped.")
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with options, over the preset's.")]
 SetOption = Annotated[
@@ -69,7 +81,7 @@ TargetOption = Annotated[
     typer.Option(
         "--output",
         "-o",
-        callback=lambda path: path and _expand(path),
+        callback=lambda path: path and expanded(path),
         help="A film (.webm, or .mp4, four times slower) or the stills' folder; else below OUT/renders.",
     ),
 ]

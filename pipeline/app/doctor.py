@@ -8,20 +8,29 @@ import platform
 import shutil
 from pathlib import Path
 
-from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
+from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes, mount_of
 from splatpipe.pipeline.engine.runner import versions
 from splatpipe.pipeline.engine.stage import JSON
 
+SHARED_MEMORY = Path("/dev/shm")
 
-def examine() -> dict[str, JSON]:
-    """Versions, cores, memory, disk, the rasterizer's instruction set, and whether CUDA is used."""
+
+def examine(place: Path) -> dict[str, JSON]:
+    """Versions, cores, memory, disk, the rasterizer's instruction set, and whether CUDA is used.
+
+    Args:
+        place: An OUT, which need not be there yet.
+    """
     from splatpipe.pipeline.raster.rasterizer import isa_name, isa_names
 
     return {
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cores": _cores(),
         "memory": _memory(),
-        "free disk here": f"{shutil.disk_usage(Path.cwd()).free / 1e9:.0f} GB",
+        "shared memory": f"{_free(SHARED_MEMORY) if SHARED_MEMORY.is_dir() else 'none'} (splatpipe needs none)",
+        "place of results": str(place),
+        "file system there": _file_system(place),
+        "free disk there": _free(place),
         **versions(),
         "rasterizer": f"native, {isa_name()} (of {', '.join(isa_names())})",
         "CUDA": _cuda(),
@@ -43,6 +52,20 @@ def _cores() -> str:
     """What runs may use, and what the machine has beyond that."""
     usable, all_of_them = available_cores(), os.cpu_count() or 0
     return f"{usable} of {all_of_them}, by a limit on this process" if usable < all_of_them else str(usable)
+
+
+def _free(place: Path) -> str:
+    """What is free where a path lies or would lie."""
+    there = next(folder for folder in (place.absolute(), *place.absolute().parents) if folder.exists())
+    try:
+        return f"{shutil.disk_usage(there).free / 1e9:.1f} GB"
+    except OSError as error:
+        return f"unknown: {error.strerror}"
+
+
+def _file_system(place: Path) -> str:
+    mount = mount_of(place)
+    return "unknown" if mount is None else f"{mount.kind} at {mount.point}"
 
 
 def _memory() -> str:

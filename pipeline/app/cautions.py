@@ -1,0 +1,101 @@
+"""What about a place and its machine makes runs slow, unsafe or impossible, told before one is begun.
+
+From the kernel's own texts alone: which file systems' locks other machines see is documented, and not to be tried out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.engine.machine import Mount, available_memory_bytes, mount_of, mounts
+from splatpipe.pipeline.engine.stage import JSON
+
+WINDOWS_KINDS = ("9p", "drvfs", "v9fs")  # of Windows' drives in WSL; 9p of other virtual machines' folders, too
+NFS_KINDS = ("nfs", "nfs4")
+LOCAL_ONLY = ("nolock", "local_lock=all", "local_lock=flock", "nobrl", "localflock")  # options of NFS, SMB, Lustre
+# Of folders that a virtual machine or a container engine on Windows or macOS passes on, and of servers by FUSE.
+PASSED_ON = ("virtiofs", "vboxsf", "vmhgfs", "prl_fs", "fakeowner", "osxfs", "grpcfuse", "fuse", "fuseblk")
+FUSE_WITH_LOCKS = ("fuse.glusterfs", "fuse.ceph", "fuse.juicefs")  # pass locks on to their servers
+IN_MEMORY = ("tmpfs", "ramfs")
+SMALL_WSL_BYTES = 12e9  # less than what the larger captures take: worth a line in .wslconfig
+WSL = "microsoft"  # in the kernel's release, in any case of letters
+
+
+@dataclass(frozen=True)
+class Caution:
+    """Something to think of: one sentence, and what to do."""
+
+    message: str
+    hint: str
+
+    def as_json(self) -> dict[str, JSON]:
+        return asdict(self)
+
+
+def cautions(place: Path, root: Path = Path("/")) -> list[Caution]:
+    """Everything that there is to think of before a run writes to a place.
+
+    Args:
+        place: An OUT, which need not be there yet.
+        root: Where ``proc`` and ``sys`` lie.
+    """
+    release = root / "proc/sys/kernel/osrelease"
+    kernel = release.read_text(encoding="utf-8", errors="replace") if release.is_file() else ""
+    mount = mount_of(place, mounts(root))
+    in_wsl = WSL in kernel.casefold()
+    found = [] if mount is None else _of_mount(place, mount, in_wsl=in_wsl)
+    return [*found, *_of_wsl(kernel, available_memory_bytes(root))]
+
+
+def _of_mount(place: Path, mount: Mount, *, in_wsl: bool) -> Sequence[Caution]:
+    found = []
+    where = f"{place} is on {mount.kind} (mounted at {mount.point})"
+    if "ro" in mount.options:
+        found.append(Caution(f"{where}, which is read-only.", "Choose another OUT."))
+    if mount.kind in WINDOWS_KINDS or (in_wsl and "drvfs" in mount.options):
+        found.append(
+            Caution(
+                f"{where}: every file goes through another system, many times slower, and locks hold in this one only.",
+                "Choose an OUT in Linux's own file system, such as ~/out, and copy the results from there; photos may "
+                "stay where they are.",
+            )
+        )
+    elif option := _unshared_locks(mount):
+        found.append(
+            Caution(
+                f"{where}{option}: its locks hold on this machine only; another machine in the same OUT is noticed by "
+                "its signs of life, within half a minute.",
+                "Let one machine at a time work in an OUT, or mount it with locks (NFS 4, or 3 with its lock service).",
+            )
+        )
+    elif mount.kind in IN_MEMORY:
+        found.append(
+            Caution(f"{where}: it takes memory as it fills, and is gone with the machine.", "Choose an OUT on a disk.")
+        )
+    return found
+
+
+def _unshared_locks(mount: Mount) -> str:
+    """Why other machines do not see its locks, told after its name; empty where they do, or have no access."""
+    options = [option for option in mount.options if option in LOCAL_ONLY]
+    if options:
+        return f" with {', '.join(dict.fromkeys(options))}"
+    passed_on = mount.kind in PASSED_ON or mount.kind.startswith("fuse.")
+    return ", passed on from elsewhere" if passed_on and mount.kind not in FUSE_WITH_LOCKS else ""
+
+
+def _of_wsl(kernel: str, memory_bytes: int) -> Sequence[Caution]:
+    if WSL not in kernel.casefold():
+        return []
+    if "wsl2" not in kernel.casefold():
+        return [Caution("This is WSL 1, which nobody has tried.", "Convert it: wsl --set-version DISTRIBUTION 2")]
+    if 0 < memory_bytes < SMALL_WSL_BYTES:
+        return [
+            Caution(
+                f"WSL gives Linux {memory_bytes / 1e9:.1f} GB: by default half of what Windows has.",
+                "For more, write [wsl2] and memory=24GB into .wslconfig in your Windows profile, then: wsl --shutdown",
+            )
+        ]
+    return []
