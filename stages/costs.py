@@ -14,7 +14,7 @@ MB = 1_000_000
 
 @dataclass(frozen=True)
 class Costs:
-    """Constants of forecasts; what a unit of work is, `forecast.py` says stage by stage.
+    """Constants of forecasts; what a unit of work is, `work.py` says stage by stage.
 
     Attributes:
         keypoints: Of a megapixel in which they are looked for, by extractor.

@@ -1,0 +1,220 @@
+"""The line's work on a capture, counted in units that follow from its size and the options. Light to import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from splatpipe.pipeline.engine.needs import Need
+from splatpipe.pipeline.train.limits import FIXED_BYTES, PIXEL_BYTES, bytes_per_gaussian, worthwhile_iterations
+from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
+from splatpipe.stages.costs import Costs
+from splatpipe.stages.options import LineConfig
+
+MEGA = 1e6
+HEIGHT_SHARE = 0.72  # of a photo's longer side: between the 4:3 and the 3:2 of most cameras
+SIFT_WORK = {"opencv-sift": 1.0, "sift": 4.2}  # times the CPU seconds of OpenCV's, a pixel; measured on the demo
+SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # the same of a thread's memory
+MOST_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times the keypoints asked for: orientations, scales taken whole
+NEIGHBOURS = 20  # of the costs' pairs a photo
+PHOTOS_OF_ONE_COST = 50  # a photo of a mapping of so many costs what the constant says, of a larger one more
+MAPPING_GROWTH = 0.5  # power of the photos that a photo's mapping costs
+UNTIL = 0.5  # of the run there is density control
+GROWTH_MEAN = 5.0 / 6.0  # of the growth is there on average: x (2 - x) until half of the run, all of it from there on
+PREVIEW_STEPS = 5  # of density control, which the costs' Gaussians were counted after
+STEPS_POWER = 0.35  # of the steps, that Gaussians grow with
+GAUSSIAN_MEGAPIXELS = 3e-6  # of a photo that cost as much in an iteration as a Gaussian does
+FLAT_SHARE = 0.92  # of the iterations is done where a flat loss ends the training
+START_SHARE = 0.2  # of the final Gaussians, at the start
+LEAST_SHARE = 0.1  # of a time budget for the training, even where nothing is left
+FEWEST_GAUSSIANS = 1000  # whatever the time
+PHOTO_BYTES = 3  # of a pixel, decoded
+PARALLEL = {
+    "ingest": 0.8,
+    "features": 0.98,
+    "matches": 0.97,
+    "sparse": 0.2,
+    "undistort": 0.8,
+    "initialize": 0.85,
+    "train": 0.93,
+    "evaluate": 0.75,
+    "export": 0.2,
+    "flythrough": 0.7,
+}
+"""Of each stage's CPU seconds, what more threads divide among themselves; measured with one and two."""
+
+
+@dataclass(frozen=True)
+class CaptureSize:
+    """What is known of a capture before anything is done.
+
+    Attributes:
+        photos: How many.
+        megapixels: Of one photo as flown, the median.
+        positions: Whether most have a position.
+    """
+
+    photos: int
+    megapixels: float
+    positions: bool
+
+
+@dataclass(frozen=True)
+class Units:
+    """A stage's work.
+
+    Attributes:
+        cpu: Of CPU time.
+        memory: Of what grows in memory.
+        disk: Of what it leaves.
+    """
+
+    cpu: float
+    memory: float
+    disk: float
+
+
+@dataclass(frozen=True)
+class Work:
+    """A capture and what is to be made of it.
+
+    Attributes:
+        size: Of the capture.
+        config: The options, resolved.
+        costs: What a unit costs.
+        threads: Of the run.
+        iterations: Of the training.
+        gaussians: At its end.
+    """
+
+    size: CaptureSize
+    config: LineConfig
+    costs: Costs
+    threads: int
+    iterations: int
+    gaussians: float
+
+    @staticmethod
+    def of(size: CaptureSize, config: LineConfig, costs: Costs, threads: int) -> Work:
+        """The work without a time budget."""
+        iterations = config.train.iterations
+        work = Work(size, config, costs, threads, iterations, 0.0)
+        return replace(work, gaussians=min(work.most_gaussians, work.grown(iterations)))
+
+    def filling(self, seconds: float, speed: float) -> Work:
+        """The same with a training of so many seconds: iterations by their root, and the Gaussians that then fit in."""
+        iterations = worthwhile_iterations(seconds)
+        cpu = seconds / Need(0, 1.0, 0, parallel=PARALLEL["train"]).seconds(self.threads)
+        room = cpu * speed / (self.costs.cpu["train"] * iterations) - self.trained_at
+        fitting = max(FEWEST_GAUSSIANS, room / (GAUSSIAN_MEGAPIXELS * _mean_share()))
+        gaussians = min(self.most_gaussians, self.grown(iterations), fitting)
+        return replace(self, iterations=iterations, gaussians=gaussians)
+
+    @property
+    def looked_at(self) -> float:
+        """Megapixels of a photo in which keypoints are looked for."""
+        return min(self.size.megapixels, HEIGHT_SHARE * self.config.features.max_image_size**2 / MEGA)
+
+    @property
+    def keypoints(self) -> float:
+        """Of a photo."""
+        options = self.config.features
+        most = MOST_KEYPOINTS[options.extractor] * options.max_features
+        return min(most, self.costs.keypoints[options.extractor] * self.looked_at)
+
+    @property
+    def pairs(self) -> float:
+        """Of photos that are matched."""
+        photos, options = self.size.photos, self.config.matches
+        every = photos * (photos - 1) / 2
+        small = photos <= options.exhaustive_up_to and not self.size.positions
+        if options.pairing == "exhaustive" or (options.pairing == "auto" and small):
+            return every
+        return min(every, self.costs.pairs * photos * options.neighbours / NEIGHBOURS)
+
+    @property
+    def trained_at(self) -> float:
+        """Megapixels of a training photo."""
+        return min(self.size.megapixels, self.config.undistort.max_megapixels)
+
+    @property
+    def most_gaussians(self) -> float:
+        """That the options, a limit of memory among them, let there be."""
+        options = self.config.train
+        if not options.max_memory_bytes:
+            return float(options.max_gaussians)
+        taken = self.costs.resident["train"] + FIXED_BYTES + PIXEL_BYTES * MEGA * self.trained_at
+        room = max(0.0, options.max_memory_bytes - taken)
+        return min(float(options.max_gaussians), room / bytes_per_gaussian(options.sh_degree))
+
+    def grown(self, iterations: int) -> float:
+        """Gaussians after density control, as the photos' detail asks for."""
+        first, every = max(1, min(500, iterations // 5)), max(1, min(100, iterations // 10))
+        steps = max(1.0, 1.0 + (UNTIL * iterations - first) // every)
+        return float(self.costs.gaussians * self.size.photos * self.trained_at * (steps / PREVIEW_STEPS) ** STEPS_POWER)
+
+    @property
+    def film_pixels(self) -> float:
+        """Megapixels of the film's frames together."""
+        film, budget = self.config.flythrough, self.config.train.time_budget_s
+        if 0.0 < budget < FILM_FROM_BUDGET_S:
+            return 0.0
+        size = film.film_size
+        frame = size[0] * size[1] / MEGA if size else self.trained_at
+        return film.seconds * film.fps * frame
+
+    def units(self) -> dict[str, Units]:
+        """By stage: CPU time, memory, disk."""
+        size, train = self.size, self.config.train
+        photos, pixels = float(size.photos), size.photos * size.megapixels
+        keypoints, trained, gaussians = photos * self.keypoints, photos * self.trained_at, float(self.gaussians)
+        extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
+        mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
+        done = self.iterations * (FLAT_SHARE if train.stop_when_flat and not train.time_budget_s else 1.0)
+        iteration = self.trained_at + GAUSSIAN_MEGAPIXELS * gaussians * _mean_share()
+        state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.trained_at
+        looked = photos * self.looked_at * SIFT_WORK[extractor]
+        looked_at_once = self.threads * self.looked_at * SIFT_MEMORY[extractor]
+        return {
+            "ingest": Units(pixels, 0.0, photos),
+            "features": Units(looked, looked_at_once, keypoints),
+            "matches": Units(self.pairs * self.keypoints, self.threads * self.keypoints, keypoints),
+            "sparse": Units(keypoints * mapping, keypoints, keypoints),
+            "georef": Units(photos, keypoints, keypoints),
+            "undistort": Units(pixels, at_once, trained),
+            "split": Units(photos, 0.0, photos),
+            "initialize": Units(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
+            "train": Units(done * iteration, state, gaussians),
+            "evaluate": Units(trained, gaussians, trained),
+            "export": Units(gaussians, gaussians, gaussians),
+            "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
+        }
+
+    def needs(self, speed: float) -> dict[str, Need]:
+        """What the units cost, by stage, on a machine of that speed."""
+        costs, most = self.costs, self.config.train.max_memory_bytes
+        found = {}
+        for stage, units in self.units().items():
+            memory = costs.resident[stage] + costs.memory[stage] * units.memory
+            if stage == "train" and most:
+                memory = min(memory, most)
+            found[stage] = Need(
+                int(memory),
+                costs.cpu[stage] * units.cpu / speed,
+                int(costs.disk[stage] * units.disk),
+                self._scratch(stage, units),
+                PARALLEL.get(stage, 0.0),
+            )
+        return found
+
+    def _scratch(self, stage: str, units: Units) -> int:
+        """Bytes that a stage takes while it runs: a copy of the features; decoded photos and a checkpoint."""
+        if stage in ("matches", "sparse"):
+            return int(self.costs.disk["features"] * units.disk)
+        if stage == "train":
+            return int(PHOTO_BYTES * MEGA * self.size.photos * self.trained_at + units.memory)
+        return 0
+
+
+def _mean_share() -> float:
+    """Of the final Gaussians, that an iteration has on average."""
+    return START_SHARE + (1.0 - START_SHARE) * GROWTH_MEAN
