@@ -18,7 +18,7 @@ from splatpipe.pipeline.engine.needs import whole as whole
 from splatpipe.pipeline.engine.stage import Summary
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import LEAST_SHARE, CaptureSize, Work
+from splatpipe.stages.work import LEAST_SHARE, MEGA, CaptureSize, Work
 
 SPEED_NUMBERS = 20_000  # of a text without repeats, whose packing is timed
 SPEED_S = 0.008  # that the machine of the costs takes to pack it, undisturbed
@@ -80,12 +80,14 @@ class Forecaster:
 
 
 def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
-    """The size of a capture as ``ingest`` told it; None where it did not run."""
+    """The size of a capture as ``ingest`` told it, by its commonest camera; None where it did not run."""
     told = summaries.get("ingest", {})
-    photos = int(told.get("photos", 0))
-    if not photos:
+    groups = told.get("camera_groups", ())
+    if not groups:
         return None
-    return CaptureSize(photos, float(told["megapixels"]) / photos, 2 * int(told["positions"]) > photos)
+    shorter, longer = sorted(max(groups, key=lambda group: int(group["photos"]))["size"])
+    photos = int(told["photos"])
+    return CaptureSize(photos, shorter * longer / MEGA, 2 * int(told["positions"]) > photos, shorter / longer)
 
 
 def seconds(need: Need, threads: int) -> float:

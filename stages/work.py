@@ -11,7 +11,7 @@ from splatpipe.stages.costs import Costs
 from splatpipe.stages.options import LineConfig
 
 MEGA = 1e6
-HEIGHT_SHARE = 0.72  # of a photo's longer side: between the 4:3 and the 3:2 of most cameras
+USUAL_SHAPE = 0.72  # of photos whose sides nobody asked for: between the 4:3 and the 3:2 of most cameras
 SIFT_WORK = {"opencv-sift": 1.0, "sift": 4.2}  # times the CPU seconds of OpenCV's, a pixel; measured on the demo
 SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # the same of a thread's memory
 MOST_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times the keypoints asked for: orientations, scales taken whole
@@ -21,9 +21,10 @@ MAPPING_GROWTH = 0.5  # power of the photos that a photo's mapping costs
 UNTIL = 0.5  # of the run there is density control
 GROWTH_MEAN = 5.0 / 6.0  # of the growth is there on average: x (2 - x) until half of the run, all of it from there on
 PREVIEW_STEPS = 5  # of density control, which the costs' Gaussians were counted after
-STEPS_POWER = 0.35  # of the steps, that Gaussians grow with
-GAUSSIAN_MEGAPIXELS = 3e-6  # of a photo that cost as much in an iteration as a Gaussian does
-FLAT_SHARE = 0.92  # of the iterations is done where a flat loss ends the training
+STEPS_POWER = 1.3  # of the steps, that Gaussians grow with: 1.5 on brighton (946,000 at `standard`), 0.9 on the demo
+SIZE_POWER = 0.5  # of the photos' size, the same: from 0.1 to 0.3 megapixels on the demo
+PREVIEW_MEGAPIXELS = 0.3  # at which the costs' Gaussians were counted
+GAUSSIAN_MEGAPIXELS = 1e-6  # of a photo that cost as much in an iteration as a Gaussian does
 START_SHARE = 0.2  # of the final Gaussians, at the start
 LEAST_SHARE = 0.1  # of a time budget for the training, even where nothing is left
 FEWEST_GAUSSIANS = 1000  # whatever the time
@@ -51,11 +52,13 @@ class CaptureSize:
         photos: How many.
         megapixels: Of one photo as flown, the median.
         positions: Whether most have a position.
+        shape: A photo's shorter side over its longer one.
     """
 
     photos: int
     megapixels: float
     positions: bool
+    shape: float = USUAL_SHAPE
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ class Work:
         """The same with a training of so many seconds: iterations by their root, and the Gaussians that then fit in."""
         iterations = worthwhile_iterations(seconds)
         cpu = seconds / Need(0, 1.0, 0, parallel=PARALLEL["train"]).seconds(self.threads)
-        room = cpu * speed / (self.costs.cpu["train"] * iterations) - self.trained_at
+        room = cpu * speed / (self.costs.stages["train"].cpu * iterations) - self.trained_at
         fitting = max(FEWEST_GAUSSIANS, room / (GAUSSIAN_MEGAPIXELS * _mean_share()))
         gaussians = min(self.most_gaussians, self.grown(iterations), fitting)
         return replace(self, iterations=iterations, gaussians=gaussians)
@@ -112,7 +115,7 @@ class Work:
     @property
     def looked_at(self) -> float:
         """Megapixels of a photo in which keypoints are looked for."""
-        return min(self.size.megapixels, HEIGHT_SHARE * self.config.features.max_image_size**2 / MEGA)
+        return min(self.size.megapixels, self.size.shape * self.config.features.max_image_size**2 / MEGA)
 
     @property
     def keypoints(self) -> float:
@@ -142,7 +145,7 @@ class Work:
         options = self.config.train
         if not options.max_memory_bytes:
             return float(options.max_gaussians)
-        taken = self.costs.resident["train"] + FIXED_BYTES + PIXEL_BYTES * MEGA * self.trained_at
+        taken = self.costs.stages["train"].resident + FIXED_BYTES + PIXEL_BYTES * MEGA * self.trained_at
         room = max(0.0, options.max_memory_bytes - taken)
         return min(float(options.max_gaussians), room / bytes_per_gaussian(options.sh_degree))
 
@@ -150,7 +153,8 @@ class Work:
         """Gaussians after density control, as the photos' detail asks for."""
         first, every = max(1, min(500, iterations // 5)), max(1, min(100, iterations // 10))
         steps = max(1.0, 1.0 + (UNTIL * iterations - first) // every)
-        return float(self.costs.gaussians * self.size.photos * self.trained_at * (steps / PREVIEW_STEPS) ** STEPS_POWER)
+        longer, larger = steps / PREVIEW_STEPS, self.trained_at / PREVIEW_MEGAPIXELS
+        return float(self.costs.gaussians * self.size.photos * longer**STEPS_POWER * larger**SIZE_POWER)
 
     @property
     def film_pixels(self) -> float:
@@ -169,16 +173,18 @@ class Work:
         keypoints, trained, gaussians = photos * self.keypoints, photos * self.trained_at, float(self.gaussians)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
-        done = self.iterations * (FLAT_SHARE if train.stop_when_flat and not train.time_budget_s else 1.0)
+        done = self.iterations * (self.costs.flat if train.stop_when_flat and not train.time_budget_s else 1.0)
         iteration = self.trained_at + GAUSSIAN_MEGAPIXELS * gaussians * _mean_share()
         state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.trained_at
         looked = photos * self.looked_at * SIFT_WORK[extractor]
         looked_at_once = self.threads * self.looked_at * SIFT_MEMORY[extractor]
         return {
             "ingest": Units(pixels, 0.0, photos),
+            "control": Units(photos, 0.0, photos),
             "features": Units(looked, looked_at_once, keypoints),
             "matches": Units(self.pairs * self.keypoints, self.threads * self.keypoints, keypoints),
             "sparse": Units(keypoints * mapping, keypoints, keypoints),
+            "targets": Units(pixels, at_once, photos),
             "georef": Units(photos, keypoints, keypoints),
             "undistort": Units(pixels, at_once, trained),
             "split": Units(photos, 0.0, photos),
@@ -191,16 +197,16 @@ class Work:
 
     def needs(self, speed: float) -> dict[str, Need]:
         """What the units cost, by stage, on a machine of that speed."""
-        costs, most = self.costs, self.config.train.max_memory_bytes
-        found = {}
+        most, found = self.config.train.max_memory_bytes, {}
         for stage, units in self.units().items():
-            memory = costs.resident[stage] + costs.memory[stage] * units.memory
+            cost = self.costs.stages[stage]
+            memory = cost.resident + cost.memory * units.memory
             if stage == "train" and most:
                 memory = min(memory, most)
             found[stage] = Need(
                 int(memory),
-                costs.cpu[stage] * units.cpu / speed,
-                int(costs.disk[stage] * units.disk),
+                cost.cpu * units.cpu / speed,
+                int(cost.disk * units.disk),
                 self._scratch(stage, units),
                 PARALLEL.get(stage, 0.0),
             )
@@ -209,7 +215,7 @@ class Work:
     def _scratch(self, stage: str, units: Units) -> int:
         """Bytes that a stage takes while it runs: a copy of the features; decoded photos and a checkpoint."""
         if stage in ("matches", "sparse"):
-            return int(self.costs.disk["features"] * units.disk)
+            return int(self.costs.stages["features"].disk * units.disk)
         if stage == "train":
             return int(PHOTO_BYTES * MEGA * self.size.photos * self.trained_at + units.memory)
         return 0

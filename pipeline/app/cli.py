@@ -242,6 +242,7 @@ def view(
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Say what is there, what is stale and why."""
     from splatpipe.pipeline.app.console import show_standings
+    from splatpipe.pipeline.engine.needs import used_and_forecast
     from splatpipe.pipeline.engine.runner import survey
     from splatpipe.pipeline.engine.session import survey_line
 
@@ -254,6 +255,7 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
                 "reason": standing.reason,
                 "seconds": standing.artifact.manifest["seconds"] if standing.artifact else None,
                 "summary": standing.artifact.summary if standing.artifact else None,
+                **(used_and_forecast(standing.artifact.manifest) if standing.artifact else {}),
             }
             for standing in standings
         ]

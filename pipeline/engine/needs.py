@@ -44,6 +44,14 @@ def unforeseen(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
     return {}
 
 
+def used_and_forecast(manifest: Mapping[str, JSON]) -> dict[str, JSON]:
+    """What a finished stage took and what had been forecast for it, from its manifest; null where nothing had been."""
+    disk = sum(file["size"] for part in manifest["parts"].values() for file in part["files"])
+    used = {"memory_bytes": manifest["peak_memory_bytes"], "cpu_seconds": manifest["cpu_seconds"], "disk_bytes": disk}
+    forecast = manifest.get("forecast")
+    return {"used": used, "forecast": None if forecast is None else {name: forecast[name] for name in used}}
+
+
 def whole(needs: Mapping[str, Need]) -> Need:
     """Of a run of these stages, one after the other: the largest memory, all the time, all that is left on the disk.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
@@ -49,6 +49,7 @@ def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
         "total": duration(sum(row["seconds"] or 0.0 for row in rows)),
         "cpu_total": duration(sum(row["cpu_seconds"] or 0.0 for row in rows)),
         "peak": size(max((row["memory"] or 0 for row in rows), default=0) or None),
+        "forecast": _forecast([row["foreseen"] for row in rows if row["foreseen"]]),
         "machine": _machine(machine),
         "versions": sorted((str(name), str(value)) for name, value in versions.items()),
         "otherwise": _made_otherwise(holdings, versions),
@@ -121,8 +122,18 @@ def _stage_row(holdings: Holdings, name: str) -> dict[str, Any]:
         "cpu": duration(manifest.get("cpu_seconds")),
         "memory": memory,
         "peak": size(memory),
+        "foreseen": manifest.get("forecast"),
+        "forecast": _forecast([manifest["forecast"]] if "forecast" in manifest else []),
         "key": (str(manifest.get("key", "")) or ("" if story is None else story.key))[:16],
     }
+
+
+def _forecast(needs: Sequence[Mapping[str, Any]]) -> str:
+    """CPU time and memory as they had been forecast for one stage or several; empty where they had not."""
+    if not needs:
+        return ""
+    seconds = sum(float(need["cpu_seconds"]) for need in needs)
+    return f"{duration(seconds)}, {size(max(int(need['memory_bytes']) for need in needs))}"
 
 
 def _made_otherwise(holdings: Holdings, versions: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -1,0 +1,111 @@
+"""Fits the costs of forecasts to finished runs, and shows how far they are off runs that they were not fitted to.
+
+python benchmarks/forecast.py                       # the table of figures that is kept: fits, leaves one capture out
+python benchmarks/forecast.py --add OUT NAME PRESET # reads a finished run's manifests into that table
+python benchmarks/forecast.py --costs               # prints the fitted costs, for stages/costs.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from forecast_fit import Outcome, Run, compared, fit, left_out, read_run
+from tables import print_table
+
+from splatpipe.pipeline.engine.config import load_preset, resolve
+from splatpipe.stages.costs import REFERENCE, Costs
+from splatpipe.stages.options import LineConfig
+
+TABLE = Path(__file__).with_name("forecast.json")
+FITTED_TO = "preview"  # runs of other presets are told, not fitted to
+MEMORY_WITHIN = 0.3
+CPU_WITHIN = 1.5
+SHOWN = ("features", "matches", "sparse", "initialize", "train")
+
+
+def main() -> int:
+    """The exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--add", nargs=3, metavar=("OUT", "NAME", "PRESET"))
+    parser.add_argument("--costs", action="store_true")
+    options = parser.parse_args()
+    rows = json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.is_file() else []
+    if options.add:
+        out, name, preset = options.add
+        row = read_run(Path(out), configured(preset), name).as_row(preset)
+        kept = [old for old in rows if (old["name"], old["preset"]) != (name, preset)]
+        lines = (
+            json.dumps(entry) for entry in sorted([*kept, row], key=lambda entry: (entry["preset"], entry["name"]))
+        )
+        TABLE.write_text("[\n" + ",\n".join(lines) + "\n]\n", encoding="utf-8")
+        return 0
+    fitted_to, others = runs_of(rows)
+    if options.costs:
+        sys.stdout.write(told(fit(fitted_to)) + "\n")
+        return 0
+    show(f"{FITTED_TO}, each against the costs of the others: forecast over used", left_out(fitted_to))
+    show("other presets, against the costs in stages/costs.py", [compared(run, REFERENCE) for run in others])
+    return 0
+
+
+def told(costs: Costs) -> str:
+    """Costs as `stages/costs.py` has them, to three digits."""
+    lines = [f"{name}: {getattr(costs, name):.3g}" for name in ("pairs", "gaussians", "flat")]
+    lines.append(f"keypoints: { {name: round(count) for name, count in costs.keypoints.items()} }")
+    for stage, of in costs.stages.items():
+        lines.append(f'"{stage}": StageCosts({of.cpu:.3g}, {of.resident / 1e6:.0f}e6, {of.memory:.3g}, {of.disk:.3g}),')
+    return "\n".join(lines)
+
+
+def configured(preset: str) -> LineConfig:
+    """A preset's options."""
+    return resolve(LineConfig, [load_preset(preset)])
+
+
+def runs_of(rows: Sequence[dict[str, object]]) -> tuple[list[Run], list[Run]]:
+    """The runs of the preset that is fitted to, and the others."""
+    fitted_to = [Run.of_row(row, configured(FITTED_TO)) for row in rows if row["preset"] == FITTED_TO]
+    others = [Run.of_row(row, configured(str(row["preset"]))) for row in rows if row["preset"] != FITTED_TO]
+    return fitted_to, others
+
+
+def holds(outcome: Outcome) -> tuple[bool, bool]:
+    """Whether the whole run's peak memory and its CPU time were foretold well enough."""
+    return abs(outcome.memory - 1.0) <= MEMORY_WITHIN, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
+
+
+def show(title: str, outcomes: Sequence[Outcome]) -> None:
+    """Print what came of it."""
+    table = []
+    for outcome in outcomes:
+        used = outcome.run.used.values()
+        table.append(
+            {
+                "name": outcome.run.name,
+                "used": max(found["peak_memory_bytes"] for found in used) / 1e6,
+                "memory": outcome.memory,
+                "seconds": sum(found["cpu_seconds"] for found in used),
+                "cpu": outcome.cpu,
+                "disk": outcome.disk,
+                "holds": " ".join("yes" if well else "NO" for well in holds(outcome)),
+                **{stage: outcome.stages[stage] for stage in SHOWN},
+            }
+        )
+    columns = {
+        "capture": "name",
+        "peak MB": "used:.0f",
+        "memory ×": "memory:.2f",
+        "CPU s": "seconds:.0f",
+        "CPU ×": "cpu:.2f",
+        "disk ×": "disk:.2f",
+        "both hold": "holds",
+    }
+    print_table(title, table, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in SHOWN})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,208 @@
+"""Costs of forecasts fitted to finished runs, and how well they tell a run that they were not fitted to."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import nnls
+
+from splatpipe.stages.costs import REFERENCE, Costs, StageCosts
+from splatpipe.stages.forecast import counted, forecast
+from splatpipe.stages.options import LineConfig
+from splatpipe.stages.work import NEIGHBOURS, CaptureSize, Units, Work
+
+KINDS = ("cpu_seconds", "peak_memory_bytes", "disk_bytes")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, as its manifests tell it.
+
+    Attributes:
+        name: Of the capture.
+        size: Of the capture.
+        config: The options that it ran with.
+        threads: It was given.
+        counts: Keypoints of all photos, pairs, Gaussians at the end, iterations done.
+        used: ``KINDS`` by stage.
+    """
+
+    name: str
+    size: CaptureSize
+    config: LineConfig
+    threads: int
+    counts: Mapping[str, float]
+    used: Mapping[str, Mapping[str, float]]
+
+    def as_row(self, preset: str) -> dict[str, Any]:
+        """For the table that is kept."""
+        return {
+            "name": self.name,
+            "preset": preset,
+            "threads": self.threads,
+            "size": [self.size.photos, round(self.size.megapixels, 4), self.size.positions, round(self.size.shape, 4)],
+            "counts": dict(self.counts),
+            "used": {stage: [round(found[kind], 2) for kind in KINDS] for stage, found in self.used.items()},
+        }
+
+    @staticmethod
+    def of_row(row: Mapping[str, Any], config: LineConfig) -> Run:
+        """The inverse of ``as_row``, with the preset's options."""
+        used = {stage: dict(zip(KINDS, figures, strict=True)) for stage, figures in row["used"].items()}
+        return Run(row["name"], CaptureSize(*row["size"]), config, row["threads"], row["counts"], used)
+
+
+def read_run(out: Path, config: LineConfig, name: str) -> Run:
+    """A run from the newest manifest of each stage in its OUT.
+
+    Raises:
+        ValueError: if it did not begin with photos, or is not finished.
+    """
+    manifests: dict[str, dict[str, Any]] = {}
+    for path in out.glob("stages/*/manifest.json"):
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        before = manifests.get(manifest["stage"])
+        if before is None or manifest["finished_s"] > before["finished_s"]:
+            manifests[manifest["stage"]] = manifest
+    summaries = {stage: manifest["summary"] for stage, manifest in manifests.items()}
+    size = counted(summaries)
+    if size is None or "flythrough" not in summaries:
+        raise ValueError(f"{out} holds no whole run of photos.")
+    counts = {
+        "keypoints": float(summaries["features"]["keypoints"]),
+        "pairs": float(summaries["matches"]["pairs"]),
+        "gaussians": float(summaries["train"]["gaussians"]),
+        "iterations": float(summaries["train"]["iterations"]),
+    }
+    used = {stage: _used(manifest) for stage, manifest in manifests.items()}
+    return Run(name, size, config, int(manifests["train"]["machine"]["threads"]), counts, used)
+
+
+def _used(manifest: Mapping[str, Any]) -> dict[str, float]:
+    disk = sum(file["size"] for part in manifest["parts"].values() for file in part["files"])
+    return {
+        "cpu_seconds": float(manifest["cpu_seconds"]),
+        "peak_memory_bytes": float(manifest["peak_memory_bytes"]),
+        "disk_bytes": float(disk),
+    }
+
+
+def fit(runs: Sequence[Run], base: Costs = REFERENCE) -> Costs:
+    """The costs that explain these runs: what scenes typically have, and what a unit of the work takes that they had.
+
+    What these runs do not tell (of an extractor that none used, of a film) is taken from ``base``.
+    """
+    scenes = [scene_of(run, base) for run in runs]
+    works = [Work.of(run.size, run.config, scene, run.threads) for run, scene in zip(runs, scenes, strict=True)]
+    units = [work.units() for work in works]
+    keypoints = dict(base.keypoints)
+    for extractor in {run.config.features.extractor for run in runs}:
+        told = [scene.keypoints[extractor] for run, scene in zip(runs, scenes, strict=True) if _uses(run, extractor)]
+        keypoints[extractor] = _typical(told, 0.0)
+    chosen = [scene.pairs for run, scene in zip(runs, scenes, strict=True) if run.counts["pairs"] < _every(run)]
+    ended = [scene.flat for run, scene in zip(runs, scenes, strict=True) if run.config.train.stop_when_flat]
+    stages = {}
+    for stage, otherwise in base.stages.items():
+        those = [(run.used[stage], each[stage]) for run, each in zip(runs, units, strict=True) if stage in run.used]
+        if those:
+            resident, memory = _line(those)
+            cpu = [used["cpu_seconds"] / of.cpu for used, of in those if used["cpu_seconds"] * of.cpu > 0.0]
+            disk = [used["disk_bytes"] / of.disk for used, of in those if used["disk_bytes"] * of.disk > 0.0]
+            found = _typical(cpu, otherwise.cpu), _typical(disk, otherwise.disk)
+            stages[stage] = StageCosts(found[0], resident, memory, found[1])
+        else:
+            stages[stage] = otherwise
+    return Costs(
+        keypoints,
+        _typical(chosen, base.pairs),
+        _typical([scene.gaussians for scene in scenes], base.gaussians),
+        _typical(ended, base.flat),
+        stages,
+    )
+
+
+def scene_of(run: Run, base: Costs) -> Costs:
+    """Costs with what this run's scene had, which is known afterwards only: the units of its work come out as done."""
+    bare = Work.of(run.size, run.config, replace(base, gaussians=1.0), run.threads)
+    options, counts = run.config, run.counts
+    keypoints = {
+        **base.keypoints,
+        options.features.extractor: counts["keypoints"] / run.size.photos / bare.looked_at,
+    }
+    return replace(
+        base,
+        keypoints=keypoints,
+        pairs=counts["pairs"] / run.size.photos * NEIGHBOURS / options.matches.neighbours,
+        gaussians=counts["gaussians"] / bare.grown(options.train.iterations),
+        flat=counts["iterations"] / options.train.iterations,
+    )
+
+
+def _uses(run: Run, extractor: str) -> bool:
+    return run.config.features.extractor == extractor
+
+
+def _every(run: Run) -> float:
+    return run.size.photos * (run.size.photos - 1) / 2
+
+
+def _typical(values: Sequence[float], otherwise: float) -> float:
+    """Geometric mean: as often too high as too low by the same factor."""
+    return math.exp(sum(math.log(value) for value in values) / len(values)) if values else otherwise
+
+
+def _line(those: Sequence[tuple[Mapping[str, float], Units]]) -> tuple[float, float]:
+    """A stage's memory: what is there whatever the size, and a unit's (relative least squares, neither below zero)."""
+    units = np.array([of.memory for _, of in those])
+    used = np.array([found["peak_memory_bytes"] for found, _ in those])
+    scale = max(float(units.max()), 1.0)
+    table = np.stack([np.ones(len(those)), units / scale], axis=1) * (used.mean() / used)[:, None]
+    constant, slope = nnls(table, np.ones(len(those)))[0] * used.mean()
+    return float(constant), float(slope / scale)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run beside its forecast: forecast over used.
+
+    Attributes:
+        run: What was used.
+        memory: Of the whole run's peak.
+        cpu: Of the whole run.
+        disk: Of all that is left.
+        stages: Of the CPU time of single stages.
+    """
+
+    run: Run
+    memory: float
+    cpu: float
+    disk: float
+    stages: Mapping[str, float]
+
+
+def compared(run: Run, costs: Costs) -> Outcome:
+    """What the costs tell of a run, over what it used."""
+    needs = forecast(run.size, run.config, run.threads, costs=costs)
+    used = run.used
+
+    def ratio(join: Callable[[Iterable[float]], float], told: Mapping[str, float], kind: str) -> float:
+        return join(told.values()) / join(used[stage][kind] for stage in used)
+
+    return Outcome(
+        run,
+        ratio(max, {stage: float(needs[stage].memory_bytes) for stage in used}, "peak_memory_bytes"),
+        ratio(sum, {stage: needs[stage].cpu_seconds for stage in used}, "cpu_seconds"),
+        ratio(sum, {stage: float(needs[stage].disk_bytes) for stage in used}, "disk_bytes"),
+        {stage: needs[stage].cpu_seconds / max(used[stage]["cpu_seconds"], 0.01) for stage in used},
+    )
+
+
+def left_out(runs: Sequence[Run]) -> list[Outcome]:
+    """Each run against costs fitted to the other captures."""
+    return [compared(run, fit([other for other in runs if other.name != run.name])) for run in runs]
