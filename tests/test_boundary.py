@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from splatpipe.demo.geodesy import Origin as DemoOrigin
+from splatpipe.pipeline.app.cli_runs import overrides, with_boundary
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
@@ -265,6 +266,15 @@ def test_projected_numbers_need_a_projected_run(tmp_path: Path) -> None:
 def test_degrees_of_a_projected_system_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SplatpipeError, match="look like degrees"):
         laid(tmp_path, polygon(degrees, OUTLINE) | named("EPSG:32633"))
+
+
+def test_the_command_lines_file_is_the_option_and_set_has_the_last_word() -> None:
+    def resolved(assignments: list[str], boundary: str | None) -> str:
+        return overrides(None, with_boundary(assignments, boundary), None).resolve().georef.boundary
+
+    assert resolved([], None) == "auto"
+    assert resolved(["train.seed=3"], "site plan = 2.geojson") == "site plan = 2.geojson"
+    assert resolved(["georef.boundary=none"], "site.geojson") == "none"
 
 
 def test_any_datum_finds_the_same_ground(tmp_path: Path) -> None:

@@ -194,6 +194,8 @@ def crossing_of(ring: Ring) -> tuple[float, ...]:
         near = (low[others, 1] <= high[k, 1]) & (high[others, 1] >= low[k, 1])
         apart = (others - k) % len(ring)
         others = others[near & (apart != 1) & (apart != len(ring) - 1)]
+        if not len(others):
+            continue
         met = others[_meet(ring[k], following[k], ring[others], following[others])]
         if len(met):
             there = _meeting(ring[k], following[k], ring[met[0]], following[met[0]])
