@@ -3,7 +3,7 @@
 # make test                    sets up, then passes every test
 # make develop                 installs links to the sources, so that what is edited is what runs; make test goes back
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
-# make test-image              builds the container image for real and runs the demo in it (Linux, root, buildah, crun)
+# make test-image              builds the container image for real and runs the demo in it (Linux, root, buildah, runc)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
 # SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or for some: "80;90"

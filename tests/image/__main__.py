@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 import shutil
 import sys
 from pathlib import Path
 
 from building import Image, ImageTools, Problem, build_image
-from container import Container, Mounts
+from container import MEMORY, Container, Mounts
 from contents import foreign_tools, pulled_bytes, sizes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,7 +85,11 @@ def run_demo(image: Image) -> None:
         out.mkdir(parents=True)
     command = ["run", "/photos", "/out", "--preset", "preview"]
     whole = Container(image, WORK / "bundle", Mounts(photos / "photos", outs["undisturbed"]))
-    whole.must_end(0, ["doctor"], say)
+    told = json.loads(whole.must_end(0, ["doctor", "--json"], say, cores=1))
+    limits = f"{told['cores']} cores, {told['memory']}"
+    if not limits.startswith("1 ") or f"{MEMORY / 1e9:.1f} GB for this process" not in limits:
+        raise Problem(f"It does not keep to its control group's limits: {limits}.")
+    say(f"Limited to one processor and {MEMORY / 1e9:.1f} GB it finds {limits}.")
     whole.must_end(0, command, say)
     say("The demo ran undisturbed.")
     stopped = Container(image, WORK / "bundle", Mounts(photos / "photos", outs["stopped"]))

@@ -18,7 +18,7 @@ SUITE = "bookworm"  # Debian 12, as the base's name says
 CERT_INSIDE = "/etc/index-certificates.pem"  # beside Debian's own, which a package of the image writes
 DOCKERFILE = Path("docker") / "Dockerfile"
 DRIVERS = ("overlay", "vfs")  # the second works everywhere, and copies everything for every layer
-TOOLS = ("buildah", "debootstrap", "crun")
+TOOLS = ("buildah", "debootstrap", "runc")
 
 
 class Problem(Exception):

@@ -19,6 +19,8 @@ SHM = "size=65536k"  # what Docker gives
 DOCKER_KILLS_S = 10.0
 PATIENCE_S = 3600.0  # of a busy machine; a container that hangs ends the test
 LOOK_S = 0.1
+MEMORY = 4 << 30  # bytes that its control group allows
+PERIOD_US = 100_000  # of the control group that allows processors
 DEVICES = ["nosuid", "noexec"]
 
 
@@ -66,32 +68,33 @@ class Container:
         self._name = f"splatpipe-test-{os.getpid()}"
         os.chown(mounts.out, USER, USER)
 
-    def must_end(self, code: int, command: list[str], say: Callable[[str], None]) -> None:
-        """Run a command to its end.
+    def must_end(self, code: int, command: list[str], say: Callable[[str], None], cores: int = 0) -> str:
+        """Run a command to its end, with so many processors if not all; what it told.
 
         Raises:
             Problem: if it ends with another code.
         """
         started_s = time.monotonic()
-        with self._running(command) as process:
+        with self._running(command, cores) as process:
             process.wait(PATIENCE_S)
         say(f"splatpipe {' '.join(command)}: exit code {process.returncode}, {time.monotonic() - started_s:.0f} s.")
         if process.returncode != code:
             raise Problem(f"It has to be {code}.\n{self._told()}")
         if "Traceback" in self._told() or "not writable" in self._told():
             raise Problem(f"It complains:\n{self._told()}")
+        return self._told()
 
     def stop_inside(self, command: list[str], stage: str, done: float) -> End:
         """Run a command and send SIGTERM to it once a stage has done more than so much."""
         before = sum(1 for _ in self._events())
         with self._running(command) as process:
             progress = self._await_progress(process, before, stage, done)
-            subprocess.run(["crun", "kill", self._name, "TERM"], check=True)
+            subprocess.run(["runc", "kill", self._name, "TERM"], check=True)
             sent_s = time.monotonic()
             try:
                 process.wait(DOCKER_KILLS_S)
             except subprocess.TimeoutExpired:
-                subprocess.run(["crun", "kill", self._name, "KILL"], check=True)
+                subprocess.run(["runc", "kill", self._name, "KILL"], check=True)
                 process.wait(PATIENCE_S)
             return End(process.returncode, time.monotonic() - sent_s, progress, self._told())
 
@@ -118,23 +121,26 @@ class Container:
         return (self._bundle / "told.txt").read_text(encoding="utf-8", errors="replace")[-3000:]
 
     @contextmanager
-    def _running(self, command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    def _running(self, command: list[str], cores: int = 0) -> Iterator[subprocess.Popen[bytes]]:
         shutil.rmtree(self._bundle, ignore_errors=True)
         self._bundle.mkdir(parents=True)
-        (self._bundle / "config.json").write_text(json.dumps(self._config(command)), encoding="utf-8")
-        arguments = ["crun", "--cgroup-manager=disabled", "run", "--bundle", str(self._bundle), self._name]
+        (self._bundle / "config.json").write_text(json.dumps(self._config(command, cores)), encoding="utf-8")
+        arguments = ["runc", "run", "--bundle", str(self._bundle), self._name]
         with (self._bundle / "told.txt").open("wb") as told:
             process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=told, stderr=told)
         try:
             yield process
         finally:
             if process.poll() is None:
-                subprocess.run(["crun", "delete", "--force", self._name], check=False)
+                subprocess.run(["runc", "delete", "--force", self._name], check=False)
                 process.wait(PATIENCE_S)
 
-    def _config(self, command: list[str]) -> dict:
-        """As ``docker run --read-only --network none --user 54321:54321 -v photos:/photos:ro -v out:/out``."""
+    def _config(self, command: list[str], cores: int) -> dict:
+        """As ``docker run --read-only --network none --user 54321:54321 --memory 4g -v …:/photos:ro -v …:/out``."""
         kinds = ("pid", "network", "ipc", "uts", "mount")
+        resources: dict = {"memory": {"limit": MEMORY}}
+        if cores:
+            resources["cpu"] = {"quota": cores * PERIOD_US, "period": PERIOD_US}
         return {
             "ociVersion": "1.0.2",
             "process": {
@@ -153,10 +159,11 @@ class Container:
                 _mount("/dev", "tmpfs", "nosuid", "mode=755", "size=65536k"),
                 _mount("/dev/shm", "tmpfs", *DEVICES, "mode=1777", SHM),
                 _mount("/sys", "sysfs", *DEVICES, "ro"),
+                _mount("/sys/fs/cgroup", "cgroup", *DEVICES, "ro"),
                 _mount("/photos", str(self._mounts.photos), "rbind", "ro"),
                 _mount("/out", str(self._mounts.out), "rbind", "rw"),
             ],
-            "linux": {"namespaces": [{"type": kind} for kind in kinds]},
+            "linux": {"namespaces": [{"type": kind} for kind in kinds], "resources": resources},
         }
 
 
