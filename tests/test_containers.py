@@ -1,0 +1,67 @@
+"""The examples for containers and clusters: their commands are ones, their limits hold what the issue asks for."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from splatpipe.demo import capture_path
+
+DOCKER = Path(__file__).resolve().parents[1] / "docker"
+SLURM = DOCKER / "slurm.sh"
+PATIENCE_S = 240.0  # of a busy machine
+REASONS = ("There is no folder", "Name a folder of capture folders", "holds no run", "CUDA does not work here")
+COMMAND = re.compile(r"^ +(?:command|args): \[(.+)\]$", re.MULTILINE)
+
+
+def commands() -> list[list[str]]:
+    """The commands of the compose file and of the Job, with their variables' defaults."""
+    texts = ((DOCKER / name).read_text() for name in ("compose.yaml", "kubernetes-job.yaml"))
+    lists = (re.sub(r"\$\{\w+:-(\w+)\}", r"\1", listed) for text in texts for listed in COMMAND.findall(text))
+    return [[word.strip(' "') for word in listed.split(",")] for listed in lists]
+
+
+@pytest.mark.parametrize("command", commands(), ids=" ".join)
+def test_the_examples_call_splatpipe_as_it_is(tmp_path: Path, command: list[str]) -> None:
+    """Not one is refused for how it is called, though the container's folders are not here."""
+    here = [word.replace("/", f"{tmp_path}/", 1) if word.startswith("/") else word for word in command]
+    started = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *here]
+    done = subprocess.run(started, capture_output=True, text=True, check=False)
+    refused = " ".join(done.stderr.replace("│", " ").split())
+    assert any(reason in refused for reason in REASONS), refused
+
+
+def slurm(tmp_path: Path, *arguments: object) -> subprocess.Popen[str]:
+    """The job's script with this splatpipe on PATH, as Slurm starts it."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "splatpipe").write_text(f'#!/bin/sh\nexec {sys.executable} -m splatpipe.pipeline.app.cli "$@"\n')
+    (programs / "splatpipe").chmod(0o755)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
+    environment |= {"PATH": f"{programs}:{os.environ['PATH']}", "SPLATPIPE_IMAGE": ""}
+    command = ["bash", str(SLURM), *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def test_the_slurm_job_ends_with_the_exit_code_of_its_command(tmp_path: Path) -> None:
+    process = slurm(tmp_path, tmp_path / "none", tmp_path / "out", "--preset", "preview")
+    _, told = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1, told
+    assert "There is no folder" in told
+
+
+def test_the_slurm_job_hands_the_warning_on_and_waits_for_the_end(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    process = slurm(tmp_path, capture_path(), out, "--preset", "preview")
+    until_s = time.monotonic() + PATIENCE_S
+    while not (out / "events.jsonl").exists() and time.monotonic() < until_s and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)  # Slurm's B: the shell alone
+    _, told = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 143, told
+    assert "What was finished is kept" in told, told
