@@ -181,16 +181,13 @@ def test_finished_with_doubts_is_told_in_the_headline(tmp_path: Path) -> None:
 
 
 def test_two_hundred_captures_stay_a_small_page(tmp_path: Path, open_page: Callable) -> None:
-    captures = []
-    for i in range(200):
-        name = f"capture-{i:03}"
-        (tmp_path / name).mkdir()
+    for i in range(4):
         noise = Image.frombytes("RGB", (480, 360), os.urandom(480 * 360 * 3))
-        if i < 4:
-            noise.save(tmp_path / name / "x.jpg", quality=95)
-        else:
-            os.link(tmp_path / f"capture-00{i % 4}" / "x.jpg", tmp_path / name / "x.jpg")
-        captures.append(CaptureState(name, "done", verdict="Finished", level="good", picture=f"{name}/x.jpg"))
+        noise.save(tmp_path / f"{i}.jpg", quality=95)
+    captures = [
+        CaptureState(f"capture-{i:03}", "done", verdict="Finished", level="good", picture=f"{i % 4}.jpg")
+        for i in range(200)
+    ]
     path = tmp_path / "batch.html"
     write_page(batch(*captures), path)
     assert path.stat().st_size < 12_000_000  # of pure noise; of photos a third
