@@ -174,6 +174,13 @@ def test_the_headline_tells_how_it_ended(
     assert "refresh" not in page and "<script>" not in page
 
 
+def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
+    reason = f"{tmp_path}/one/stages/x is gone, and so is /home/somebody/photos/a.jpg."
+    page = batch_page(batch(CaptureState("one", "failed", reason=reason), warnings=(f"{tmp_path} is full.",)), tmp_path)
+    assert "OUT/one/stages/x is gone, and so is a.jpg." in page and "OUT is full." in page
+    assert str(tmp_path.parent) not in page and "somebody" not in page
+
+
 def test_finished_with_doubts_is_told_in_the_headline(tmp_path: Path) -> None:
     captures = (CaptureState("a", "done", level="good"), CaptureState("b", "done", level="doubt"))
     page = batch_page(batch(*captures, ended_s=time.time(), exit_code=0), tmp_path)

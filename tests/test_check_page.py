@@ -281,6 +281,13 @@ def test_the_verdict_is_that_of_the_worst_finding(severities: tuple[str, ...], l
     assert f'<section class="verdict {level}"' in page and f"<h2>{headline}</h2>" in page
 
 
+def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
+    finding = Finding("control", "error", f"{tmp_path}/gcp_list.txt: line 4 is broken.", "See /home/somebody/a.txt.")
+    page = check_page(grid(tmp_path, ["a.jpg", "b.jpg"], findings=(finding,)))
+    assert "PHOTOS/gcp_list.txt: line 4 is broken." in page and "See a.txt." in page
+    assert str(tmp_path.parent) not in page and "somebody" not in page
+
+
 def test_a_folder_without_a_photo_still_has_a_page() -> None:
     page = check_page(grid(Path("/nowhere"), [], components=(), left_out=(LeftOutPhoto("a.jpg", "is no picture"),)))
     assert "There is no photo to work with" in page and "<svg" not in page

@@ -12,6 +12,7 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from splatpipe.pipeline.app.places import Places
 from splatpipe.pipeline.web import asset
 
 SHARED = Path(__file__).resolve().parent / "templates"
@@ -21,12 +22,15 @@ UNPRINTABLE = frozenset(("Cc", "Cs", "Cn", "Co", "Zl", "Zp"))  # categories of U
 REPLACED = "\ufffd"  # stands for what would be invisible, or turn the text around it
 
 
-def page_text(templates: Path, template: str, *, style: str, script: str | None = None, **content: object) -> str:
+def page_text(
+    templates: Path, template: str, places: Places, *, style: str, script: str | None = None, **content: object
+) -> str:
     """A page as one HTML text that needs nothing else.
 
     Args:
         templates: Folder of the template.
         template: Its name; it extends ``page.html.j2``.
+        places: Folders of this machine, which the page is not to tell.
         style: Name of the bundled style.
         script: Name of the bundled script; None for a page without one.
         content: What the template fills in. Everything is escaped that is not markup of our own.
@@ -40,6 +44,7 @@ def page_text(templates: Path, template: str, *, style: str, script: str | None 
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=places.plain_value,
     )
     environment.filters |= {"shown": shown, "told": told}
     code = asset(script).replace("</", "<\\/") if script else ""
@@ -63,6 +68,6 @@ def told(message: object) -> str:
     return shown(" ".join(str(message).split()))
 
 
-def relative_link(path: str) -> str:
+def relative_link(path: str) -> Markup:
     """The address of a file beside a page, whatever its name holds; as long as the path is relative, so is this."""
-    return "./" + quote(os.fsencode(path), safe="/")
+    return Markup("./" + quote(os.fsencode(path), safe="/"))

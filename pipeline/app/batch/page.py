@@ -7,8 +7,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path, PurePosixPath
 
+from markupsafe import Markup
+
 from splatpipe.pipeline.app.batch.state import STALE_S, BatchState, CaptureState, Level, State
 from splatpipe.pipeline.app.page_file import page_text, relative_link, shown
+from splatpipe.pipeline.app.places import Places
 from splatpipe.pipeline.app.report.wording import duration, plural, roughly, size
 from splatpipe.pipeline.app.thumbnails import Thumbnail, thumbnail
 from splatpipe.pipeline.engine.durable import write_durably
@@ -61,7 +64,7 @@ class Card:
     reason: str
     hint: str
     earlier: tuple[str, ...]
-    links: tuple[tuple[str, str], ...]
+    links: tuple[tuple[str, Markup], ...]
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,7 @@ def batch_page(state: BatchState, folder: Path) -> str:
     return page_text(
         TEMPLATES,
         "batch.html.j2",
+        Places.of(folder),
         style="batch.css",
         script="batch.js" if state.at_work else None,
         name=state.name,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from splatpipe.pipeline.app.page_file import page_text, shown
+from splatpipe.pipeline.app.places import Places
 from splatpipe.pipeline.app.preflight.finding_pictures import FindingPicture, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, Severity
 from splatpipe.pipeline.app.preflight.overlap_map import overlap_map
@@ -72,6 +73,7 @@ def check_page(preflight: Preflight) -> str:
     return page_text(
         TEMPLATES,
         "check.html.j2",
+        Places.of(preflight.folder, preflight.folder),
         style="check.css",
         name=preflight.folder.resolve().name or "photos",
         version=importlib.metadata.version("splatpipe"),

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import importlib.metadata
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
-
+from splatpipe.pipeline.app.page_file import page_text
 from splatpipe.pipeline.app.places import Places
 from splatpipe.pipeline.app.report.capturing import capture_chapter, registration_chapter
 from splatpipe.pipeline.app.report.holdings import Holdings
@@ -21,7 +17,6 @@ from splatpipe.pipeline.app.report.placing import placing_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.app.report.wording import count, duration, length, moment, number
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.web import asset
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.geometry import Geometry
@@ -49,7 +44,6 @@ def report_page(holdings: Holdings, *, drawn: bool) -> str:
 
 
 def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> str:
-    script, style = asset("report.js").replace("</", "<\\/"), asset("report.css").replace("</", "<\\/")
     chapters = {
         "capture": _guarded(lambda: capture_chapter(holdings, geometry, drawn=drawn) if _checked(holdings) else None),
         "registration": _guarded(lambda: registration_chapter(holdings, geometry) if _matched(holdings) else None),
@@ -60,15 +54,12 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
         "files": _guarded(lambda: files_chapter(holdings)),
         "said": _guarded(lambda: said_chapter(holdings)),
     }
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=_places(holdings).plain_value,
-    )
-    return environment.get_template("report.html.j2").render(
+    return page_text(
+        TEMPLATES,
+        "report.html.j2",
+        _places(holdings),
+        style="report.css",
+        script="report.js",
         name=holdings.out.resolve().name or str(holdings.out),
         photos_dir="" if holdings.photos_dir is None else holdings.photos_dir.name,
         began=moment(holdings.story.began_s) if holdings.story.began_s else "",
@@ -77,9 +68,6 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
         key_figures=_guarded(lambda: {"cards": _cards(holdings)}),
         drawn=drawn,
         geometry_trouble=trouble,
-        script=Markup(script),
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        style=Markup(style),
         **chapters,
     )
 
