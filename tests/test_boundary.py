@@ -8,16 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatpipe.demo import capture_path
 from splatpipe.demo.geodesy import Origin as DemoOrigin
 from splatpipe.pipeline.app.cli_runs import overrides, with_boundary
+from splatpipe.pipeline.app.preflight.boundary import boundary_findings
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.scan import Candidate
 from splatpipe.pipeline.survey import boundary_file
 from splatpipe.pipeline.survey.boundary import lay_boundary
 from splatpipe.pipeline.survey.boundary_file import crossing_of, read_boundary
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.photo_positions import Position, read_positions
 
 DEMO = DemoOrigin()
 WORLD_FROM_MODEL = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))
@@ -237,7 +243,7 @@ def test_a_few_points_inside_are_told(tmp_path: Path) -> None:
 def test_a_boundary_elsewhere_is_refused_with_the_way_to_it(
     tmp_path: Path, offset: tuple[float, float], told: str
 ) -> None:
-    with pytest.raises(SplatpipeError, match="Nothing of the model lies inside") as caught:
+    with pytest.raises(SplatpipeError, match="Nothing of the capture lies inside") as caught:
         laid(tmp_path, polygon(metres, OUTLINE + np.array(offset)))
     assert told in caught.value.message and "UTM zone 33N" in caught.value.hint
     assert "georef.boundary=none" in caught.value.hint
@@ -245,7 +251,7 @@ def test_a_boundary_elsewhere_is_refused_with_the_way_to_it(
 
 def test_swapped_coordinates_are_recognised(tmp_path: Path) -> None:
     swapped = {"type": "Polygon", "coordinates": [[[y, x] for x, y in degrees(OUTLINE)]]}
-    with pytest.raises(SplatpipeError, match="Nothing of the model") as caught:
+    with pytest.raises(SplatpipeError, match="Nothing of the capture") as caught:
         laid(tmp_path, swapped)
     assert "swapped" in caught.value.hint
 
@@ -275,6 +281,30 @@ def test_the_command_lines_file_is_the_option_and_set_has_the_last_word() -> Non
     assert resolved([], None) == "auto"
     assert resolved(["train.seed=3"], "site plan = 2.geojson") == "site plan = 2.geojson"
     assert resolved(["georef.boundary=none"], "site.geojson") == "none"
+
+
+@pytest.fixture(scope="module")
+def stated() -> tuple[Position, ...]:
+    """What some photos of the demo state of their places."""
+    names = [f"DJI_00{number:02d}.JPG" for number in (1, 8, 16, 24)]
+    checked = [check_photo(Candidate(name, capture_path() / name), Limits(320, 10**8)) for name in names]
+    return read_positions([photo for photo in checked if isinstance(photo, CheckedPhoto)]).positions
+
+
+def test_the_preflight_tells_what_a_run_would_stumble_over(tmp_path: Path, stated: tuple[Position, ...]) -> None:
+    def told(value: Any, positions: tuple[Position, ...] = stated, controlled: bool = False) -> list[tuple[str, str]]:
+        found = boundary_findings(written(tmp_path, value), GeorefConfig(), positions, controlled)
+        assert all(finding.hint for finding in found)
+        return [(finding.code, finding.message) for finding in found]
+
+    assert len(stated) == 4
+    assert told(polygon(degrees, OUTLINE)) == told(polygon(metres, OUTLINE)) == []
+    assert told(polygon(degrees, 1000.0 * OUTLINE)) == []  # around all of it
+    assert "9.0 km north" in told(polygon(degrees, np.add(OUTLINE, (0.0, 9000.0))))[0][1]
+    assert "no GeoJSON" in told("{")[0][1]
+    assert told(polygon(degrees, OUTLINE[[0, 2, 1, 3]]))[0][0] == "boundary-crossing"
+    assert "without positions" in told(polygon(degrees, OUTLINE), ())[0][1]
+    assert told(polygon(degrees, OUTLINE), (), controlled=True) == []
 
 
 def test_any_datum_finds_the_same_ground(tmp_path: Path) -> None:

@@ -85,12 +85,7 @@ def placed(drawing: Drawing, frame: Frame, points: Float64[np.ndarray, "n 3"]) -
     Raises:
         SplatpipeError: if the frame lies nowhere, the CRS cannot be used there, or no point lies inside.
     """
-    if frame.origin is None:
-        raise SplatpipeError(
-            f"The boundary {drawing.name} cannot be laid onto a model without coordinates: {frame.note}".rstrip("."),
-            f"Give the photos' positions (geo.txt) or control points. {WITHOUT}",
-        )
-    text = drawing.crs or _crs_of(drawing, frame)
+    text = _crs_of(drawing, frame)
     area, degrees = _in_world(drawing, text, frame, swapped=False)
     inside = area.contains(points)
     if not inside.any():
@@ -98,8 +93,24 @@ def placed(drawing: Drawing, frame: Frame, points: Float64[np.ndarray, "n 3"]) -
     return Boundary(area, degrees, float(inside.mean()))
 
 
+def placed_area(drawing: Drawing, frame: Frame) -> PlanArea:
+    """The polygons in the world frame, wherever they lie.
+
+    Raises:
+        SplatpipeError: as ``placed``, but for what lies inside.
+    """
+    return _in_world(drawing, _crs_of(drawing, frame), frame, swapped=False)[0]
+
+
 def _crs_of(drawing: Drawing, frame: Frame) -> str:
-    """The CRS of a file that names none: WGS 84 by RFC 7946, or the run's where the numbers are no degrees."""
+    """What a file names, or WGS 84 by RFC 7946, or the run's CRS where the numbers are no degrees."""
+    if frame.origin is None:
+        raise SplatpipeError(
+            f"The boundary {drawing.name} cannot be laid onto a model without coordinates: {frame.note}".rstrip("."),
+            f"Give the photos' positions (geo.txt) or control points. {WITHOUT}",
+        )
+    if drawing.crs:
+        return drawing.crs
     rings = [ring for polygon in drawing.polygons for ring in polygon]
     if all((np.abs(ring) <= LARGEST_DEGREES).all() for ring in rings):
         return WGS84
@@ -147,7 +158,7 @@ def _elsewhere(
         pass
     told = f"{away / 1000.0:,.1f} km" if away >= 1000.0 else f"{away:.0f} m"
     return SplatpipeError(
-        f"Nothing of the model lies inside the boundary {drawing.name}, {told} {direction} of its middle.", hint
+        f"Nothing of the capture lies inside the boundary {drawing.name}, {told} {direction} of its middle.", hint
     )
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.app.preflight.boundary import boundary_findings
 from splatpipe.pipeline.app.preflight.findings import (
     ControlPlace,
     Finding,
@@ -94,6 +95,9 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     look = look_at(intake, threads, report)
     control, told = _control(source, config, intake)
     findings += [*look.findings, *focal_findings(intake), *told]
+    if (boundary := source.part_path("source.boundary")).is_file():
+        controlled = source.part_path("source.control").is_file()
+        findings += boundary_findings(boundary, config.georef, intake.positions.positions, controlled)
     forecasts, machine = forecast_presets(intake, configs, threads)
     return Preflight(
         folder=source.folder,

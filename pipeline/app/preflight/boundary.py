@@ -1,0 +1,60 @@
+"""A boundary held against the photos before a run: broken, without coordinates to lay it by, or somewhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from splatpipe.pipeline.app.preflight.findings import Finding
+from splatpipe.pipeline.app.preflight.places import LEAST_REACH_M
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.survey.boundary import placed, placed_area
+from splatpipe.pipeline.survey.boundary_file import read_boundary
+from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.survey.photo_positions import Position
+from splatpipe.pipeline.survey.world import in_crs
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.survey.options import GeorefConfig
+
+
+def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Position], controlled: bool) -> list[Finding]:
+    """Read the boundary as a run does, and hold it against where the photos were taken.
+
+    Args:
+        path: The file.
+        config: Of the run that would follow.
+        stated: The photos' positions.
+        controlled: Whether there is a control file, which places a model whose photos have no positions.
+    """
+    try:
+        drawing = read_boundary(path)
+        findings = []
+        if drawing.crossing:
+            x, y = drawing.crossing
+            text = f"The boundary {path.name} crosses itself near {x:.10g}, {y:.10g}."
+            findings.append(Finding("boundary-crossing", "warning", text, "Draw it without crossings."))
+        if not stated:
+            return [*findings, *([] if controlled else [_unplaced(path.name)])]
+        geodetic = np.array([[each.latitude, each.longitude, each.altitude_m] for each in stated], dtype=np.float64)
+        origin = Origin(*np.median(np.nan_to_num(geodetic), axis=0).tolist())
+        frame = in_crs(Frame("enu", Similarity.identity(), origin), config.crs, "", config.approximate_crs)
+        cameras = origin.enu_from_geodetic(np.nan_to_num(geodetic))
+        area = placed_area(drawing, frame)
+        vertices = np.concatenate([ring for polygon in area.polygons for ring in polygon])
+        wide = float(np.linalg.norm(np.ptp(cameras[:, :2], axis=0)))
+        apart = min(float(np.linalg.norm(vertices - camera, axis=1).min()) for camera in cameras[:, :2])
+        if apart > max(wide, LEAST_REACH_M):  # farther from all photos than the flight is wide
+            placed(drawing, frame, cameras)  # says where it is, unless it is around all of them
+    except SplatpipeError as error:
+        return [Finding("boundary-broken", "error", error.message, error.hint)]
+    return findings
+
+
+def _unplaced(name: str) -> Finding:
+    text = f"The boundary {name} cannot be laid onto photos without positions."
+    return Finding("boundary-broken", "error", text, "Give positions (geo.txt) or control points, or run without it.")
