@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -92,7 +93,8 @@ class Account:
         done = {each.stage for each in tries if each.succeeded}
         rest = [job for job in planned.jobs if job.stage not in done]
         if planned.jobs[-1].stage in done:
-            return CaptureState(planned.name, "done", progress=1.0, tries=1, earlier=_reasons(tries))
+            most = max(Counter(each.stage for each in tries).values())
+            return CaptureState(planned.name, "done", progress=1.0, tries=most, earlier=_reasons(tries))
         stage = rest[0].stage
         own = [each for each in tries if each.stage == stage]
         told = CaptureState(planned.name, "waiting", stage, tries=len(own), earlier=_reasons(tries))

@@ -31,7 +31,7 @@ class CaptureState:
         level: How good that is; empty while there is none.
         reason: Why it failed or was stopped, one sentence; empty else.
         hint: What to do about it.
-        tries: How often the stage was begun in this batch, at least 1 where it ran.
+        tries: How often the stage was begun in this batch; once all are done, the one that was begun most often.
         earlier: Why earlier tries ended, with their stages, also where a later one went well.
         seconds: That its stages took together, by their manifests, with what runs now.
         left_s: About what it still takes once it runs, by the forecast; None where nothing tells.

@@ -1,0 +1,292 @@
+"""A night of captures on Snakemake: each in its right state, nothing done twice, nothing left behind, never a lie."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from splatpipe.demo import capture_path
+from splatpipe.pipeline.app.batch.account import Account
+from splatpipe.pipeline.app.batch.driver import fresh_call
+from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
+from splatpipe.pipeline.app.batch.snakemake_process import open_profile, snakemake_command
+from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
+from splatpipe.pipeline.app.batch.tries import NO_WORD, Ending, TryLog
+from splatpipe.pipeline.app.batch.workflow import workflow_text
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE
+from splatpipe.stages.line import LINE
+
+SLOW = ("--until", "features", "--set", "features.extractor=sift")
+PATIENCE_S = 120.0  # for what a busy machine does in a second
+
+
+def command(captures: Path, out: Path, *more: str) -> list[str]:
+    return [sys.executable, "-m", "splatpipe.pipeline.app.cli", "batch", str(captures), str(out), *more, "--json"]
+
+
+def batch(captures: Path, out: Path, *more: str) -> dict[str, object]:
+    done = subprocess.run(command(captures, out, *more), capture_output=True, text=True, check=False)
+    told: dict[str, object] = json.loads(done.stdout)
+    assert done.returncode == told["exit_code"], done.stderr
+    return told
+
+
+def states(told: dict[str, object]) -> dict[str, str]:
+    return {capture["name"]: capture["state"] for capture in told["captures"]}  # type: ignore[index,attr-defined]
+
+
+def link(folder: Path, photos: Iterable[Path]) -> Path:
+    folder.mkdir(parents=True)
+    for photo in photos:
+        (folder / photo.name).symlink_to(photo)
+    return folder
+
+
+def demo() -> list[Path]:
+    return sorted(capture_path().glob("*.JPG"))
+
+
+def events(out: Path) -> dict[str, bytes]:
+    return {path.parent.name: path.read_bytes() for path in out.glob("*/events.jsonl")}
+
+
+def test_what_fails_stops_no_other_and_what_is_finished_is_not_touched(tmp_path: Path) -> None:
+    """One broken, one of wrong options, one without a folder; the same again; one added, one changed, one gone."""
+    captures, out = tmp_path / "captures", tmp_path / "out"
+    link(captures / "house", demo()[:2])
+    broken = link(captures / "broken", [])
+    for photo in demo()[:2]:
+        (broken / photo.name).write_bytes(photo.read_bytes()[:9000])
+    listed = tmp_path / "night.csv"
+    rows = ["name,photos,train.iterations", "house,captures/house,", "broken,captures/broken,"]
+    listed.write_text("\n".join([*rows, "wrong,captures/house,-5", "nowhere,captures/none,"]))
+    notice = 'echo "$SPLATPIPE_STATE $SPLATPIPE_CAPTURE" >> notices'
+    night = ("--until", "ingest", "--retries", "3", "--notify", notice)
+    os.chdir(tmp_path)
+
+    told = batch(listed, out, *night)
+    bad = dict.fromkeys(("broken", "wrong", "nowhere"), "failed")
+    assert states(told) == {"house": "done", **bad} and told["exit_code"] == 1
+    of = {capture["name"]: capture for capture in told["captures"]}  # type: ignore[attr-defined]
+    assert "cut off" in of["broken"]["reason"] and of["broken"]["hint"] and of["broken"]["tries"] == 1
+    assert "train.iterations" in of["wrong"]["reason"] and "There is no folder" in of["nowhere"]["reason"]
+    assert json.loads((out / "batch.json").read_text())["captures"] == told["captures"]
+    table = {row["capture"]: row for row in csv.DictReader((out / "batch.csv").read_text().splitlines())}
+    assert {name: row["state"] for name, row in table.items()} == states(told)
+    assert "broken" in (out / "batch.html").read_text()
+    notices = ["done house", "failed broken", "failed nowhere", "failed out", "failed wrong"]
+    assert sorted((tmp_path / "notices").read_text().splitlines()) == notices
+    assert (out / "notices").exists() is False
+
+    before = events(out)
+    told = batch(listed, out, *night)
+    assert states(told) == {"house": "reused", **bad} and told["exit_code"] == 1
+    assert events(out) == before and not list((out / ".batch" / "call").glob("tries/*"))
+    assert not (out / ".batch" / "call" / "Snakefile").exists()  # Snakemake was not even started
+
+    link(captures / "barn", demo()[5:7])
+    (captures / "house" / demo()[9].name).symlink_to(demo()[9])
+    listed.write_text("\n".join([*rows[:2], "barn,captures/barn,"]))
+    told = batch(listed, out, *night)
+    assert states(told) == {"house": "done", "barn": "done"} and told["exit_code"] == 0
+    assert told["unlisted"] == ["broken"] and events(out)["broken"] == before["broken"]
+
+
+def descendants(process: int) -> dict[int, str]:
+    """Command lines of all that came from a process, by their numbers."""
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+        except (OSError, IndexError):
+            continue
+    found, front = {}, [process]
+    while front:
+        front = [child for child, parent in parents.items() if parent in front]
+        found.update({child: words(child) for child in front})
+    return found
+
+
+def words(process: int) -> str:
+    try:
+        return Path(f"/proc/{process}/cmdline").read_text().replace("\0", " ")
+    except OSError:
+        return ""
+
+
+def alive(processes: dict[int, str]) -> list[str]:
+    return [told for process, told in processes.items() if words(process) == told]
+
+
+def worker_of(running: subprocess.Popen[str], out: Path, but: int = 0) -> int:
+    """Waits until the stage features runs; the number of the process that runs it."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        assert running.poll() is None
+        if b'"stage_started", "stage": "features"' in events(out).get("house", b""):
+            for child, told in descendants(running.pid).items():
+                if "engine.worker" in told and child != but:
+                    return child
+        time.sleep(0.02)
+    raise AssertionError("features never ran")
+
+
+def test_a_killed_stage_is_begun_again_and_ctrl_c_ends_all_in_order(tmp_path: Path) -> None:
+    link(tmp_path / "captures" / "house", demo()[:3])
+    out = tmp_path / "out"
+    with subprocess.Popen(command(tmp_path / "captures", out, *SLOW), stdout=subprocess.PIPE, text=True) as running:
+        first = worker_of(running, out)
+        os.kill(first, signal.SIGKILL)
+        worker_of(running, out, but=first)
+        others = descendants(running.pid)
+        running.send_signal(signal.SIGINT)
+        told = json.loads(running.communicate()[0])
+    assert alive(others) == []
+    assert running.returncode == told["exit_code"] == 130
+    filed = json.loads((out / "batch.json").read_text())
+    (house,) = filed["captures"]
+    assert (house["state"], house["stage"], house["tries"], filed["at_work"]) == ("stopped", "features", 2, False)
+    assert "features: The stage features died of SIGKILL" in house["earlier"][0]
+
+
+def test_a_batch_that_is_killed_leaves_nothing_at_work_and_no_lie(tmp_path: Path) -> None:
+    link(tmp_path / "captures" / "house", demo()[:3])
+    out = tmp_path / "out"
+    with subprocess.Popen(command(tmp_path / "captures", out, *SLOW), stdout=subprocess.PIPE, text=True) as running:
+        worker_of(running, out)
+        others = descendants(running.pid)
+        assert json.loads((out / "batch.json").read_text())["at_work"]
+        running.kill()
+    deadline = time.monotonic() + PATIENCE_S
+    while alive(others) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert alive(others) == []
+    told = json.loads((out / "batch.json").read_text())
+    assert states(told) == {"house": "stopped"} and not told["at_work"] and "killed" in told["message"]
+    assert states(batch(tmp_path / "captures", out, "--until", "ingest")) == {"house": "reused"}
+
+
+def job(stage: str, threads: int = 2) -> StageJob:
+    return StageJob(stage, threads, 900_000_000, 120.0, 50_000_000)
+
+
+def planned(name: str, *stages: str) -> PlannedCapture:
+    return PlannedCapture(
+        name, f"0001-{name}", "/photos", "preview", tuple(map(job, stages)), {"ingest": 1.0, "train": 3.0}
+    )
+
+
+def call_of(out: Path, *captures: PlannedCapture, retries: int = 1) -> Call:
+    call = fresh_call(out)
+    call.write_plan(Plan(str(out), time.time(), captures, retries=retries))
+    return call
+
+
+BAD = Ending(EXIT_STAGE, "The stage train died.", "See the log.")
+HOPELESS = Ending(EXIT_INPUT, "No two photos overlap.", "Fly again.", final=True)
+FULL = Ending(EXIT_MACHINE, "The disk is full.", "Make room.")
+
+
+@pytest.mark.parametrize(
+    ("tries", "ended", "expected"),
+    [
+        ([], False, ("waiting", "ingest", 0.0, 0, "")),
+        ([], True, ("stopped", "ingest", 0.0, 0, "It was stopped with the batch.")),
+        ([("ingest", Ending(0))], False, ("waiting", "train", 0.25, 0, "")),
+        ([("ingest", Ending(0)), ("train", None)], False, ("running", "train", 0.25, 1, "")),
+        ([("ingest", Ending(0)), ("train", BAD)], False, ("waiting", "train", 0.25, 1, "")),
+        ([("ingest", Ending(0)), ("train", BAD), ("train", FULL)], False, ("failed", "train", 0.25, 2, FULL.message)),
+        ([("ingest", HOPELESS)], False, ("failed", "ingest", 0.0, 1, HOPELESS.message)),
+        ([("ingest", Ending(0)), ("train", BAD), ("train", Ending(0))], True, ("done", "", 1.0, 2, "")),
+    ],
+)
+def test_a_captures_state_follows_from_its_tries_alone(
+    tmp_path: Path, tries: Sequence[tuple[str, Ending | None]], ended: bool, expected: tuple[object, ...]
+) -> None:
+    call = call_of(tmp_path, planned("house", "ingest", "train"))
+    log = TryLog(call.tries_file("0001-house"))
+    for stage, ending in tries:
+        log.begin(stage)
+        if ending is not None:
+            log.end(ending)
+    if tries:
+        with call.tries_file("0001-house").open("ab") as file:
+            file.write(b'{"ended": {"exit_c')  # as a power cut leaves it
+    if ended:
+        call.write_end(time.time(), 0, "")
+    (house,) = Account(call).state().captures
+    assert (house.state, house.stage, house.progress, house.tries, house.reason) == expected
+    assert house.earlier == (("train: The stage train died.",) if ("train", BAD) in tries else ())
+
+
+def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
+    call = call_of(tmp_path, planned("house", "ingest", "train"), retries=0)
+    log = TryLog(call.tries_file("0001-house"))
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    begun = log.begin("ingest")
+    call.tries_file("0001-house").write_text(json.dumps({"begun": {**vars(begun), "process": process.pid}}) + "\n")
+    (house,) = Account(call).state().captures
+    assert (house.state, house.reason) == ("failed", NO_WORD)
+
+
+def run_job(call: Call, stage: str) -> int:
+    words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder), "0001-house", stage, "1"]
+    return subprocess.run([*words, str(call.folder / "marker")], check=False).returncode
+
+
+def test_a_job_without_room_does_not_begin_and_a_hopeless_one_is_not_begun_again(tmp_path: Path) -> None:
+    large = replace(planned("house"), jobs=(replace(job("ingest"), disk_bytes=10**18),))
+    call = call_of(tmp_path, large, retries=5)
+    assert run_job(call, "ingest") == run_job(call, "ingest") == EXIT_MACHINE
+    (house,) = Account(call).state().captures
+    assert (house.state, house.tries) == ("failed", 1) and "GB free" in house.reason
+    assert not (tmp_path / "house").exists() and not (call.folder / "marker").exists()
+    assert any("does not begin" in said for said in call_warnings(call, large))
+    call.stop_file.touch()
+    assert run_job(call, "ingest") == 143
+
+
+def call_warnings(call: Call, capture: PlannedCapture) -> tuple[str, ...]:
+    """Before anything has run."""
+    call.tries_file(capture.key).unlink()
+    return Account(call).state().warnings
+
+
+def test_the_workflow_has_a_rule_for_each_stage_that_runs_and_asks_for_what_it_needs(tmp_path: Path) -> None:
+    call = call_of(tmp_path / "a b{c}", planned("house", "georef", "train"), replace(planned("barn"), key="0002-barn"))
+    text = workflow_text(call, replace(call.plan(), device="cuda"), LINE)
+    assert [line for line in text.splitlines() if line.startswith("rule ")] == [
+        "rule all:",
+        "rule georef:",
+        "rule train:",
+    ]
+    assert text.count("gpu=1") == 1 and "0002-barn" not in text
+    assert '"train": [2, 900, 21, 50]' in text
+    assert "gpu" not in workflow_text(call, call.plan(), LINE)
+
+
+def test_a_profile_decides_where_jobs_run_and_without_one_memory_does(tmp_path: Path) -> None:
+    call = call_of(tmp_path, planned("house", "train"))
+    alone = snakemake_command(call, call.plan(), open_profile(None))
+    assert "--resources" in alone and any(word.startswith("mem_mb=") for word in alone)
+    for name in ("slurm", "kubernetes"):
+        profile = open_profile(Path(__file__).parents[1] / "configs" / "batch" / name)
+        elsewhere = snakemake_command(call, call.plan(), profile)
+        assert not profile.local and "--resources" not in elsewhere
+        assert elsewhere[elsewhere.index("--cores") + 1] == "2"  # no job gets more
+
+
+def test_a_cell_of_the_table_is_never_a_formula() -> None:
+    state = BatchState("night", (CaptureState("=1+1", reason="@SUM(A1)"),), as_of_s=0.0, began_s=0.0)
+    (row,) = csv.DictReader(table_text(state).splitlines())
+    assert tuple(row) == COLUMNS and row["capture"] == "'=1+1" and row["reason"] == "'@SUM(A1)"
