@@ -79,7 +79,8 @@ def batch(
         tables = tuple(with_files_from(Path.cwd(), table) for table in overrides(config, assignments, None).tables)
         if where.local:  # what the machine or the options lack is told now
             request_of(captures, out, overrides(config, assignments, None).resolve(load_preset(preset)), device)
-        settings = Settings(preset, tables, until or "", device, threads, retries, retry_failed, where.local)
+        gpu = _uses_gpu(device, where)
+        settings = Settings(preset, tables, until or "", device, gpu, threads, retries, retry_failed, where.local)
         if dry_run:
             code = _dry_run(captures, out, settings, where)
         else:
@@ -93,6 +94,15 @@ def batch(
         _print(out, state, code, None)
     if code:
         raise typer.Exit(code)
+
+
+def _uses_gpu(device: str, profile: Profile) -> bool:
+    """Of another machine only who names it asks for one: a cluster without would never begin the job."""
+    if device != "auto" or not profile.local:
+        return device == "cuda"
+    from splatpipe.pipeline.raster.cuda_library import why_not
+
+    return why_not() is None
 
 
 def _run(captures: Path, out: Path, settings: Settings, profile: Profile, command: str) -> BatchState:

@@ -72,6 +72,7 @@ class Plan:
         captures: In the order of the list.
         until: The last stage; empty for the whole line.
         device: As the command was given it.
+        gpu: Whether the stages that can use a GPU get one.
         retries: How often a stage that died is begun again.
         local: Whether the jobs run on this machine, and not where a profile sends them.
         warnings: What was noticed before.
@@ -83,6 +84,7 @@ class Plan:
     captures: tuple[PlannedCapture, ...]
     until: str = ""
     device: str = "auto"
+    gpu: bool = False
     retries: int = 0
     local: bool = True
     warnings: tuple[str, ...] = ()

@@ -27,7 +27,8 @@ from splatpipe.pipeline.engine.runner import Line, Standing, survey
 from splatpipe.pipeline.engine.session import Request, survey_line
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.store import Part, is_copy
-from splatpipe.stages.forecast import CaptureSize, forecast, machine_speed
+from splatpipe.stages.forecast import forecast, machine_speed
+from splatpipe.stages.work import CaptureSize
 
 SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly alike
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
@@ -45,6 +46,7 @@ class Settings:
         tables: Options, below a capture's own.
         until: The last stage; empty for the whole line.
         device: ``auto``, ``cpu`` or ``cuda``.
+        gpu: Whether the stages that can use a GPU get one.
         threads: Of a job; 0 to divide the machine.
         retries: How often a stage that died is begun again.
         retry_failed: Try again what failed for its photos or options, too, though nothing changed.
@@ -55,6 +57,7 @@ class Settings:
     tables: tuple[Table, ...] = ()
     until: str = ""
     device: str = "auto"
+    gpu: bool = False
     threads: int = 0
     retries: int = 0
     retry_failed: bool = False
@@ -92,7 +95,16 @@ def make_plan(captures: Sequence[Capture], call: Call, settings: Settings) -> Pl
     ]
     threads = settings.threads or _threads(outlooks, local=settings.local)
     planned = tuple(_with_jobs(outlook, threads) for outlook in outlooks)
-    return Plan(str(call.out), began_s, planned, settings.until, settings.device, settings.retries, settings.local)
+    return Plan(
+        out=str(call.out),
+        began_s=began_s,
+        captures=planned,
+        until=settings.until,
+        device=settings.device,
+        gpu=settings.gpu,
+        retries=settings.retries,
+        local=settings.local,
+    )
 
 
 def _slug(name: str) -> str:
@@ -179,18 +191,21 @@ def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
 
     from splatpipe.pipeline.photos.exif import read_exif
 
-    sizes, placed = [], has_file
+    sizes, placed = [], 0
     step = max(1, len(paths) // SAMPLED)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of odd tags; what is wrong with a photo is told by the run
         for path in sorted(paths)[::step][:SAMPLED]:
             try:
                 with Image.open(path) as picture:
-                    sizes.append(picture.width * picture.height / 1e6)
-                    placed = placed or read_exif(picture).gps is not None
+                    sizes.append(picture.size)
+                    placed += read_exif(picture).gps is not None
             except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
                 continue
-    return CaptureSize(len(paths), median(sizes) if sizes else 0.0, placed)
+    megapixels = median(width * height for width, height in sizes) / 1e6 if sizes else 0.0
+    shapes = [min(size) / max(size) for size in sizes]
+    positions = has_file or 2 * placed > len(sizes)
+    return CaptureSize(len(paths), megapixels, positions, *([median(shapes)] if shapes else []))
 
 
 def _threads(outlooks: Sequence[_Outlook], *, local: bool) -> int:

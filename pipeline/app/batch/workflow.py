@@ -81,9 +81,7 @@ def workflow_text(call: Call, plan: Plan, stages: Sequence[Stage]) -> str:
     rules = [
         # Broken photos are told first; then what is nearest to its end goes first, so that captures are finished one
         # after the other and not all in the morning.
-        _RULE.format(
-            done=done, stage=stage.name, priority=place or len(stages), job=job, gpu=_gpu(stage.name, plan.device)
-        )
+        _RULE.format(done=done, stage=stage.name, priority=place or len(stages), job=job, gpu=_gpu(stage.name, plan))
         for place, stage in enumerate(stages)
         if stage.name in wanted
     ]
@@ -96,9 +94,8 @@ def _resources(threads: int, memory_bytes: int, seconds: float, disk_bytes: int)
     return [threads, max(1, memory_bytes // MEGABYTE), minutes, max(1, disk_bytes // MEGABYTE)]
 
 
-def _gpu(stage: str, device: str) -> str:
-    """A GPU is asked for only where the user asks for one: a cluster without would never begin the job."""
-    return "        gpu=1,\n" if device == "cuda" and stage in GPU_STAGES else ""
+def _gpu(stage: str, plan: Plan) -> str:
+    return "        gpu=1,\n" if plan.gpu and stage in GPU_STAGES else ""
 
 
 def write_workflow(call: Call, plan: Plan, stages: Sequence[Stage]) -> Path:
