@@ -15,7 +15,7 @@ from playwright.sync_api import expect
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.preflight.coverage import CELLS, STEPS, covered, shades
-from splatpipe.pipeline.app.preflight.finding_pictures import MOST_A_FINDING, MOST_PICTURES
+from splatpipe.pipeline.app.preflight.finding_pictures import MOST_A_FINDING, MOST_PICTURES, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import (
     ControlPlace,
     Finding,
@@ -29,7 +29,7 @@ from splatpipe.pipeline.app.preflight.findings import (
     worst_first,
 )
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, frame_of
-from splatpipe.pipeline.app.preflight.overlap_map import MOST_PAIRS
+from splatpipe.pipeline.app.preflight.overlap_map import MOST_PAIRS, Labels
 from splatpipe.pipeline.app.preflight.page import check_page, write_page
 
 WIDTHS = ((1440, 900), (390, 844))
@@ -263,6 +263,30 @@ def test_two_thousand_photos_stay_a_page_that_opens(tmp_path: Path, open_page: C
     assert drawn.count("M") == MOST_PAIRS
     ends = {end for line in drawn.split("M")[1:] for end in line.split("L")}
     assert len(ends) == 2000  # no photo loses all its lines
+
+
+def test_a_finding_of_the_whole_capture_is_shown_by_photos_too(demo_names: list[str]) -> None:
+    findings = (
+        Finding("orphan", "warning", "1 of 40 photos matches no other one."),
+        Finding("gap", "warning", f"Photos are missing between {demo_names[4]} and {demo_names[5]}: 80 m apart."),
+        Finding("blurred", "warning", "All photos are dull."),
+        Finding("nadir-only", "warning", "All photos look straight down."),
+    )
+    preflight = grid(capture_path(), demo_names, findings=findings)
+    photos = tuple(replace(it, sharpness=0.5 + 0.01 * i) for i, it in enumerate(preflight.photos))
+    shown = [
+        [it.name for it in pictures if not it.beside]
+        for pictures in finding_pictures(replace(preflight, photos=photos))
+    ]
+    assert shown == [demo_names[-1:], demo_names[4:6], demo_names[:3], []]
+
+
+def test_names_on_the_map_do_not_cover_each_other() -> None:
+    labels = Labels()
+    assert labels.room(100, 100, "P01", "start") == "everywhere"
+    assert labels.room(110, 105, "P02", "start") == ""
+    assert labels.room(100, 145, "P03", "start") == "wide"  # where letters are larger there is none
+    assert labels.room(100, 300, "P04", "end") == "everywhere"
 
 
 @pytest.mark.parametrize(

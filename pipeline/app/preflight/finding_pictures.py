@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ MOST_A_FINDING = 8
 MOST_PICTURES = 40  # on the page: below a megabyte, and a second or two of decoding
 MOST_CUTS = 8  # of these cut-outs, for which a photo is decoded whole
 CLOSE = ("blurred",)  # findings whose photos are shown pixel by pixel
+EXAMPLES = 3  # of photos that are dull throughout
 SHARP = 0.9  # a neighbour to compare with is as sharp as the others, or nearly
 
 
@@ -46,12 +48,13 @@ def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
     every = []
     for finding in preflight.findings:
         pictures: list[FindingPicture] = []
-        for name in finding.photos[: min(MOST_A_FINDING, left)]:
+        names = finding.photos or _examples(preflight, finding)
+        for name in names[: min(MOST_A_FINDING, left)]:
             close = finding.code in CLOSE and cuts > 0
             cuts -= close
             pictures.append(_pictured(root, name, finding, photos.get(name), close=close))
         if finding.code in CLOSE and pictures and cuts > 0:
-            other = _sharp_neighbour(preflight, finding.photos[0])
+            other = _sharp_neighbour(preflight, names[0])
             if other is not None:
                 cuts -= 1
                 pictures.insert(1, _pictured(root, other.name, finding, other, close=True, beside=True))
@@ -73,6 +76,19 @@ def facts_in_words(finding: Finding, photo: PhotoFacts | None) -> str:
     if any(word in finding.code for word in ("size", "camera", "resized", "focal")):
         return f"{photo.width:,} × {photo.height:,} pixels"
     return ""
+
+
+def _examples(preflight: Preflight, finding: Finding) -> tuple[str, ...]:
+    """Photos that show what a finding of the whole capture is about: the worst of them, or those that it names."""
+    photos = preflight.photos
+    if finding.code == "orphan":
+        return tuple(photos[i].name for i in preflight.orphans)
+    if finding.code in CLOSE:
+        known = [photo for photo in photos if photo.sharpness is not None]
+        return tuple(photo.name for photo in sorted(known, key=lambda photo: photo.sharpness or 0.0)[:EXAMPLES])
+    names = {photo.name for photo in photos}
+    words = dict.fromkeys(word.strip("()") for word in re.split(r"[\s,;:]+", finding.message))
+    return tuple(word for word in (each if each in names else each.rstrip(".") for each in words) if word in names)
 
 
 def _pictured(

@@ -11,7 +11,7 @@ from splatpipe.pipeline.app.preflight.findings import Place, Preflight
 WIDTH = 2000  # of the drawing, in its own units: whole numbers are fine enough, and short
 NARROWEST, HIGHEST = 0.4, 1.0  # height over width
 MARGIN = 0.06  # of the longer side, around what is shown
-REACH = 0.5  # of the photos' span: footprints of slanting views and points that lie further out are cut off
+REACH = 0.3  # of the photos' span: footprints of slanting views and points that lie further out are cut off
 LEAST_SPAN_M = 10.0  # a capture from one spot still has a map
 SCALE_SHARE = 0.25  # of the width, that the scale's bar takes at most
 

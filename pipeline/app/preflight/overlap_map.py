@@ -19,12 +19,13 @@ from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
 from splatpipe.pipeline.app.report.wording import count, length, plural
 
 MOST_PAIRS = 5_000  # lines; of more, those come first that hold photos which few others hold
-STRENGTHS = ((0, "weak"), (40, "fair"), (120, "strong"))  # from so many matches on
+STRENGTHS = ((0, "weak"), (25, "fair"), (80, "strong"))  # from so many matches on
 CLEAR_PAIRS = 120  # lines that may be drawn in full; more of them are fainter, so that what is below shows through
 FAINTEST = 0.25
 MANY = 400  # photos, whose dots are smaller
 MOST_NAMED = 40  # control points with their names on the map
 RADIUS, MIDDLE = 880, 1000  # of the ring
+LETTERS = {"wide": 34, "everywhere": 60}  # height of letters in the drawing's units: as in the style, and on a phone
 LONGEST_TITLE = 120  # characters of a name that a pointer is told
 
 
@@ -43,6 +44,28 @@ class Drawing:
     kind: str
     layers: tuple[tuple[str, str], ...]
     unplaced: int
+
+
+class Labels:
+    """The names on a map, none upon another: on a phone, whose letters are larger against the map, fewer of them."""
+
+    def __init__(self) -> None:
+        self._taken: dict[int, list[tuple[float, float, float, float]]] = {size: [] for size in LETTERS.values()}
+
+    def room(self, x: int, y: int, text: str, side: str) -> str:
+        """Where there is room for a name at a place: ``everywhere``, on ``wide`` screens; empty where there is none."""
+        free = [name for name, size in LETTERS.items() if self._take(x, y, text, side, size)]
+        return "everywhere" if "everywhere" in free else "wide" if free else ""
+
+    def _take(self, x: int, y: int, text: str, side: str, size: int) -> bool:
+        wide = 0.62 * size * len(text)
+        left = x - wide if side == "end" else x
+        box = (left, left + wide, y - 0.8 * size, y + 0.25 * size)
+        taken = self._taken[size]
+        if any(box[0] < b[1] and b[0] < box[1] and box[2] < b[3] and b[2] < box[3] for b in taken):
+            return False
+        taken.append(box)
+        return True
 
 
 def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> Drawing | None:
@@ -189,6 +212,7 @@ def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtfu
 
 def _control(frame: MapFrame, preflight: Preflight) -> str:
     drawn = []
+    labels = Labels()
     for point in preflight.control:
         inside = frame.holds(point.position_m)
         x, y = frame.point(point.position_m) if inside else frame.at_edge(point.position_m)
@@ -201,12 +225,13 @@ def _control(frame: MapFrame, preflight: Preflight) -> str:
             title += f": {count(point.photos)} photos may show it"
         poor = " poor" if not inside or point.photos == 0 else ""
         drawn.append(_path(f"control {point.kind}{poor}", f"M{x} {y - 22}l20 36h-40z", title))
-        if len(preflight.control) <= MOST_NAMED:
-            side = "end" if x > 0.85 * WIDTH else "start"
-            away = -30 if side == "end" else 30
-            drawn.append(
-                f'<text class="name" text-anchor="{side}" x="{x + away}" y="{y + 12}">{escape(_short(name))}</text>'
-            )
+        side = "end" if x > 0.85 * WIDTH else "start"
+        away = -30 if side == "end" else 30
+        text = _short(name)
+        room = labels.room(x + away, y + 12, text, side) if len(preflight.control) <= MOST_NAMED else ""
+        if room:
+            spot = f'text-anchor="{side}" x="{x + away}" y="{y + 12}"'
+            drawn.append(f'<text class="name {room}" {spot}>{escape(text)}</text>')
     return "".join(drawn)
 
 
