@@ -47,13 +47,12 @@ from splatpipe.pipeline.photos.scan import LeftOut, Scan, scan_folder
 from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.pipeline.survey.photo_positions import (
-    DATUM_STEP_M,
-    NOWHERE,
     PositionList,
     is_on_earth,
     positions_json,
     read_positions,
 )
+from splatpipe.pipeline.survey.position_doubts import position_doubts
 from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 
 MIN_PHOTOS = 2
@@ -86,7 +85,9 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         skies = prepare_masks(SKIES, root, photos, others, {}, work)
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places)
-    _tell_positions(positions, report)
+    for doubt in position_doubts(photos, positions):
+        if doubt.weight == "warning":
+            report.warning(doubt.message, doubt.hint)
     described = describe_cameras(photos, groups, camera_of)
     tell_cameras(described, report)
     if find_model(inputs.photos_dir) is None:  # a given model has its calibration
@@ -215,27 +216,6 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
         "sigma_vertical_m": float(np.median([each.sigma_vertical_m for each in stated])),
         "sigma_sources": sorted({each.sigma_source for each in stated}),
     }
-
-
-def _tell_positions(positions: PositionList, report: Reporter) -> None:
-    if positions.impossible:
-        report.warning(
-            f"The position is none that can be on Earth: {some(positions.impossible)}.",
-            "These photos take part without their position.",
-        )
-    elsewhere = [f"{printable(name)} {why}" for name, why in positions.wrong.items() if why != NOWHERE]
-    if elsewhere:
-        more = f"; and {len(elsewhere) - NAMES_SHOWN} more" if len(elsewhere) > NAMES_SHOWN else ""
-        report.warning(
-            f"Positions that cannot be right: {'; '.join(elsewhere[:NAMES_SHOWN])}{more}.",
-            "These photos take part without their position.",
-        )
-    step = positions.altitude_step_m
-    if step is not None and abs(step) > DATUM_STEP_M:
-        report.warning(
-            f"The altitudes in EXIF and in the drone's XMP differ by {step:.1f} m: they have different datums.",
-            "EXIF's are used.",
-        )
 
 
 def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:

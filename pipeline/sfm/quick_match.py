@@ -24,6 +24,8 @@ from splatpipe.pipeline.sfm.pairs import Pair
 
 LONGEST_PX = 640  # of the pictures that are matched: a fifth of a second a photo
 MOST_KEYPOINTS = 1000
+FEW_KEYPOINTS = 600  # fields and water, dark or hazy photos: there fainter ones are taken, too
+FAINT = 0.008  # of OpenCV's contrast threshold, whose default is 0.04; COLMAP's own is about as low
 RATIO = 0.85  # of the angles to the best and to the second best descriptor, looser than COLMAP's 0.8: RANSAC follows
 LEAST_MATCHES = 12  # that agree on a two-view geometry; chance gives 8 and a few
 LEAST_SHARE = 0.2  # of the candidates: fewer agree by chance among many
@@ -89,7 +91,11 @@ def glimpse(photo: CheckedPhoto) -> Glimpse:
     grey = read_grey(photo)
     small = reduced(grey, LONGEST_PX)
     detector = cv2.SIFT_create(enable_precise_upscale=True)
-    found = sorted(detector.detect(small, None), key=lambda keypoint: -keypoint.size)[:MOST_KEYPOINTS]
+    found = detector.detect(small, None)
+    if len(found) < FEW_KEYPOINTS:
+        detector = cv2.SIFT_create(contrastThreshold=FAINT, enable_precise_upscale=True)
+        found = detector.detect(small, None)
+    found = sorted(found, key=lambda keypoint: -keypoint.size)[:MOST_KEYPOINTS]
     values = np.zeros((0, 128), np.float32)
     if found:
         found, values = detector.compute(small, found)
