@@ -212,7 +212,16 @@ def test_what_cannot_be_reconstructed_ends_with_1_and_says_why(tmp_path: Path) -
     assert done.returncode == told["exit_code"] == 1, done.stderr
     assert {"no-overlap", "control-broken"} <= {finding["code"] for finding in told["findings"]}
     assert told["verdict"] == "error" and (tmp_path / "check.html").is_file()
-    assert "line 2" in done.stderr
+    assert "Line 2 of gcp_list.txt" in done.stderr
+
+
+def test_a_run_tells_a_broken_control_file_before_its_first_stage(tmp_path: Path) -> None:
+    photos = little(tmp_path / "photos")
+    (photos / "gcp_list.txt").write_text("EPSG:32633\n388710 5299705 512 112 514\n")
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(photos), str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "Line 2 of gcp_list.txt" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_of_rubbish_is_told_file_by_file(tmp_path: Path) -> None:

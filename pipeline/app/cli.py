@@ -112,6 +112,7 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Turn a folder of photos into a Gaussian splat; what is there and valid is reused."""
+    from splatpipe.pipeline.app.preflight.start import require_readable
     from splatpipe.pipeline.engine.config import load_preset
 
     with Ending(out, as_json) as done:
@@ -120,7 +121,9 @@ def run(
         assignments = with_boundary(assignments, boundary)
         resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
         again = stages_to_rerun(rerun or [], rerun_from, until)
-        with RunSession(request_of(photos, out, resolved, device, threads), wait) as runner:
+        request = request_of(photos, out, resolved, device, threads)
+        require_readable(request)
+        with RunSession(request, wait) as runner:
             done.outcome = runner.outcome
             runner.walk(until=until, rerun=again)
 

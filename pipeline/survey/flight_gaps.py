@@ -96,7 +96,7 @@ def _other_turns(steps: Float64[np.ndarray, " m"], k: int) -> float:
 
 
 def _as_fast(speed: float, usual: float, pauses: float) -> bool:
-    return SPEEDS[0] * usual < speed < SPEEDS[1] * usual and pauses > LONG_PAUSE
+    return bool(SPEEDS[0] * usual < speed < SPEEDS[1] * usual and pauses > LONG_PAUSE)
 
 
 def _by_numbers(names: Sequence[str], numbers: Sequence[int] | None, flight: Flight) -> list[MissingStrip]:

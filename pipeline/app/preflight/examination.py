@@ -159,7 +159,8 @@ def forecast_presets(
     intake: Intake, configs: Mapping[str, LineConfig], threads: int
 ) -> tuple[tuple[PresetForecast, ...], MachineFacts]:
     """What a run with each preset would need, and whether this machine has it."""
-    from splatpipe.stages.forecast import CaptureSize, forecast, machine_speed
+    from splatpipe.stages.forecast import forecast, machine_speed
+    from splatpipe.stages.work import CaptureSize
 
     disk = shutil.disk_usage(Path.cwd())
     machine = MachineFacts(available_memory_bytes(), available_cores(), disk.free)
