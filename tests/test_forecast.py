@@ -11,8 +11,13 @@ from typing import Any
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import forecast as benchmark
+from forecast_fit import compared, fit, left_out, scene_of
+
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.needs import Need, whole
+from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.forecast import CaptureSize, Forecaster, forecast, machine_speed, seconds
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
@@ -83,6 +88,21 @@ def test_a_run_forecasts_from_what_ingest_counted() -> None:
     groups = [{"photos": 3, "size": [640, 480]}, {"photos": 77, "size": [3000, 4000]}]
     needs = forecaster({"ingest": {"photos": 80, "positions": 80, "camera_groups": groups}})
     assert needs == forecast(replace(SIZE, shape=0.75), configured("preview"), 2, speed=forecaster.speed)
+
+
+def test_the_costs_are_what_the_runs_say_and_hold_for_captures_left_out() -> None:
+    rows = json.loads(benchmark.TABLE.read_text(encoding="utf-8"))
+    runs, _others = benchmark.runs_of(rows)
+    assert len(runs) >= 6
+    fitted = fit(runs)
+    assert benchmark.told(fitted) == benchmark.told(REFERENCE)
+    held = [benchmark.holds(outcome) for outcome in left_out(runs)]
+    for each in zip(*held, strict=True):  # memory, CPU time
+        assert sum(each) >= 5 / 6 * len(runs)
+    # A fit is exact for the one run that it is of, where that run's scene is known.
+    run = runs[0]
+    alone = compared(run, scene_of(run, fit([run])))
+    assert (alone.memory, alone.cpu, alone.disk) == pytest.approx((1.0, 1.0, 1.0), rel=0.02)
 
 
 def test_each_manifest_has_the_forecast_beside_what_was_used(demo_run: Path) -> None:

@@ -167,7 +167,8 @@ def forecast_presets(
     if len(intake.photos) < LEAST_PHOTOS:
         return (), machine
     megapixels = float(np.median([photo.width * photo.height for photo in intake.photos])) / 1e6
-    size = CaptureSize(len(intake.photos), megapixels, bool(intake.layout.located().mean() > 0.5))
+    shape = float(np.median([min(photo.width / photo.height, photo.height / photo.width) for photo in intake.photos]))
+    size = CaptureSize(len(intake.photos), megapixels, bool(intake.layout.located().mean() > 0.5), shape)
     speed = machine_speed()
     told = []
     for preset, config in configs.items():
