@@ -18,6 +18,9 @@ from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import NEIGHBOURS, CaptureSize, Units, Work
 
 KINDS = ("cpu_seconds", "peak_memory_bytes", "disk_bytes")
+BY_GAUSSIANS = ("train", "evaluate", "export")
+"""Stages whose memory grows with Gaussians, of which runs at `preview` have too few to tell how: what one takes is
+counted in training (`train/limits.py`), and was seen on seneca's 325,000 in the stages after it."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def fit(runs: Sequence[Run], base: Costs = REFERENCE) -> Costs:
     for stage, otherwise in base.stages.items():
         those = [(run.used[stage], each[stage]) for run, each in zip(runs, units, strict=True) if stage in run.used]
         if those:
-            resident, memory = _line(those)
+            resident, memory = _line(those, otherwise.memory if stage in BY_GAUSSIANS else None)
             cpu = [used["cpu_seconds"] / of.cpu for used, of in those if used["cpu_seconds"] * of.cpu > 0.0]
             disk = [used["disk_bytes"] / of.disk for used, of in those if used["disk_bytes"] * of.disk > 0.0]
             found = _typical(cpu, otherwise.cpu), _typical(disk, otherwise.disk)
@@ -157,10 +160,12 @@ def _typical(values: Sequence[float], otherwise: float) -> float:
     return math.exp(sum(math.log(value) for value in values) / len(values)) if values else otherwise
 
 
-def _line(those: Sequence[tuple[Mapping[str, float], Units]]) -> tuple[float, float]:
-    """A stage's memory: what is there whatever the size, and a unit's (relative least squares, neither below zero)."""
+def _line(those: Sequence[tuple[Mapping[str, float], Units]], slope: float | None = None) -> tuple[float, float]:
+    """A stage's memory: what is there whatever the size, and a unit's; neither below zero (relative least squares)."""
     units = np.array([of.memory for _, of in those])
     used = np.array([found["peak_memory_bytes"] for found, _ in those])
+    if slope is not None:
+        return float(np.mean(used - slope * units)), slope
     scale = max(float(units.max()), 1.0)
     table = np.stack([np.ones(len(those)), units / scale], axis=1) * (used.mean() / used)[:, None]
     constant, slope = nnls(table, np.ones(len(those)))[0] * used.mean()
