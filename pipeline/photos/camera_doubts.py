@@ -94,11 +94,12 @@ def _mixed_cameras(
 def _difference(photo: CheckedPhoto, other: CheckedPhoto) -> tuple[str, str]:
     """How a photo of a small group differs from one of the largest."""
     mine, theirs = _body(photo), _body(other)
-    if mine != theirs:
+    other_size = sorted((photo.width, photo.height)) != sorted((other.width, other.height))
+    if mine != theirs and not (other_size and not any(mine)):
         if mine[:2] == theirs[:2]:
             return "cameras", f"another {camera_name(*mine[:2])} than the others, by its serial number"
         return "cameras", f"taken with {_described(photo)}, the others with {_described(other)}"
-    if sorted((photo.width, photo.height)) != sorted((other.width, other.height)):
+    if other_size:
         return "resized", f"{photo.width} × {photo.height} px, the others {other.width} × {other.height}"
     if (photo.exif.focal_mm, photo.exif.focal_35mm) != (other.exif.focal_mm, other.exif.focal_35mm):
         return "focal-length", f"a focal length of {_focal(photo)}, the others {_focal(other)}"

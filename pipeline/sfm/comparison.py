@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from splatpipe.pipeline.photos.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.pairs import Pair
@@ -20,6 +20,8 @@ ALIKE_SIZES = 1.5  # of a keypoint in both photos, relative to them: further apa
 PASSES = 3
 ODD_DETAIL = 0.6  # of a logarithm of energies: photos that dull are no standard for others
 ODD_LEVEL_EV = 0.7
+CLIPPED = -0.06  # binary logarithm of linear light from which on nothing brighter is told: 250 of 255
+ALONE_DETAIL, ALONE_EV = 2.0, 2.0  # of photos that match none, against all others: what they show differs, too
 
 
 def duller(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Float64[np.ndarray, "n directions"]:
@@ -34,19 +36,23 @@ def duller(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Floa
         value = _detail_difference(glimpses[pair[0]], glimpses[pair[1]], agreed)
         if value is not None:
             differences[pair] = value
-    return _own_share(differences, len(glimpses), DIRECTIONS, ODD_DETAIL)
+    own = _own_share(differences, len(glimpses), DIRECTIONS, ODD_DETAIL)
+    return _or_alone(own, [-_medians(found.detail, DIRECTIONS) for found in glimpses], ALONE_DETAIL)
 
 
 def brighter_ev(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Float64[np.ndarray, " n"]:
     """Exposure values by which each photo shows the same things brighter than its neighbours do; NaN where unknown."""
     differences = {}
     for (i, j), agreed in found.items():
-        steps = glimpses[i].levels[agreed.first] - glimpses[j].levels[agreed.second]
-        known = steps[np.isfinite(steps)]
-        if len(known) >= LEAST_PLACES:
-            value = float(np.median(known))
+        here, there = glimpses[i].levels[agreed.first], glimpses[j].levels[agreed.second]
+        known = np.isfinite(here) & np.isfinite(there)
+        drawn = known & (here < CLIPPED) & (there < CLIPPED)
+        rows = drawn if np.count_nonzero(drawn) >= LEAST_PLACES else known
+        if np.count_nonzero(rows) >= LEAST_PLACES:
+            value = float(np.median(here[rows] - there[rows]))
             differences[i, j] = np.array([value]), np.array([-value])
-    return _own_share(differences, len(glimpses), 1, ODD_LEVEL_EV)[:, 0]
+    own = _own_share(differences, len(glimpses), 1, ODD_LEVEL_EV)
+    return _or_alone(own, [_medians(found.levels[:, None], 1) for found in glimpses], ALONE_EV)[:, 0]
 
 
 def _detail_difference(
@@ -65,6 +71,25 @@ def _detail_difference(
     in_first = np.take_along_axis(there[rows], (own + shift) % DIRECTIONS, axis=1) - here[rows]
     in_second = np.take_along_axis(here[rows], (own - shift) % DIRECTIONS, axis=1) - there[rows]
     return np.median(in_first, axis=0).astype(np.float64), np.median(in_second, axis=0).astype(np.float64)
+
+
+def _medians(values: Float32[np.ndarray, "n k"], size: int) -> Float64[np.ndarray, " k"]:
+    known = values[np.isfinite(values).all(axis=1)]
+    return np.median(known, axis=0).astype(np.float64) if len(known) else np.full(size, np.nan)
+
+
+def _or_alone(
+    own: Float64[np.ndarray, "n k"], plain: Sequence[Float64[np.ndarray, " k"]], least: float
+) -> Float64[np.ndarray, "n k"]:
+    """The same, with photos that match none set against all others, where they differ from these by ``least``."""
+    alone = ~np.isfinite(own).any(axis=1)
+    told = np.stack(plain) if len(plain) else own
+    others = told[~alone & np.isfinite(told).all(axis=1)]
+    if not alone.any() or not len(others):
+        return own
+    steps = told - np.median(others, axis=0)
+    far = alone & (np.abs(np.nan_to_num(steps)) > least).any(axis=1)
+    return np.where(far[:, None], steps, own)
 
 
 def _own_share(

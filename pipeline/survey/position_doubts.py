@@ -19,7 +19,9 @@ from splatpipe.pipeline.survey.photo_positions import (
     xmp_place,
 )
 
-CONTRADICTION_M = 10.0  # between a photo's EXIF and XMP; corrected positions (PPK) move by less
+CONTRADICTION_M = 1.0  # between a photo's EXIF and XMP: no rounding
+CONTRADICTION_TIMES = 6.0  # what they differ by in most photos, whose EXIF was corrected afterwards (PPK)
+ANOTHER_PLACE_M = 10.0  # in most photos: no correction
 WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
 RTK_SHARE = 0.5  # of the photos with a fix: then the others have lost it
 ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
@@ -99,13 +101,14 @@ def _contradicting(photos: Sequence[CheckedPhoto]) -> list[Doubt]:
         if is_on_earth(other.latitude, other.longitude):
             places = [(gps.latitude, gps.longitude)], [(other.latitude, other.longitude)]
             apart[photo.name] = median_distance_m(*places)
-    names = tuple(sorted(name for name, metres in apart.items() if metres > CONTRADICTION_M))
-    if not names:
-        return []
-    if len(names) > len(apart) / 2:
-        step = float(np.median(list(apart.values())))
+    step = float(np.median(list(apart.values()))) if apart else 0.0
+    limit = max(CONTRADICTION_M, CONTRADICTION_TIMES * step)
+    names = tuple(sorted(name for name, metres in apart.items() if metres > limit))
+    if step > ANOTHER_PLACE_M:
         text = f"EXIF and the drone's XMP place the photos {step:,.0f} m apart."
         return [Doubt("position-contradiction", text, "EXIF's places are used; were they written anew?")]
+    if not names:
+        return []
     furthest = max(names, key=apart.__getitem__)
     text = f"EXIF and XMP state different places: {some(names)} (up to {apart[furthest]:,.0f} m apart)."
     return [Doubt("position-contradiction", text, "EXIF's are used: correct them, or write the originals back.", names)]

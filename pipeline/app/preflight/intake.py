@@ -164,7 +164,9 @@ def _duplicates(entries: Sequence[LeftOut]) -> list[Finding]:
         return []
     told = [f"{printable(entry.name)} {entry.reason}" for entry in entries]
     more = f"; and {len(told) - 5} more" if len(told) > 5 else ""
-    names = tuple(sorted(entry.name for entry in entries))
+    # The reason ends with the twin's name: who looks for the copy finds both.
+    twins = {entry.reason.partition(" as ")[2] for entry in entries}
+    names = tuple(sorted({entry.name for entry in entries} | twins))
     text = f"Photos are there twice: {'; '.join(told[:5])}{more}."
     return [Finding("duplicate", "warning", text, "They are left out; was a card copied twice?", names)]
 

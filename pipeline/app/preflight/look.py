@@ -126,4 +126,4 @@ def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[Glimpse]) -> 
     more = f"; and {len(copies) - 5} more" if len(copies) > 5 else ""
     text = f"Photos are there twice: {'; '.join(told)}{more}."
     hint = "Leave the copies out: they count double, and a held-out photo may be among the trained ones."
-    return [Finding("duplicate", "warning", text, hint, tuple(sorted(copies)))]
+    return [Finding("duplicate", "warning", text, hint, tuple(sorted({*copies, *copies.values()})))]
