@@ -181,6 +181,14 @@ def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
     assert str(tmp_path.parent) not in page and "somebody" not in page
 
 
+def test_a_reason_of_many_lines_is_told_in_its_first(tmp_path: Path) -> None:
+    reason = "None of the 70 pictures can be used. Left out:\n" + "\n".join(f"  {i}.jpg is cut off" for i in range(70))
+    capture = CaptureState("a", "failed", "ingest", verdict="Failed in ingest", level="bad", reason=reason)
+    page = batch_page(batch(capture), tmp_path)
+    assert "can be used. Left out:</p>" in page and ">49.jpg is cut off<" in page and ">50.jpg" not in page
+    assert "and 20 more" in page and page.count("Failed in ingest") == 1
+
+
 def test_finished_with_doubts_is_told_in_the_headline(tmp_path: Path) -> None:
     captures = (CaptureState("a", "done", level="good"), CaptureState("b", "done", level="doubt"))
     page = batch_page(batch(*captures, ended_s=time.time(), exit_code=0), tmp_path)

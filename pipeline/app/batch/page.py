@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from markupsafe import Markup
 
-from splatpipe.pipeline.app.batch.state import STALE_S, BatchState, CaptureState, Level, State
+from splatpipe.pipeline.app.batch.state import FINISHED, STALE_S, BatchState, CaptureState, Level, State
 from splatpipe.pipeline.app.page_file import page_text, relative_link, shown
 from splatpipe.pipeline.app.places import Places
 from splatpipe.pipeline.app.report.wording import duration, plural, roughly, size
@@ -21,6 +21,7 @@ REFRESH_S = 10  # as often as a reader would look; the batch renews the page som
 PICTURE_SIDE = 480  # pixels, of a card on a good display
 SMALL_SIDE = 240  # where there are so many that the page would take long to load each time
 MANY = 60  # captures
+MOST_LINES = 50  # of a reason; the report has all
 GROUPS: Sequence[tuple[State, str]] = (  # first what somebody has to see to
     ("failed", "Failed"),
     ("running", "Running"),
@@ -46,7 +47,8 @@ class Card:
         facts: Figures in words: photos, time, tries.
         verdict: The report's headline.
         level: How good that is.
-        reason: Why it failed or was stopped.
+        reason: Why it failed or was stopped, in its first line.
+        more: Further lines of that.
         hint: What to do about it.
         earlier: Why earlier tries ended.
         links: Titles and addresses.
@@ -62,6 +64,7 @@ class Card:
     verdict: str
     level: Level
     reason: str
+    more: tuple[str, ...]
     hint: str
     earlier: tuple[str, ...]
     links: tuple[tuple[str, Markup], ...]
@@ -155,7 +158,9 @@ def _headline(state: BatchState) -> tuple[Level, str]:
 def _text(state: BatchState) -> str:
     """When, for how long, and what it takes."""
     until_s = state.as_of_s if state.ended_s is None else state.ended_s
-    told = [state.message, f"Began {_moment(state.began_s)}."]
+    poor = sum(capture.level == "bad" and capture.state in FINISHED for capture in state.captures)
+    told = [state.message, f"Of what finished, {poor:,} came out poorly." if poor else ""]
+    told += [f"Began {_moment(state.began_s)}."]
     if state.ended_s is not None:
         told.append(f"Ended {_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")
     elif state.left_s is not None:
@@ -177,6 +182,7 @@ def _card(capture: CaptureState, folder: Path, side: int) -> Card:
     left = f"{percent} %"
     if capture.left_s is not None:
         left += f", about {roughly(capture.left_s)} left"
+    reason, *more = [line.strip() for line in capture.reason.splitlines() if line.strip()] or [""]
     begun = capture.state != "waiting" or capture.progress > 0.0
     return Card(
         name=shown(capture.name),
@@ -186,9 +192,10 @@ def _card(capture: CaptureState, folder: Path, side: int) -> Card:
         percent=percent if running else None,
         left=left if running else "",
         facts=" · ".join(filter(None, facts)),
-        verdict=capture.verdict,
+        verdict="" if reason else capture.verdict,  # which says no more than the state and the reason
         level=capture.level,
-        reason=capture.reason,
+        reason=reason,
+        more=tuple(more[:MOST_LINES]) + ((f"and {len(more) - MOST_LINES:,} more",) if len(more) > MOST_LINES else ()),
         hint=capture.hint,
         earlier=capture.earlier,
         links=tuple(

@@ -16,6 +16,7 @@ from splatpipe.pipeline.photos.names import PHOTO_SUFFIXES
 from splatpipe.pipeline.photos.photo_list import photo_root
 
 SIDE = 480  # pixels, of a card on a good display
+POOR_DB = 15.0  # a render that is so little like its photo does not show which capture it is
 LOOKED_AT = 5  # photos, spread over the capture: some show little but sky, grass, or the ground before take-off
 
 
@@ -60,15 +61,22 @@ def _render(out: Path) -> tuple[Path, int] | None:
         views: Sequence[Mapping[str, Any]] = holdings.read("evaluate.metrics").get("per_view", [])
         if folder is None or not views:
             return None
-        views = sorted(views, key=lambda view: -float(view.get("psnr_cc") or view.get("psnr") or 0.0))
+        views = sorted(views, key=_likeness, reverse=True)
         renders = [(folder / f"{Path(str(view['file'])).name}.render.png", view) for view in views]
-        good = [(path, view) for path, view in renders[: (len(renders) + 1) // 2] if path.is_file()]
+        alike = [(path, view) for path, view in renders[: (len(renders) + 1) // 2] if _likeness(view) >= POOR_DB]
+        good = [(path, view) for path, view in alike if path.is_file()]
+        if not good:
+            return None
         path, view = max(good, key=lambda render: render[0].stat().st_size)
         photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
         turned = {photo["name"]: int(photo.get("orientation") or 1) for photo in photos}
         return path, turned.get(view["name"], 1)
     except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # of a run that is not whole yet
         return None
+
+
+def _likeness(view: Mapping[str, Any]) -> float:
+    return float(view.get("psnr_cc") or view.get("psnr") or 0.0)
 
 
 def _photo(photos: Path) -> Path | None:
