@@ -11,8 +11,9 @@ import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import IO
 
-from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, StageError, Stopped
+from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, StageError, Stopped
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.worker import Task, peak_memory_of
@@ -111,17 +112,26 @@ class Executor:
     def _started(self) -> subprocess.Popen[str]:
         if self._process is None:
             with self._log.open("a", encoding="utf-8") as log:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=log,
-                    text=True,
-                    encoding="utf-8",
-                    env=self._environment,
-                    pass_fds=(self._lock,),
-                )
+                self._process = self._begun(log)
         return self._process
+
+    def _begun(self, log: IO[str]) -> subprocess.Popen[str]:
+        try:
+            return subprocess.Popen(
+                [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                encoding="utf-8",
+                env=self._environment,
+                pass_fds=(self._lock,),
+            )
+        except OSError as error:
+            raise MachineError(
+                f"No process could be started for the work: {error.strerror}.",
+                hint="Does a limit on processes or memory apply here (ulimit -u, a container's pids)?",
+            ) from error
 
     def _raise(self, failure: Mapping[str, str]) -> None:
         if failure["type"] == "KeyboardInterrupt":

@@ -167,8 +167,9 @@ class Runner:
         Raises:
             SplatpipeError: the first stage that failed; what came before it stays.
         """
-        self.store.recover()
-        self.save_config(self.line.config)
+        with self._explained():
+            self.store.recover()
+            self.save_config(self.line.config)
         parts = dict(self.line.source)
         outcome = self.outcome
         needed = self.line.needed(until)
@@ -194,7 +195,8 @@ class Runner:
         Raises:
             UsageError: if a stage that it reads from is not valid.
         """
-        self.store.recover()
+        with self._explained():
+            self.store.recover()
         outcome = self.outcome
         parts = dict(self.line.source)
         for standing in survey(self.line, self.store):
@@ -211,7 +213,8 @@ class Runner:
                 f"The stage {name} reads what {', '.join(missing)} leaves, and that is not there or no longer valid.",
                 hint=f"Run the line up to there first: splatpipe run PHOTOS {self.store.out} --until {missing[-1]}",
             )
-        self.save_config(self.line.config)
+        with self._explained():
+            self.save_config(self.line.config)
         with self._told([name]):
             artifact = self._run(stage, self.line.inputs_of(stage, parts), parts, "asked for")
             outcome.artifacts[name] = artifact
@@ -314,7 +317,7 @@ class Runner:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Turn a full or failing disk, here or behind a crash in the worker, into its plain message."""
+        """Turn a full, failing or absent disk, here or behind what the worker says, into its plain message."""
         try:
             yield
         except OSError as error:
@@ -323,9 +326,10 @@ class Runner:
                 f"Cannot write to {self.store.out}: {error.strerror or error}.",
                 hint="Make room or check the permissions, then run again: it goes on from here.",
             ) from error
-        except StageError:
+        except SplatpipeError as error:
             self._check_places()
-            self._check_space()
+            if isinstance(error, StageError):
+                self._check_space()
             raise
 
     def _check_places(self) -> None:

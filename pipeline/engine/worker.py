@@ -30,7 +30,8 @@ from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, StageConfig, load_body
 
 NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # of libraries' errors, in small letters
-NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
+BAD_DISK = {errno.EIO, errno.ESTALE, errno.ENXIO, errno.ENODEV}  # a failing one, or a server's that went away
 
 
 @dataclass(frozen=True)
@@ -123,11 +124,12 @@ def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
         known = next(ERRORS[kind.__name__] for kind in type(error).__mro__ if kind.__name__ in ERRORS)
         return known(error.message, error.hint)
     text = str(error).lower()
-    if isinstance(error, OSError) and error.errno in NO_ROOM:
+    if isinstance(error, OSError) and error.errno in NO_ROOM | BAD_DISK:
         where = f" ({error.filename})" if error.filename else ""
+        what = "write" if error.errno in NO_ROOM else "use a file"
         return MachineError(
-            f"The stage {stage} could not write: {error.strerror}{where}.",
-            "Make room, then run again: it goes on from here.",
+            f"The stage {stage} could not {what}: {error.strerror}{where}.",
+            "Make room, or look after the disk, then run again: it goes on from here.",
         )
     if "disk is full" in text or "no space left" in text:
         return MachineError(

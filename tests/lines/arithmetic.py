@@ -3,8 +3,11 @@
 import json
 import os
 import signal
+import sys
 import time
 from pathlib import Path
+
+from rich.console import Console
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Stage, StageConfig, Summary
@@ -80,6 +83,12 @@ def count(config: CountConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         raise ValueError("out of order")
     if config.fail == "disk":
         raise OSError(28, "No space left on device", "somewhere")
+    if config.fail == "fill":
+        with (out / "much").open("wb") as file:
+            for _ in range(64):
+                file.write(bytes(1 << 20))
+    if config.fail == "colours":
+        Console(file=sys.stderr).print("[red]no terminal here")
     if config.fail == "deaf":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         time.sleep(60)
