@@ -16,7 +16,7 @@ from splatpipe.pipeline.photos.names import PHOTO_SUFFIXES
 from splatpipe.pipeline.photos.photo_list import photo_root
 
 SIDE = 480  # pixels, of a card on a good display
-POOR_DB = 15.0  # a render that is so little like its photo does not show which capture it is
+POOR_DB = 12.0  # PSNR, exposure included: a render that is so little like its photo does not show which capture it is
 LOOKED_AT = 5  # photos, spread over the capture: some show little but sky, grass, or the ground before take-off
 
 
@@ -63,8 +63,8 @@ def _render(out: Path) -> tuple[Path, int] | None:
             return None
         views = sorted(views, key=_likeness, reverse=True)
         renders = [(folder / f"{Path(str(view['file'])).name}.render.png", view) for view in views]
-        alike = [(path, view) for path, view in renders[: (len(renders) + 1) // 2] if _likeness(view) >= POOR_DB]
-        good = [(path, view) for path, view in alike if path.is_file()]
+        better = renders[: (len(renders) + 1) // 2]
+        good = [(path, view) for path, view in better if path.is_file() and float(view.get("psnr") or 0.0) >= POOR_DB]
         if not good:
             return None
         path, view = max(good, key=lambda render: render[0].stat().st_size)
