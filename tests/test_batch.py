@@ -90,6 +90,7 @@ def test_what_fails_stops_no_other_and_what_is_finished_is_not_touched(tmp_path:
     before = events(out)
     told = batch(listed, out, *night)
     assert states(told) == {"house": "reused", **bad} and told["exit_code"] == 1
+    assert "--retry-failed" in {each["name"]: each["hint"] for each in told["captures"]}["broken"]  # type: ignore[attr-defined]
     assert events(out) == before and not list((out / ".batch" / "call").glob("tries/*"))
     assert not (out / ".batch" / "call" / "Snakefile").exists()  # Snakemake was not even started
 

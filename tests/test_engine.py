@@ -363,6 +363,28 @@ def test_how_a_run_and_its_stages_ended_is_in_the_events(numbers: Path, out: Pat
         assert (ended["exit_code"], ended["message"]) == (3, caught.value.message)
         assert failed["message"] == caught.value.message and failed["seconds"] >= 0.0  # type: ignore[operator]
         assert (failed["peak_memory_bytes"] is not None) is memory_is_known
+        assert failed["lasting"] is False
+
+
+@pytest.mark.parametrize(("meddled", "lasting"), [("", True), ("gone", False), ("another", False)])
+def test_a_failure_for_the_photos_lasts_as_long_as_they_do(
+    numbers: Path, out: Path, meddled: str, lasting: bool
+) -> None:
+    """Of a folder that was gone for a while, or was still being written, the next run may think otherwise."""
+    for path in numbers.glob("*.txt"):
+        path.unlink()
+    (numbers / "none.csv").write_text("")
+
+    def meddle(event: Event) -> None:
+        if meddled and (event.kind, event.stage) == ("stage_started", "read"):
+            (numbers / "none.csv").unlink()
+            (numbers / "another.csv").write_text("1") if meddled == "another" else numbers.rmdir()
+
+    with pytest.raises(SplatpipeError), open_session(request_of(numbers, out), meddle) as runner:
+        runner.walk()
+    events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+    (failed,) = (event["data"] for event in events if event["kind"] == "stage_failed")
+    assert (failed["exit_code"], failed["lasting"]) == (1, lasting)
 
 
 def test_hostile_names_do_not_disturb(numbers: Path, out: Path) -> None:

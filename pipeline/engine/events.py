@@ -42,7 +42,8 @@ class Event:
             ``note``: message. ``warning``: message, hint. ``run_started``: stages, machine, versions.
             ``stage_started``: reason, key. ``stage_reused``: summary, seconds, key. ``stage_finished``: summary,
             seconds, cpu_seconds, peak_memory_bytes, key. ``stage_failed``: message, hint, exit_code, seconds,
-            peak_memory_bytes (None: nobody knows), key. ``run_finished``: exit_code, message, hint, seconds.
+            peak_memory_bytes (None: nobody knows), key, lasting (the same input fails again). ``run_finished``:
+            exit_code, message, hint, seconds.
         time_s: Seconds since the epoch.
     """
 

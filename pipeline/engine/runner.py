@@ -15,7 +15,15 @@ from typing import Literal
 from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.config import settings_of
-from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, UsageError, exit_code
+from splatpipe.pipeline.engine.errors import (
+    EXIT_INPUT,
+    MachineError,
+    SplatpipeError,
+    StageError,
+    Stopped,
+    UsageError,
+    exit_code,
+)
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
@@ -290,6 +298,7 @@ class Runner:
         told = (error.message, error.hint) if isinstance(error, SplatpipeError) else ("Stopped.", "")
         data: dict[str, JSON] = {"message": told[0], "hint": told[1], "exit_code": exit_code(error), "key": inputs.key}
         data |= {"seconds": round(seconds, 3), "peak_memory_bytes": self.executor.peak_memory_bytes()}
+        data["lasting"] = data["exit_code"] == EXIT_INPUT and self._source_stands()
         return Event("stage_failed", inputs.stage, data)
 
     def _check_source(self, stage: Stage) -> None:
@@ -331,6 +340,14 @@ class Runner:
             if isinstance(error, StageError):
                 self._check_space()
             raise
+
+    def _source_stands(self) -> bool:
+        """Whether the user's files are what they were when the run began: then what is wrong with them stays wrong."""
+        try:
+            now = self.source_now()
+        except (SplatpipeError, OSError):
+            return False
+        return all(now.get(name, "") in ("", part.digest) for name, part in self.line.source.items())
 
     def _check_places(self) -> None:
         """What lies behind many an error: a disk that is no longer there."""

@@ -137,7 +137,7 @@ class Account:
         under_way = time.time() - tries[-1].began_s if told.state == "running" else 0.0
         return replace(
             told,
-            verdict=facts.verdict,
+            verdict="" if told.state == "failed" else facts.verdict,  # it would say no more than that
             level="bad" if told.state == "failed" else facts.level,
             seconds=round(facts.seconds + under_way, 1),
             photos=planned.photo_count,

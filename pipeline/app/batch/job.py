@@ -23,8 +23,10 @@ from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJ
 from splatpipe.pipeline.app.batch.tries import HOPELESS, Ending, TryLog
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
 from splatpipe.pipeline.app.ending import PART_VARIABLE
+from splatpipe.pipeline.app.report.story import read_story
 from splatpipe.pipeline.engine.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE
 from splatpipe.pipeline.engine.stage import JSON
 
 RESERVE_BYTES = 256 << 20  # of the disk, for what other captures' stages are writing at the same time
@@ -84,7 +86,7 @@ def _run(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads
         )
     _pass_on_signals(process)
     told, _ = process.communicate()
-    return _ending(process.returncode, told)
+    return _ending(process.returncode, told, Path(plan.out) / capture.name)
 
 
 def command_of(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
@@ -130,7 +132,7 @@ def _pass_on_signals(process: subprocess.Popen[bytes]) -> None:
         signal.signal(number, pass_on)
 
 
-def _ending(code: int, told: bytes) -> Ending:
+def _ending(code: int, told: bytes, out: Path) -> Ending:
     if code < 0:
         name = signal.Signals(-code).name
         hint = "Its log has what it said last; run out of memory is what SIGKILL mostly means."
@@ -138,12 +140,14 @@ def _ending(code: int, told: bytes) -> Ending:
     if code == 0:
         return Ending(0)
     error = _error(told)
-    return Ending(
-        code,
-        str(error.get("message", "")) or f"It ended with exit code {code}.",
-        str(error.get("hint", "")),
-        code in HOPELESS,
-    )
+    message = str(error.get("message", "")) or f"It ended with exit code {code}."
+    return Ending(code, message, str(error.get("hint", "")), code in HOPELESS and not _may_pass(out))
+
+
+def _may_pass(out: Path) -> bool:
+    """Whether it failed for photos that were changed, or gone for a while, as they are on a network disk."""
+    culprit = read_story(out / EVENTS_FILE, running=False).culprit
+    return culprit is not None and culprit.state == "failed" and not culprit.lasting
 
 
 def _error(told: bytes) -> Mapping[str, JSON]:

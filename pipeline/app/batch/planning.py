@@ -18,7 +18,7 @@ from splatpipe.pipeline.app.cli_runs import Overrides, request_of
 from splatpipe.pipeline.app.report.story import read_story
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
 from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.errors import EXIT_INPUT, MachineError, SplatpipeError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
@@ -34,6 +34,7 @@ SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly ali
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
 CLUSTER_THREADS = 8  # of a job that another machine runs; a profile's set-threads says otherwise
 LONGEST_SLUG = 40
+UNTRIED = "Nothing has changed since, so it was not tried again; --retry-failed does."
 NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000)  # a process that looks and ends
 
 
@@ -173,11 +174,11 @@ def _with_kept_failure(planned: PlannedCapture, first: Standing, out: Path) -> P
     story = read_story(out / EVENTS_FILE, running=is_locked(out))
     culprit = story.culprit
     alike = story.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
-    if culprit is None or culprit.state != "failed" or story.exit_code != EXIT_INPUT or not alike:
+    if culprit is None or culprit.state != "failed" or not culprit.lasting or not alike:
         return planned
     if (culprit.name, culprit.key) != (first.stage.name, first.key):
         return planned
-    return replace(planned, message=culprit.message, hint=culprit.hint, stage=culprit.name)
+    return replace(planned, message=culprit.message, hint=f"{culprit.hint} {UNTRIED}".strip(), stage=culprit.name)
 
 
 def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:

@@ -47,6 +47,7 @@ class StageStory:
         memory_bytes: Peak; None where unknown.
         message: What it failed with.
         hint: What to do about it.
+        lasting: Whether the same input fails again.
         told: What it said.
     """
 
@@ -58,6 +59,7 @@ class StageStory:
     memory_bytes: int | None = None
     message: str = ""
     hint: str = ""
+    lasting: bool = False
     told: Told = field(default_factory=Told)
 
     @property
@@ -186,6 +188,7 @@ class _Reader:
         stopped = code in STOPPED if code is not None else data["message"] == "Stopped."
         stage = self._stage(name, "stopped" if stopped else "failed", data)
         stage.message, stage.hint = str(data["message"]), str(data["hint"])
+        stage.lasting = bool(data.get("lasting"))
         stage.seconds, stage.memory_bytes = data.get("seconds"), data.get("peak_memory_bytes")
 
     def _progress(self, name: str, data: Facts) -> None:
