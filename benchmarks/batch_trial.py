@@ -4,8 +4,8 @@
 
 The captures are links to photos of the demo and of the folder of real ones, made below the second folder. One is
 broken, one cannot be reconstructed, one has a wrong control file, and of one the training is killed with -9. Then the
-command is repeated at once, and once more with a capture added and one changed. Then Snakemake says what it would send to
-Slurm and Kubernetes; its plugins have to be there: `pip install snakemake-executor-plugin-slurm
+command is repeated at once, and once more with a capture added and one changed. Then Snakemake says what it would send
+to Slurm and Kubernetes; its plugins have to be there: `pip install snakemake-executor-plugin-slurm
 snakemake-executor-plugin-kubernetes snakemake-storage-plugin-fs`. It ends with 1 at the first thing that is not as it
 should be.
 """
