@@ -28,7 +28,18 @@ from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
 from splatpipe.pipeline.survey.model import SparseModel, copy_model, read_model
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.place import Site, Targets, stations_of
-from splatpipe.pipeline.survey.surveyed_points import load_survey
+from splatpipe.pipeline.survey.scale_bars import Scale
+from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
+from splatpipe.pipeline.survey.target_finds import load_finds, load_wanted
+from splatpipe.pipeline.survey.target_marks import TargetMarks
+from splatpipe.pipeline.survey.target_survey import (
+    TargetSurvey,
+    compare,
+    marker_of,
+    scale_of,
+    scale_summary,
+    scaled,
+)
 from splatpipe.pipeline.survey.world import in_crs
 
 DATUM_STEP_M = 1.0  # between two vertical datums; less may be the receiver's error
@@ -51,8 +62,16 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     frame = _by_positions(config, model, positions, photos, report)
     report.progress(2, 3, "fitting the control", "steps")
     controlled = None
-    if inputs["source.control"].is_file():
-        survey = load_survey(inputs["source.control"], config, photos, model, report)
+    targets = TargetSurvey(
+        load_wanted(inputs["control.points"]),
+        load_finds(inputs["targets.found"]),
+        model,
+        photos,
+        None if isinstance(frame, str) else frame,
+        config.approximate_crs,
+    )
+    survey, scale = _survey(targets, inputs, config, report)
+    if survey is not None and any(point.sightings for point in survey.points):
         priors = _focal_priors(inputs["ingest.cameras"], model, photos)
         capture = Capture(model, positions, photos, priors, inputs.settings.get("sparse.lens") == "held")
         try:
@@ -64,6 +83,11 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
             )
     if controlled is not None:
         frame = controlled.frame
+    if isinstance(frame, str) and scale is not None:
+        frame = scaled(arbitrary_frame(model, positions, frame), scale)
+        report.note(frame.note)
+    elif scale is not None and isinstance(frame, Frame):
+        compare(frame, scale, report)
     if isinstance(frame, str):
         report.warning(f"Arbitrary scale: {frame}.", "Lengths and heights in this result have no unit.")
         frame = arbitrary_frame(model, positions, frame)
@@ -77,7 +101,24 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     else:
         copy_model(source, out / "sparse" / "0", may_link=inputs.photos_dir not in source.parents)
     report.progress(3, 3, "fitting the control", "steps")
-    return {**_summary(frame, controlled, accuracy), **bounded}
+    return {**_summary(frame, controlled, accuracy), **scale_summary(scale), **bounded}
+
+
+def _survey(
+    targets: TargetSurvey, inputs: Inputs, config: GeorefConfig, report: Reporter
+) -> tuple[Survey | None, Scale | None]:
+    """The survey with the marks that targets are, and what scale bars say; None where there is none."""
+    control = inputs["source.control"]
+    seen: list[TargetMarks] = []
+    survey, marked = None, {}
+    if control.is_file():
+        finder = marker_of(targets, control, report, seen) if targets.finds else None
+        survey = load_survey(control, config, targets.photos, targets.model, report, finder)
+        marked = {point.name: point.found.xyz for point in survey.points if point.found is not None}
+    elif targets.finds:
+        seen.append(targets.marks({}, report))
+    found = seen[0] if seen else TargetMarks((), {})
+    return survey, scale_of(targets, found, marked, report)
 
 
 def _by_positions(

@@ -8,7 +8,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
 
@@ -64,11 +64,38 @@ SPARSE = Stage(
     parts={"model": "sparse/0", "summary": "models.json"},
     entry="splatpipe.stages.sparse:run",
 )
+CONTROL = Stage(
+    "control",
+    version=1,
+    config=ControlConfig,
+    reads=("source.control", "source.scale_bars"),
+    parts={"points": "points.json"},
+    entry="splatpipe.stages.control:run",
+    files={"scale_bars": NamedFile("source.scale_bars", ("scale_bars.csv",))},
+)
+TARGETS = Stage(
+    "targets",
+    version=1,
+    config=TargetsConfig,
+    reads=("control.points", "sparse.model", "ingest.photos", "ingest.positions"),
+    parts={"found": "targets.json"},
+    entry="splatpipe.stages.targets:run",
+    borrows=("georef.max_position_error_m", "georef.approximate_crs"),
+)
 GEOREF = Stage(
     "georef",
-    version=5,
+    version=6,
     config=GeorefConfig,
-    reads=("sparse.model", "ingest.positions", "ingest.photos", "ingest.cameras", "source.control", "source.boundary"),
+    reads=(
+        "sparse.model",
+        "ingest.positions",
+        "ingest.photos",
+        "ingest.cameras",
+        "control.points",
+        "targets.found",
+        "source.control",
+        "source.boundary",
+    ),
     parts={
         "frame": "frame.json",
         "model": "sparse/0",
@@ -181,4 +208,19 @@ FLYTHROUGH = Stage(
     deliverables=("film",),
 )
 
-LINE = (INGEST, FEATURES, MATCHES, SPARSE, GEOREF, UNDISTORT, SPLIT, INITIALIZE, TRAIN, EVALUATE, EXPORT, FLYTHROUGH)
+LINE = (
+    INGEST,
+    CONTROL,
+    FEATURES,
+    MATCHES,
+    SPARSE,
+    TARGETS,
+    GEOREF,
+    UNDISTORT,
+    SPLIT,
+    INITIALIZE,
+    TRAIN,
+    EVALUATE,
+    EXPORT,
+    FLYTHROUGH,
+)

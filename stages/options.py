@@ -11,7 +11,7 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.options import GONE as GONE_OF_TRAIN
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
@@ -37,9 +37,11 @@ class LineConfig(StageConfig):
     }
 
     ingest: IngestConfig = IngestConfig()
+    control: ControlConfig = ControlConfig()
     features: FeaturesConfig = FeaturesConfig()
     matches: MatchesConfig = MatchesConfig()
     sparse: SparseConfig = SparseConfig()
+    targets: TargetsConfig = TargetsConfig()
     georef: GeorefConfig = GeorefConfig()
     undistort: UndistortConfig = UndistortConfig()
     split: SplitConfig = SplitConfig()

@@ -122,8 +122,10 @@ def _observation(
     if sighting.index is not None:
         found = model.view(sighting.index, photos[sighting.photo].width).ray(np.array(sighting.pixel))
         ray = found.tolist() if np.isfinite(found).all() else None
+    automatic = {"automatic": True} if sighting.automatic else {}
     return {
         "photo": sighting.photo,
+        **automatic,
         "pixel": list(sighting.pixel),
         "ray": ray,
         "residual_px": None if residual is None else residual.tolist(),

@@ -20,6 +20,7 @@ from splatpipe.pipeline.survey.survey_text import delimiter_of, find_columns, is
 HIDDEN, UNMARKED = "# not visible:", "# unmarked:"
 CSV_TITLES = ("name", "x", "y", "z", "photo", "pixel_x", "pixel_y", "role", "sigma_h", "sigma_v")
 CSV_KEYS = ("name", "x", "y", "z", "photo", "px", "py", "role", "sigma_horizontal", "sigma_vertical")
+MARKED = ("photo", "px", "py")
 BOM = "\ufeff"
 TABS = 5  # in a line of ODM's list, from which on tabs part its fields
 
@@ -51,7 +52,7 @@ class ControlText:
         Raises:
             SplatpipeError: if it is no control file.
         """
-        table = read_table(path)
+        table = _with_columns(read_table(path), path)
         raw = path.read_bytes()
         return ControlText(path, table, find, "\r\n" if b"\r\n" in raw else "\n", raw.startswith(BOM.encode()))
 
@@ -213,6 +214,21 @@ class ControlText:
 
     def _with_lines(self, lines: Sequence[str]) -> ControlText:
         return replace(self, table=parse_table(tuple(enumerate(lines, 1)), self.path))
+
+
+def _with_columns(table: Table, path: Path) -> Table:
+    """A table of points alone with the columns that marks go into."""
+    if table.header is None:
+        return table
+    lines = [text for _, text in table.lines]
+    titles = lines[table.header - 1]
+    delimiter = delimiter_of(titles)
+    columns = find_columns(next(csv.reader([titles], delimiter=delimiter)), COLUMNS)
+    missing = [title for title, key in zip(CSV_TITLES, CSV_KEYS, strict=True) if key in MARKED and key not in columns]
+    if not missing:
+        return table
+    lines[table.header - 1] = delimiter.join([titles, *missing])
+    return parse_table(tuple(enumerate(lines, 1)), path)
 
 
 def _split(line: str) -> list[str]:

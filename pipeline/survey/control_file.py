@@ -55,6 +55,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "crs": ("crs", "epsg", "srs"),
 }
 _NEEDED = ("x", "y", "photo", "px", "py")  # columns of a table
+_OF_MARKS = ("photo", "px", "py")
 _NEEDED_OF_POINTS = ("name", "x", "y")  # of one without marks
 ROLES: Mapping[str, Role] = {
     "control": "control",
@@ -208,7 +209,7 @@ def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[s
 
 _EXPECTED = (
     "First a line with the CRS, e.g. EPSG:32633, then lines of `x y z pixel_x pixel_y photo point`;"
-    " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo."
+    " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo; without the last three where targets are to be found."
 )
 _KIND = TableKind("control file", _EXPECTED, max_bytes=32 << 20, max_lines=200_000)
 _POINTS = TableKind(
@@ -243,7 +244,10 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row]]:
 def _is_header(line: str, needed: Sequence[str]) -> bool:
     delimiter = delimiter_of(line)
     columns = find_columns(next(csv.reader([line], delimiter=delimiter)), COLUMNS)
-    return set(needed) <= set(columns) or set(_NEEDED) <= set(columns)
+    if set(needed) <= set(columns) or set(_NEEDED) <= set(columns):
+        return True
+    # Points alone: targets in the photos are to be found, or marks made.
+    return set(_NEEDED_OF_POINTS) <= set(columns) and not set(_OF_MARKS) & set(columns)
 
 
 def _require_no_header(number: int, line: str) -> None:

@@ -46,6 +46,7 @@ class Frame:
         vertical_datum: Of the world's heights, which are as they were stated: ``ellipsoidal``, ``EPSG:n``, or
             ``unknown`` unless somebody declared it.
         crs: The CRS that coordinates are read out in, as ``parse_crs`` takes it; empty for the UTM zone of ``origin``.
+        metres: Whether an arbitrary frame has metres all the same, by scale bars.
         approximate_crs: The user accepts it though a grid of it is missing.
         residuals: ``rmse_horizontal_m``, ``rmse_vertical_m``, ``rmse_m`` of the photos that took part, how many there
             are, the standard deviations of scale and rotation, and east, north, up of each photo by name (metres).
@@ -62,6 +63,12 @@ class Frame:
     note: str = ""
     crs: str = ""
     approximate_crs: bool = False
+    metres: bool = False
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether lengths are metres."""
+        return self.origin is not None or self.metres
 
 
 def save_frame(frame: Frame, path: Path) -> None:
@@ -84,6 +91,8 @@ def save_frame(frame: Frame, path: Path) -> None:
         "left_out": list(frame.left_out),
         "note": frame.note,
     }
+    if frame.metres:
+        value["metres"] = True
     write_json(path, value)
 
 
@@ -112,6 +121,7 @@ def load_frame(path: Path) -> Frame:
             left_out=tuple(value["left_out"]),
             note=value["note"],
             crs=str(value.get("crs", "")),
+            metres=bool(value.get("metres", False)),
             approximate_crs=bool(value.get("approximate_crs", False)),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -41,7 +41,8 @@ def georeference(frame: Frame, box: Float64[np.ndarray, "2 3"]) -> dict[str, Any
     """
     head = {"format": FORMAT, "note": frame.note}
     if frame.origin is None:
-        return {**head, "frame": "z up, arbitrary scale and heading", "origin": None}
+        scale = "metres, arbitrary place" if frame.metres else "arbitrary scale"
+        return {**head, "frame": f"z up, {scale} and heading", "origin": None}
     world = open_world(frame)
     there = world.crs_from_local(np.zeros((1, 3)))[0]
     return {

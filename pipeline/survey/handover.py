@@ -41,7 +41,8 @@ def ply_comments(frame: Frame, antialias: bool) -> list[str]:
     """Header lines that say in which frame the splat is."""
     comments = [MIP_COMMENT] if antialias else []
     if frame.origin is None:
-        return [*comments, "frame: z up, arbitrary scale and heading"]
+        scale = "metres, arbitrary place" if frame.metres else "arbitrary scale"
+        return [*comments, f"frame: z up, {scale} and heading"]
     origin = frame.origin
     where = f"{origin.latitude:.9f} {origin.longitude:.9f} {origin.height_m:.4f}"
     return [

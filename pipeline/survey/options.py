@@ -10,6 +10,19 @@ from splatpipe.pipeline.engine.ranges import PositiveFloat
 from splatpipe.pipeline.engine.stage import StageConfig
 
 
+class ControlConfig(StageConfig):
+    scale_bars: str = "auto"
+    """File of distances between targets: a CSV with the columns `name_a,name_b,metres` and, if known, `sigma`. They
+    give metres where no coordinates are known, and check the scale elsewhere. `auto`: `scale_bars.csv` in the photo
+    folder or beside it; `none`: no bars."""
+
+
+class TargetsConfig(StageConfig):
+    search: bool = True
+    """Look for targets in the photos, coded ones (ArUco, AprilTag) and black-and-white quadrants, where there are
+    control points or scale bars; those found where the geometry has them count as marks."""
+
+
 class GeorefConfig(StageConfig):
     max_position_error_m: Literal["auto"] | PositiveFloat = "auto"
     """Photo positions further than this from the robust fit are named and left out of it. Auto: the positions' noise is

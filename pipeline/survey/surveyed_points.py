@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -37,12 +37,14 @@ class Sighting:
         pixel: In the stored grid; (0, 0) is the top-left corner of the first pixel.
         index: Of the photo in the model; None where the photo has no pose.
         agrees: Whether the mark took part in the point's place.
+        automatic: Whether a target was found there, and nobody marked it.
     """
 
     photo: str
     pixel: tuple[float, float]
     index: int | None
     agrees: bool = True
+    automatic: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,17 @@ class Survey:
         return [point for point in self.points if point.role == role]
 
 
+# Pixels by point and photo, of a survey whose hand-made marks are located already.
+TargetFinder = Callable[[Survey], Mapping[str, Mapping[str, tuple[float, float]]]]
+
+
 def load_survey(
-    path: Path, config: GeorefConfig, photos: Mapping[str, Photo], model: SparseModel, report: Reporter
+    path: Path,
+    config: GeorefConfig,
+    photos: Mapping[str, Photo],
+    model: SparseModel,
+    report: Reporter,
+    find_targets: TargetFinder | None = None,
 ) -> Survey:
     """Read a control file and find its points in the model.
 
@@ -109,6 +120,7 @@ def load_survey(
         photos: All photos of the capture by name.
         model: The sparse model.
         report: Takes warnings of marks and photos that cannot be used.
+        find_targets: Gives marks of points that targets in the photos are.
 
     Raises:
         SplatpipeError: if the file is none, or not of these photos.
@@ -123,6 +135,14 @@ def load_survey(
         locate(SurveyPoint(point, "control", "", tuple(seen)), model, photos, config.mark_sigma_px)
         for point, seen in zip(file.points, sightings, strict=True)
     ]
+    if find_targets is not None:
+        points = _with_targets(points, find_targets(Survey(file, crs, path.name, tuple(points))), model, photos, config)
+    if not any(point.sightings for point in points):
+        report.warning(
+            f"{path.name} has points but no marks of them in photos, and no targets were found that they are.",
+            "Mark each point in at least two, better four photos: splatpipe view OUT --mark.",
+        )
+        return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
     if file.zero_heights:
         report.note(
             f"A height of 0.0 is taken as unknown: {some(file.zero_heights)} of {path.name} "
@@ -130,6 +150,30 @@ def load_survey(
         )
     _tell_unusable(points, path.name, model, photos, report)
     return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
+
+
+def _with_targets(
+    points: Sequence[SurveyPoint],
+    found: Mapping[str, Mapping[str, tuple[float, float]]],
+    model: SparseModel,
+    photos: Mapping[str, Photo],
+    config: GeorefConfig,
+) -> list[SurveyPoint]:
+    """The points with what targets tell of them; where somebody marked a photo, that counts."""
+    index, result = {photo: k for k, photo in enumerate(model.names)}, []
+    for point in points:
+        marked = {sighting.photo for sighting in point.sightings}
+        new = [
+            Sighting(photo, pixel, index.get(photo), automatic=True)
+            for photo, pixel in found.get(point.name, {}).items()
+            if photo not in marked
+        ]
+        if new:
+            every = tuple(sorted([*point.sightings, *new], key=lambda sighting: sighting.photo))
+            fresh = SurveyPoint(point.surveyed, "control", "", every)
+            point = locate(fresh, model, photos, config.mark_sigma_px)
+        result.append(point)
+    return result
 
 
 def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], mark_sigma_px: float) -> SurveyPoint:
@@ -209,9 +253,7 @@ def _tell_marks(
     name: str, marks: int, missing: Sequence[str], outside: Sequence[str], report: Reporter, all_missing: bool
 ) -> None:
     if marks == 0:
-        raise SplatpipeError(
-            f"{name} has points but no marks of them in photos.", "Mark each point in at least two, better four photos."
-        )
+        return
     if all_missing:
         raise SplatpipeError(
             f"None of the photos that {name} names is in this capture: {some(missing)}.",

@@ -76,6 +76,7 @@ class ViewerScene:
         sky: In front of the background; None for none.
         note: A sentence about the frame and its accuracy, for the help.
         focus: Which sparse points the page begins at, and turns about; None for all.
+        placed: Whether east, north and the place mean something, where lengths do.
     """
 
     title: str
@@ -91,6 +92,7 @@ class ViewerScene:
     sky: ViewerSky | None = None
     note: str = ""
     focus: Bool[np.ndarray, " n"] | None = None
+    placed: bool = True
 
 
 def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
@@ -118,7 +120,7 @@ def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
         subtitle=_subtitle(scene),
         crs=_crs_line(scene),
         note=scene.note,
-        north=scene.metres,
+        north=scene.metres and scene.placed,
         style=Markup(asset("viewer.css")),
         facts=Markup(_script_safe(json.dumps(facts, ensure_ascii=False, allow_nan=False))),
         splat=Markup(carried),
@@ -198,6 +200,8 @@ def _crs_line(scene: ViewerScene) -> str:
     if scene.crs is not None:
         datum = "datum not known" if scene.crs.heights == UNKNOWN else scene.crs.heights
         return f"{scene.crs.name} ({scene.crs.id}), heights: {datum}"
+    if scene.metres and not scene.placed:
+        return "metres by scale bars; place and heading are arbitrary"
     return "local east, north, up, metres" if scene.metres else "arbitrary units: the photos say nothing of the scale"
 
 

@@ -62,6 +62,8 @@ def _frame_facts(
 ) -> list[tuple[str, str]]:
     frame, control, report = parts
     if frame.get("kind") != "enu":
+        if frame.get("metres"):
+            return [("Frame", "z up, in metres by scale bars; place and heading are arbitrary")]
         return [("Frame", "z up; scale, place and heading are arbitrary: no metres")]
     origin = frame["origin"]
     place = f"{origin['latitude']:.7f}°, {origin['longitude']:.7f}°, {number(origin['height_m'])} m"

@@ -1,0 +1,152 @@
+"""Coded square targets in a photo, ArUco's and AprilTag's: which they are, and where their centres are.
+
+OpenCV's detector finds dark squares and reads them (Garrido-Jurado et al., "Automatic generation and detection of
+highly reliable fiducial markers under occlusion", Pattern Recognition 2014; Olson, "AprilTag", ICRA 2011). Small ones
+are read in an enlarged picture: a cell of two pixels blurs into its neighbours otherwise.
+
+Dictionaries with few bits read something into noise: of those with 16 bits no error is corrected. A square that two
+dictionaries read is told as both: the names of control points say which one is meant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+# OpenCV's smaller ones of a family are the first ids of the largest but for 4X4_1000 and others of another distance.
+DICTIONARIES = (
+    "DICT_APRILTAG_36h11",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_16h5",
+    "DICT_4X4_250",
+    "DICT_5X5_250",
+    "DICT_6X6_250",
+    "DICT_7X7_250",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12",
+)
+ENLARGED = 2
+SMALLEST_PX = 12.0  # side of a black square
+LARGEST_SHARE = 0.9  # of the picture's longer side
+TILE_PX, OVERLAP_PX = 1536, 160  # enlarged pictures are looked at in pieces, for the memory; larger squares as they are
+SAMPLES = 3  # along a cell's side
+LEAST_CORRELATION = 0.7  # of what is seen with what the dictionary has there
+LEAST_CONTRAST = 25.0  # of 255
+CENTRE_SIGMA_PX = 0.1
+
+
+@dataclass(frozen=True)
+class CodedTarget:
+    """A target found.
+
+    Attributes:
+        dictionary: OpenCV's name without ``DICT_``, in small letters.
+        number: Its id.
+        x: Of its centre, pixels; (0, 0) is the top-left corner of the first pixel.
+        y: The same.
+        size_px: The root of its black square's area.
+        sigma_px: Standard deviation of x and y.
+        score: Correlation of the pixels with the pattern.
+    """
+
+    dictionary: str
+    number: int
+    x: float
+    y: float
+    size_px: float
+    sigma_px: float
+    score: float
+
+
+def find_coded_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[CodedTarget]:
+    """Find targets in a picture.
+
+    Args:
+        pixels: RGB.
+
+    Returns:
+        By their dictionaries, ids and places.
+    """
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    height, width = grey.shape
+    found: list[CodedTarget] = []
+    if max(height, width) > TILE_PX:
+        found = _found_in(grey, 1, SMALLEST_PX * ENLARGED)
+    for top in _starts(height):
+        for left in _starts(width):
+            tile = np.ascontiguousarray(grey[top : top + TILE_PX, left : left + TILE_PX])
+            for target in _found_in(tile, ENLARGED, SMALLEST_PX):
+                there = replace(target, x=target.x + left, y=target.y + top)
+                found = [other for other in found if not _same(other, there)] + [there]
+    return sorted(found, key=lambda target: (target.dictionary, target.number, target.y, target.x))
+
+
+def _starts(length: int) -> list[int]:
+    """Where tiles begin that cover a side."""
+    return list(range(0, max(length - OVERLAP_PX, 1), TILE_PX - OVERLAP_PX))
+
+
+def _same(a: CodedTarget, b: CodedTarget) -> bool:
+    named = (a.dictionary, a.number) == (b.dictionary, b.number)
+    return named and np.hypot(a.x - b.x, a.y - b.y) < 0.5 * min(a.size_px, b.size_px)
+
+
+def _found_in(grey: UInt8[np.ndarray, "h w"], scale: int, smallest_px: float) -> list[CodedTarget]:
+    """Those in a picture that is enlarged by a factor first."""
+    height, width = grey.shape
+    if min(height, width) < smallest_px:
+        return []
+    large = grey
+    if scale > 1:
+        large = cv2.resize(grey, (width * scale, height * scale), interpolation=cv2.INTER_CUBIC)
+    names = list(DICTIONARIES)
+    dictionaries = [cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)) for name in names]
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = 4.0 * smallest_px / max(height, width)
+    parameters.maxMarkerPerimeterRate = 4.0 * LARGEST_SHARE
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+    detector = cv2.aruco.ArucoDetector(dictionaries, parameters)
+    corners, ids, _, which = detector.detectMarkersMultiDict(large)
+    found = []
+    for quad, number, index in zip(
+        corners, [] if ids is None else ids.ravel(), [] if ids is None else which.ravel(), strict=True
+    ):
+        # Centres of pixels are whole numbers to OpenCV, in the enlarged picture too.
+        square = (quad.reshape(4, 2).astype(np.float64) + 0.5) / scale
+        target = _judged(grey, square, dictionaries[int(index)], int(number), names[int(index)])
+        if target is not None:
+            found.append(target)
+    return found
+
+
+def _judged(
+    grey: UInt8[np.ndarray, "h w"],
+    square: Float64[np.ndarray, "4 2"],
+    dictionary: cv2.aruco.Dictionary,
+    number: int,
+    name: str,
+) -> CodedTarget | None:
+    """The target, if its pixels are those of one."""
+    cells = dictionary.markerSize + 2
+    ideal = dictionary.generateImageMarker(number, cells * SAMPLES).astype(np.float32)
+    plane = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
+    homography = cv2.getPerspectiveTransform(plane, square.astype(np.float32)).astype(np.float64)
+    steps = (np.arange(cells * SAMPLES) + 0.5) / (cells * SAMPLES)
+    u, v = np.meshgrid(steps, steps)
+    there = np.stack([u, v, np.ones_like(u)], axis=-1) @ homography.T
+    x, y = there[..., 0] / there[..., 2] - 0.5, there[..., 1] / there[..., 2] - 0.5
+    seen = cv2.remap(grey, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).astype(np.float32)
+    area = 0.5 * abs(
+        float(np.dot(square[:, 0], np.roll(square[:, 1], -1)) - np.dot(square[:, 1], np.roll(square[:, 0], -1)))
+    )
+    score = float(np.corrcoef(seen.ravel(), ideal.ravel())[0, 1]) if seen.std() > 0.0 else 0.0
+    contrast = float(seen[ideal > 127].mean() - seen[ideal <= 127].mean())
+    if score < LEAST_CORRELATION or contrast < LEAST_CONTRAST:
+        return None
+    centre = homography @ np.array([0.5, 0.5, 1.0])
+    middle = centre[:2] / centre[2]
+    told = name.removeprefix("DICT_").lower()
+    return CodedTarget(told, number, float(middle[0]), float(middle[1]), float(np.sqrt(area)), CENTRE_SIGMA_PX, score)

@@ -1,0 +1,221 @@
+"""Two lines through a point that part bright from dark, fitted to the pixels around it, blurred."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+
+FIRST_BLUR_PX = 0.8
+BLUR_BOUNDS_PX = (0.25, 4.8)
+LONGEST_STEP = np.array([1.0, 1.0, 0.3, 0.3, np.inf, np.inf, 0.5])
+RING_PX, RING_STEPS = 2.8, 32
+NEAR_PX = 3.5  # of the first fit, about places
+NEAR_ROUNDS = 6
+AT_ONCE = 4096  # places, for the memory
+ROUNDS = 12
+LEAST_PIXELS = 14
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Two lines through a point, and what lies between them.
+
+    Attributes:
+        values: x, y, two angles, the middle brightness, half the contrast, the blur (of a hyperbolic tangent).
+    """
+
+    values: Float64[np.ndarray, " 7"]
+
+    def directions(self) -> Float64[np.ndarray, "2 2"]:
+        """Of the lines."""
+        angles = self.values[2:4]
+        return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def sampled(
+    grey: Float32[np.ndarray, "h w"], x: Float32[np.ndarray, "n m"], y: Float32[np.ndarray, "n m"]
+) -> Float32[np.ndarray, "n m"]:
+    """Bilinear, in pieces that remap can take (fewer than 32,768 rows)."""
+    if len(x) == 0:
+        return np.zeros_like(x)
+    pieces = [
+        cv2.remap(grey, x[k : k + 30_000], y[k : k + 30_000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for k in range(0, len(x), 30_000)
+    ]
+    return np.concatenate(pieces)
+
+
+def ring_about(
+    grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"], radius: float
+) -> Float64[np.ndarray, "n steps"]:
+    """Brightness on a circle about each place."""
+    angles = 2.0 * np.pi * np.arange(RING_STEPS) / RING_STEPS
+    x = (places[:, 0, None] + radius * np.cos(angles)).astype(np.float32)
+    y = (places[:, 1, None] + radius * np.sin(angles)).astype(np.float32)
+    return sampled(grey, x, y).astype(np.float64)
+
+
+def lines_about(
+    grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
+) -> tuple[Float64[np.ndarray, "k 7"], Float64[np.ndarray, " k"]]:
+    """Lines through places, fitted to the pixels near by, and the correlation with these, of places that have any."""
+    found, scores = [np.zeros((0, 7))], [np.zeros(0)]
+    for first in range(0, len(places), AT_ONCE):
+        values = _starts(grey, places[first : first + AT_ONCE])
+        values, score = _fit_near(grey, values)
+        found.append(values)
+        scores.append(score)
+    return np.concatenate(found), np.concatenate(scores)
+
+
+def _starts(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "k 7"]:
+    """Lines where the ring about a place crosses its middle."""
+    ring, half = ring_about(grey, places, RING_PX), RING_STEPS // 2
+    ring = (ring[:, :half] + ring[:, half:]) / 2.0
+    low, high = ring.min(axis=1), ring.max(axis=1)
+    middle = (low + high) / 2.0
+    after = np.roll(ring, -1, axis=1)
+    crosses = (ring > middle[:, None]) != (after > middle[:, None])
+    two = crosses.sum(axis=1) == 2
+    ring, after, middle, crosses = ring[two], after[two], middle[two], crosses[two]
+    at = np.nonzero(crosses)[1].reshape(-1, 2)
+    rows = np.arange(len(at))[:, None]
+    angles = np.pi / half * (at + (middle[:, None] - ring[rows, at]) / (after[rows, at] - ring[rows, at]))
+    # Bright lies between the first and the second line, or dark does.
+    sign = np.where(ring[rows[:, 0], (at[:, 0] + 1) % half] > middle, 1.0, -1.0)
+    contrast = sign * (high[two] - low[two]) / 2.0
+    blur = np.full(len(at), FIRST_BLUR_PX)
+    return np.concatenate([places[two], angles, np.stack([middle, contrast, blur], axis=1)], axis=1)
+
+
+def _fit_near(
+    grey: Float32[np.ndarray, "h w"], values: Float64[np.ndarray, "n 7"]
+) -> tuple[Float64[np.ndarray, "n 7"], Float64[np.ndarray, " n"]]:
+    """Least squares over the pixels of a disc, all places at once, each with a damping of its own."""
+    reach = int(NEAR_PX) + 1
+    column, row = (v.ravel() for v in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
+    disc = column**2 + row**2 <= NEAR_PX**2
+    middle = np.rint(values[:, :2]).astype(np.int64)
+    x = np.clip(middle[:, :1] + column[disc], 0, grey.shape[1] - 1)
+    y = np.clip(middle[:, 1:] + row[disc], 0, grey.shape[0] - 1)
+    seen = grey[y, x].astype(np.float64)
+    damping = np.full(len(values), 1e-3)
+    shown, derivatives = model(values, x, y)
+    cost = ((seen - shown) ** 2).sum(axis=1)
+    for _ in range(NEAR_ROUNDS):
+        trial = _stepped(values, seen - shown, derivatives, damping)
+        shown_there, derivatives_there = model(trial, x, y)
+        there = ((seen - shown_there) ** 2).sum(axis=1)
+        better = there < cost
+        values = np.where(better[:, None], trial, values)
+        shown = np.where(better[:, None], shown_there, shown)
+        derivatives = np.where(better[:, None, None], derivatives_there, derivatives)
+        cost = np.where(better, there, cost)
+        damping = np.where(better, damping / 5.0, damping * 8.0)
+    return values, correlation(seen, shown)
+
+
+def fit_within(grey: Float32[np.ndarray, "h w"], lines: Lines, reach: Float64[np.ndarray, " 2"]) -> Lines | None:
+    """Least squares over the pixels within an ellipse; None where it has too few.
+
+    Args:
+        grey: The picture.
+        lines: To begin with.
+        reach: Along the lines, which are conjugate diameters of the ellipse.
+    """
+    around = pixels_within(grey, lines, reach)
+    if around is None:
+        return None
+    x, y, seen = (v[None] for v in around)
+    values, damping = lines.values[None], np.full(1, 1e-3)
+    shown, derivatives = model(values, x, y)
+    cost = float(((seen - shown) ** 2).sum())
+    for _ in range(ROUNDS):
+        trial = _stepped(values, seen - shown, derivatives, damping)
+        shown_there, derivatives_there = model(trial, x, y)
+        there = float(((seen - shown_there) ** 2).sum())
+        if there >= cost:
+            damping = damping * 8.0
+            continue
+        settled = cost - there < 1e-5 * cost
+        values, shown, derivatives, cost = trial, shown_there, derivatives_there, there
+        damping = damping / 5.0
+        if settled:
+            break
+    return Lines(values[0]) if np.isfinite(values).all() else None
+
+
+def _stepped(
+    values: Float64[np.ndarray, "n 7"],
+    residuals: Float64[np.ndarray, "n m"],
+    derivatives: Float64[np.ndarray, "n m 7"],
+    damping: Float64[np.ndarray, " n"],
+) -> Float64[np.ndarray, "n 7"]:
+    """A step of Levenberg and Marquardt, bounded."""
+    normal = np.einsum("nmi,nmj->nij", derivatives, derivatives)
+    diagonal = np.einsum("nii->ni", normal) + 1e-9
+    normal = normal + (damping[:, None] * diagonal)[:, :, None] * np.eye(7)
+    step = np.linalg.solve(normal, np.einsum("nmi,nm->ni", derivatives, residuals)[:, :, None])[:, :, 0]
+    trial = values + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+    trial[:, 6] = np.clip(trial[:, 6], *BLUR_BOUNDS_PX)
+    return np.asarray(trial)
+
+
+def model(
+    values: Float64[np.ndarray, "n 7"], x: Float64[np.ndarray, "n m"], y: Float64[np.ndarray, "n m"]
+) -> tuple[Float64[np.ndarray, "n m"], Float64[np.ndarray, "n m 7"]]:
+    """Brightness of two blurred edges' product, and its derivatives.
+
+    A blurred edge is nearly a hyperbolic tangent, which is cheap.
+    """
+    cx, cy, first, second, middle, contrast, blur = (values[:, k, None] for k in range(7))
+    dx, dy = x - cx, y - cy
+    # Signed distances: positive to the left of the first line, to the right of the second.
+    u = -np.sin(first) * dx + np.cos(first) * dy
+    v = np.sin(second) * dx - np.cos(second) * dy
+    p, q = np.tanh(u / blur), np.tanh(v / blur)
+    dp, dq = contrast * q * (1.0 - p * p) / blur, contrast * p * (1.0 - q * q) / blur
+    derivatives = np.stack(
+        [
+            dp * np.sin(first) - dq * np.sin(second),
+            -dp * np.cos(first) + dq * np.cos(second),
+            -dp * (np.cos(first) * dx + np.sin(first) * dy),
+            dq * (np.cos(second) * dx + np.sin(second) * dy),
+            np.ones_like(u),
+            p * q,
+            -(dp * u + dq * v) / blur,
+        ],
+        axis=2,
+    )
+    return middle + contrast * p * q, derivatives
+
+
+def correlation(seen: Float64[np.ndarray, "n m"], shown: Float64[np.ndarray, "n m"]) -> Float64[np.ndarray, " n"]:
+    """Of each row with the other's."""
+    a, b = seen - seen.mean(axis=1, keepdims=True), shown - shown.mean(axis=1, keepdims=True)
+    return np.asarray((a * b).sum(axis=1) / np.maximum(np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1)), 1e-9))
+
+
+def pixels_within(
+    grey: Float32[np.ndarray, "h w"], lines: Lines, reach: Float64[np.ndarray, " 2"]
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]] | None:
+    """Pixels within the ellipse that has the lines' reaches as conjugate half diameters."""
+    axes = lines.directions() * reach[:, None]
+    span = np.abs(axes).sum(axis=0)
+    height, width = grey.shape
+    cx, cy = lines.values[:2].tolist()
+    left, right = int(np.floor(cx - span[0])), int(np.ceil(cx + span[0])) + 1
+    top, bottom = int(np.floor(cy - span[1])), int(np.ceil(cy + span[1])) + 1
+    left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
+    if right - left < 3 or bottom - top < 3 or abs(np.linalg.det(axes)) < 1.0:
+        return None
+    column, row = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
+    away = np.stack([column.ravel() - cx, row.ravel() - cy], axis=1) @ np.linalg.inv(axes)
+    inside = (away**2).sum(axis=1) <= 1.0
+    if inside.sum() < LEAST_PIXELS:
+        return None
+    x, y = column.ravel()[inside].astype(np.float64), row.ravel()[inside].astype(np.float64)
+    return x, y, grey[top:bottom, left:right].ravel()[inside].astype(np.float64)

@@ -1,0 +1,270 @@
+"""Black-and-white quadrant targets in a photo, as surveyors paint and lay them out: their centres, sub-pixel.
+
+Where two dark and two bright sectors meet, brightness has a saddle: the determinant of its Hessian is negative there
+(Sinzinger, "A model-based approach to junction detection using radial energy", 2008, and Geiger et al., "Automatic
+camera and range sensor calibration using a single shot", ICRA 2012, look for such corners on calibration boards). Few
+saddles pass a ring around them on which brightness crosses its middle four times and looks the same from the other
+side. To those a pair of lines through one point, blurred, is fitted by least squares, within what the target covers;
+how far that reaches is told by the contrast across the lines. What is no target fails one of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from splatpipe.pipeline.photos.quadrant_lines import (
+    RING_PX,
+    RING_STEPS,
+    Lines,
+    correlation,
+    fit_within,
+    lines_about,
+    model,
+    pixels_within,
+    ring_about,
+    sampled,
+)
+
+SADDLE_SIGMA_PX = 1.0  # less lets noise in, more loses targets of 12 px seen aslant
+LEAST_CONTRAST = 40.0  # of white over black, of 255
+BLURRED_SIGMA_PX = 1.5  # of a saddle that is found still: the lens's, the motion's and ours together
+LEAST_SADDLE = LEAST_CONTRAST / (np.pi * BLURRED_SIGMA_PX**2)  # a quadrant's is contrast / (π σ²) at its centre
+MOST_SADDLES = 100_000  # of a piece, the strongest
+RINGS_PX = (2.0, RING_PX)
+LIKE_ITSELF = 0.75  # correlation of a ring with itself, turned by half
+RING_CONTRAST = 0.65  # of the least contrast: blur takes of it near the centre
+RING_DARK = 0.7  # darkest over brightest: above what a target is judged by, for the same reason
+ACROSS_PX = 1.5  # from a line to where its sides are looked at
+REACH_PX = 64  # along a line; a larger target is one whose lines go on at least so far
+LEAST_REACH_PX = 2.5
+EVEN = 0.55  # of the reaches of a line to both sides
+STEP_PX = 0.5
+TILE_PX, OVERLAP_PX = 2048, 2 * REACH_PX + 16  # large pictures are looked at in pieces, for the memory
+DIFFERENCES = 0.5  # of the contrast, from which on down a line has come to its end
+FIT_SHARE = 0.7  # of the reach, within which pixels are fitted: those of four triangles, too
+LEAST_FIT_PX = 2.2
+LARGEST_FIT_PX = 14.0  # more pixels tell hardly more
+MOST_MOVED_PX = 2.5  # from where the lines near by meet
+APART_PX = 3.0  # one target has one centre
+NEAR_CORRELATION = 0.9  # of the first fit
+LEAST_CORRELATION = 0.978
+LEAST_ANGLE_DEG = 18.0  # between the lines
+MOST_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
+LEAST_NEUTRAL = 0.75  # of white less black: the least colour's over the largest's
+MOST_BLUR_PX = 1.6
+LEAST_SIZE_PX = 9.0
+
+
+@dataclass(frozen=True)
+class QuadrantTarget:
+    """A target found.
+
+    Attributes:
+        x: Of its centre, pixels; (0, 0) is the top-left corner of the first pixel.
+        y: The same.
+        size_px: The root of the area that its lines span.
+        sigma_px: Standard deviation of x and y that the fit states.
+        score: Correlation of the pixels with the fitted pattern.
+    """
+
+    x: float
+    y: float
+    size_px: float
+    sigma_px: float
+    score: float
+
+
+def find_quadrant_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
+    """Find targets in a picture.
+
+    Args:
+        pixels: RGB.
+
+    Returns:
+        From the top down.
+    """
+    found: list[QuadrantTarget] = []
+    for top in range(0, max(pixels.shape[0] - OVERLAP_PX, 1), TILE_PX - OVERLAP_PX):
+        for left in range(0, max(pixels.shape[1] - OVERLAP_PX, 1), TILE_PX - OVERLAP_PX):
+            for target in _found_in(np.ascontiguousarray(pixels[top : top + TILE_PX, left : left + TILE_PX])):
+                there = replace(target, x=target.x + left, y=target.y + top)
+                if all(np.hypot(there.x - other.x, there.y - other.y) > APART_PX for other in found):
+                    found.append(there)
+    return sorted(found, key=lambda target: (target.y, target.x))
+
+
+def _found_in(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
+    """The targets in a piece of a picture."""
+    if min(pixels.shape[:2]) < 4 * int(RINGS_PX[-1]):
+        return []
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    places = _saddles(grey)
+    values, scores = lines_about(grey, places[_ring_like(grey, places)])
+    dark = (values[:, 4] - np.abs(values[:, 5])) / np.maximum(values[:, 4] + np.abs(values[:, 5]), 1e-9)
+    worth = (scores > NEAR_CORRELATION) & (dark < RING_DARK) & (2.0 * np.abs(values[:, 5]) > LEAST_CONTRAST)
+    found: list[QuadrantTarget] = []
+    for k in np.flatnonzero(worth).tolist():
+        x, y = (values[k, :2] + 0.5).tolist()
+        if all(np.hypot(x - other.x, y - other.y) > APART_PX for other in found):
+            target = _fitted(grey, pixels, Lines(values[k]))
+            if target is not None:
+                found.append(target)
+    return found
+
+
+def _saddles(grey: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "n 2"]:
+    """Places of strong saddles, the strongest first; (0, 0) is the first pixel's centre."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), SADDLE_SIGMA_PX)
+    # The kernels are 2 to the power of their orders too large.
+    xx, yy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, scale=0.25), cv2.Sobel(smooth, cv2.CV_32F, 0, 2, scale=0.25)
+    saddle = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, scale=0.25)
+    cv2.multiply(saddle, saddle, saddle)
+    cv2.multiply(xx, yy, xx)
+    cv2.subtract(saddle, xx, saddle)
+    largest = cv2.dilate(saddle, np.ones((3, 3), np.uint8))
+    rows, columns = np.nonzero((saddle >= largest) & (saddle > LEAST_SADDLE**2))
+    border = int(np.ceil(RINGS_PX[-1])) + 1
+    height, width = grey.shape
+    inside = (rows >= border) & (rows < height - border) & (columns >= border) & (columns < width - border)
+    rows, columns = rows[inside], columns[inside]
+    order = np.argsort(-saddle[rows, columns], kind="stable")[:MOST_SADDLES]
+    rows, columns = rows[order], columns[order]
+    return np.asarray(np.stack([columns, rows], axis=1) + _to_level(smooth, rows, columns))
+
+
+def _to_level(
+    smooth: Float32[np.ndarray, "h w"], rows: Int64[np.ndarray, " n"], columns: Int64[np.ndarray, " n"]
+) -> Float64[np.ndarray, "n 2"]:
+    """From pixels to where the brightness about them is level (a step of Newton), a pixel at most."""
+    patch = np.stack([[smooth[rows + y, columns + x] for x in (-1, 0, 1)] for y in (-1, 0, 1)]).astype(np.float64)
+    gx, gy = (patch[1, 2] - patch[1, 0]) / 2.0, (patch[2, 1] - patch[0, 1]) / 2.0
+    xx, yy = patch[1, 2] + patch[1, 0] - 2.0 * patch[1, 1], patch[2, 1] + patch[0, 1] - 2.0 * patch[1, 1]
+    xy = (patch[2, 2] + patch[0, 0] - patch[2, 0] - patch[0, 2]) / 4.0
+    det = np.minimum(xx * yy - xy * xy, -1e-6)
+    return np.asarray(np.clip(np.stack([(xy * gy - yy * gx) / det, (xy * gx - xx * gy) / det], axis=1), -1.0, 1.0))
+
+
+def _ring_like(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Which places have two bright and two dark sectors around them, the same from both sides."""
+    good = np.ones(len(places), dtype=bool)
+    for radius in RINGS_PX:
+        chosen = np.flatnonzero(good)
+        if len(chosen) == 0:
+            break
+        ring = ring_about(grey, places[chosen], radius)
+        low, high = ring.min(axis=1), ring.max(axis=1)
+        above = ring > ((low + high) / 2.0)[:, None]
+        crossings = (above != np.roll(above, 1, axis=1)).sum(axis=1)
+        centred = ring - ring.mean(axis=1, keepdims=True)
+        power = (centred**2).sum(axis=1)
+        alike = (centred * np.roll(centred, RING_STEPS // 2, axis=1)).sum(axis=1)
+        good[chosen] = (
+            (crossings == 4)
+            & (high - low > RING_CONTRAST * LEAST_CONTRAST)
+            & (low < RING_DARK * high)
+            & (alike > LIKE_ITSELF * np.maximum(power, 1e-6))
+        )
+    return good
+
+
+def _fitted(
+    grey: Float32[np.ndarray, "h w"], pixels: UInt8[np.ndarray, "h w 3"], start: Lines
+) -> QuadrantTarget | None:
+    """The target whose lines begin so; None where there is none."""
+    reach = _reach(grey, start)
+    lines = None if reach is None else fit_within(grey, start, _fitted_part(reach))
+    if lines is None or np.hypot(*(lines.values[:2] - start.values[:2])) > MOST_MOVED_PX:
+        return None
+    reach = _reach(grey, lines)
+    return None if reach is None else _judged(grey, pixels, lines, reach)
+
+
+def _fitted_part(reach: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
+    return np.clip(FIT_SHARE * reach, LEAST_FIT_PX, LARGEST_FIT_PX)
+
+
+def _reach(grey: Float32[np.ndarray, "h w"], lines: Lines) -> Float64[np.ndarray, " 2"] | None:
+    """How far the contrast across each line goes, the mean of both ways; None where that is no target's."""
+    cx, cy, contrast = lines.values[0], lines.values[1], 2.0 * abs(lines.values[5])
+    if contrast < LEAST_CONTRAST:
+        return None
+    steps = np.arange(1.0, REACH_PX, STEP_PX)
+    reaches = []
+    directions = lines.directions()
+    sine = abs(float(np.cross(directions[0], directions[1])))
+    if sine < np.sin(np.radians(LEAST_ANGLE_DEG)):
+        return None
+    for k in (0, 1):
+        along, aside = directions[k], directions[1 - k] * (ACROSS_PX / sine)
+        ways = []
+        for way in (1.0, -1.0):
+            x, y = cx + way * steps * along[0], cy + way * steps * along[1]
+            sides = sampled(
+                grey,
+                np.stack([x + aside[0], x - aside[0]]).astype(np.float32),
+                np.stack([y + aside[1], y - aside[1]]).astype(np.float32),
+            )
+            # Positive as long as the sides are as the sectors at the centre have them.
+            sign = way * np.sign(lines.values[5]) * _side(directions, k)
+            difference = sign * (sides[0] - sides[1]) / contrast
+            ended = np.flatnonzero(difference[2:] < DIFFERENCES)
+            end = len(steps) if len(ended) == 0 else int(ended[0]) + 2
+            ways.append(float(steps[min(end, len(steps) - 1)]))
+        if min(ways) < EVEN * max(ways) or min(ways) < LEAST_REACH_PX:
+            return None
+        reaches.append(sum(ways) / 2.0)
+    return np.array(reaches)
+
+
+def _side(directions: Float64[np.ndarray, "2 2"], k: int) -> float:
+    """The sign of the model's product ahead on a line, on the side to which the other line points."""
+    ahead = directions[k] + 1e-3 * directions[1 - k]
+    u = -directions[0, 1] * ahead[0] + directions[0, 0] * ahead[1]
+    v = directions[1, 1] * ahead[0] - directions[1, 0] * ahead[1]
+    return float(np.sign(u * v))
+
+
+def _judged(
+    grey: Float32[np.ndarray, "h w"],
+    pixels: UInt8[np.ndarray, "h w 3"],
+    lines: Lines,
+    reach: Float64[np.ndarray, " 2"],
+) -> QuadrantTarget | None:
+    """The target, if its pixels are those of one."""
+    around = pixels_within(grey, lines, _fitted_part(reach))
+    if around is None or lines.values[6] > MOST_BLUR_PX:
+        return None
+    x, y, seen = around
+    shown, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
+    score = float(correlation(seen[None], shown[None])[0])
+    middle, half = float(lines.values[4]), abs(float(lines.values[5]))
+    if score < LEAST_CORRELATION or middle - half > MOST_DARK * (middle + half) or not _neutral(pixels, x, y, shown):
+        return None
+    variance = float(((seen - shown) ** 2).sum()) / max(len(seen) - 7, 1)
+    covariance = variance * np.linalg.pinv(derivatives.T @ derivatives)
+    sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2.0, 0.0)))
+    directions = lines.directions()
+    area = 4.0 * reach[0] * reach[1] * abs(float(np.cross(directions[0], directions[1])))
+    if area < LEAST_SIZE_PX**2:
+        return None
+    cx, cy = lines.values[:2].tolist()
+    return QuadrantTarget(cx + 0.5, cy + 0.5, float(np.sqrt(area)), sigma, score)
+
+
+def _neutral(
+    pixels: UInt8[np.ndarray, "h w 3"],
+    x: Float64[np.ndarray, " n"],
+    y: Float64[np.ndarray, " n"],
+    shown: Float64[np.ndarray, " n"],
+) -> bool:
+    """Whether what parts bright from dark is no colour."""
+    colours = pixels[y.astype(np.int64), x.astype(np.int64)].astype(np.float64)
+    bright = shown > shown.mean()
+    if not bright.any() or bright.all():
+        return False
+    difference = colours[bright].mean(axis=0) - colours[~bright].mean(axis=0)
+    return float(difference.min()) > LEAST_NEUTRAL * float(difference.max())

@@ -1,0 +1,146 @@
+"""Which of several places are which of several points: two constellations laid over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
+
+REACH_M = 25.0  # horizontally, by which a whole capture may be misplaced: a poor receiver's
+TOLERANCE_M = 1.5  # of points after the whole was moved: the frame of positions is turned a little
+LEAST_TOLERANCE_M = 0.15  # after the similarity: the model is bent a little
+RESIDUALS = 4.0  # times their median
+LEAST_MATCHES = 3  # fewer places lie like points by chance
+MOST_HYPOTHESES = 2000
+ROUNDS = 5
+FLAT = 0.1  # of the longest extent: what lies on a line tells no tilt
+WRONG = 3.0  # times the tolerance: a place that is known by its number is another point's
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """How places lie over points.
+
+    Attributes:
+        pairs: Rows of place and point.
+        residuals_m: Of them.
+        tolerance_m: What they may miss each other by.
+        points_from_places: The transformation.
+    """
+
+    pairs: Int64[np.ndarray, "k 2"]
+    residuals_m: Float64[np.ndarray, " k"]
+    tolerance_m: float
+    points_from_places: Similarity
+
+
+def overlay(
+    places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], known: Mapping[int, int]
+) -> Overlay | None:
+    """Find which places are which points.
+
+    Args:
+        places: Metres; roughly turned and scaled as the points are, but moved, unless three are known.
+        points: Metres; a height that is not known is NaN.
+        known: Points of some places, by the places' rows: they take part as they are.
+
+    Returns:
+        None where no way to lay them is better than all others.
+    """
+    if len(known) >= LEAST_MATCHES:
+        pairs = np.array(sorted(known.items()), dtype=np.int64).reshape(-1, 2)
+        start = _fitted(places, points, pairs)
+    else:
+        moved = _moved(places, points, known)
+        if moved is None:
+            return None
+        start = Similarity(1.0, np.eye(3), moved)
+    tolerance = TOLERANCE_M
+    current, pairs = start, np.zeros((0, 2), dtype=np.int64)
+    for _ in range(ROUNDS):
+        pairs, residuals = _assigned(current.apply(places), points, tolerance)
+        if len(pairs) < LEAST_MATCHES:
+            return None
+        current = _fitted(places, points, pairs)
+        residuals = _distances(current.apply(places)[pairs[:, 0]], points[pairs[:, 1]])
+        tolerance = min(TOLERANCE_M, max(LEAST_TOLERANCE_M, RESIDUALS * float(np.median(residuals))))
+    pairs, residuals = _assigned(current.apply(places), points, tolerance)
+    return Overlay(pairs, residuals, tolerance, current) if len(pairs) >= LEAST_MATCHES else None
+
+
+def _moved(
+    places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], known: Mapping[int, int]
+) -> Float64[np.ndarray, " 3"] | None:
+    """The translation that brings most places to points; None where two that differ bring as many."""
+    differences = points[None] - places[:, None]
+    near = np.hypot(differences[..., 0], differences[..., 1]) < REACH_M
+    if known:
+        chosen = np.zeros_like(near)
+        chosen[list(known.keys()), list(known.values())] = True
+        near &= chosen
+    rows, columns = np.nonzero(near)
+    stride = max(1, len(rows) // MOST_HYPOTHESES)
+    scored = []
+    for place, point in zip(rows[::stride].tolist(), columns[::stride].tolist(), strict=True):
+        shift = np.where(np.isnan(differences[place, point]), 0.0, differences[place, point])
+        pairs, residuals = _assigned(places + shift, points, TOLERANCE_M)
+        scored.append((len(pairs), -float(residuals.sum()), shift))
+    if not scored:
+        return None
+    scored.sort(key=lambda each: each[:2], reverse=True)
+    most, _, best = scored[0]
+    rivals = [each for each in scored if each[0] == most and np.hypot(*(each[2] - best)[:2]) > 2.0 * TOLERANCE_M]
+    return None if most < LEAST_MATCHES or rivals else best
+
+
+def _assigned(
+    places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], tolerance: float
+) -> tuple[Int64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
+    """Places and points that are nearest to each other, within a tolerance."""
+    if len(places) == 0 or len(points) == 0:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    away = _distances(places[:, None], points[None])
+    nearest = away.argmin(axis=0)
+    mutual = away.argmin(axis=1)[nearest] == np.arange(len(points))
+    distances = away[nearest, np.arange(len(points))]
+    good = np.flatnonzero(mutual & (distances <= tolerance))
+    return np.stack([nearest[good], good], axis=1).astype(np.int64), distances[good]
+
+
+def _distances(
+    places: Float64[np.ndarray, "*batch 3"], points: Float64[np.ndarray, "*other 3"]
+) -> Float64[np.ndarray, "*both"]:
+    difference = points - places
+    return np.asarray(np.linalg.norm(np.where(np.isnan(difference), 0.0, difference), axis=-1))
+
+
+def _fitted(
+    places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], pairs: Int64[np.ndarray, "k 2"]
+) -> Similarity:
+    """Least squares: of all seven, or without the tilt where the pairs do not tell it."""
+    source, target = places[pairs[:, 0]], points[pairs[:, 1]]
+    whole = np.isfinite(target).all(axis=1)
+    if _spread(source, whole):
+        size, rotation, translation = fit_similarity(source[whole], target[whole], np.ones(int(whole.sum())))
+        return Similarity(float(size), rotation, translation)
+    a, b = source[:, 0] + 1j * source[:, 1], target[:, 0] + 1j * target[:, 1]
+    extent = max(float(np.vdot(a - a.mean(), a - a.mean()).real), 1e-12)
+    factor = complex(np.vdot(a - a.mean(), b - b.mean())) / extent
+    scale: float = max(abs(factor), 1e-6)
+    turn = factor / scale
+    rotation = np.array([[turn.real, -turn.imag, 0.0], [turn.imag, turn.real, 0.0], [0.0, 0.0, 1.0]])
+    moved = target - scale * source @ rotation.T
+    lift = float(moved[whole, 2].mean()) if whole.any() else 0.0
+    return Similarity(scale, rotation, np.array([moved[:, 0].mean(), moved[:, 1].mean(), lift]))
+
+
+def _spread(source: Float64[np.ndarray, "k 3"], whole: Bool[np.ndarray, " k"]) -> bool:
+    """Whether places whose points have a height tell a rotation."""
+    if whole.sum() < LEAST_MATCHES:
+        return False
+    extents = np.linalg.svd(source[whole] - source[whole].mean(axis=0), compute_uv=False)
+    return bool(extents[1] > FLAT * extents[0])

@@ -1,0 +1,154 @@
+"""Targets and scale bars in georeferencing: marks for the control file's points, and metres for a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.photos.names import NameFinder, some
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.control_edit import ControlText
+from splatpipe.pipeline.survey.expected_places import expected_enu, free_enu
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.scale_bars import Scale, scale_by
+from splatpipe.pipeline.survey.surveyed_points import Survey
+from splatpipe.pipeline.survey.target_finds import TargetFind, WantedTargets
+from splatpipe.pipeline.survey.target_marks import Expected, TargetMarks, named_tracks
+
+SCALE_OFF = 3.0  # joint sigmas between the bars' scale and the frame's: worth a warning
+
+
+@dataclass(frozen=True)
+class TargetSurvey:
+    """Finds targets' names.
+
+    Attributes:
+        wanted: Control points and scale bars.
+        finds: Targets in photos.
+        model: The sparse model.
+        photos: All photos by name.
+        frame: Of the photos' positions; None where they give none.
+        approximate_crs: As georef's option.
+    """
+
+    wanted: WantedTargets
+    finds: tuple[TargetFind, ...]
+    model: SparseModel
+    photos: Mapping[str, Photo]
+    frame: Frame | None
+    approximate_crs: bool
+
+    def marks(self, seeds: Mapping[str, Float64[np.ndarray, " 3"]], report: Reporter) -> TargetMarks:
+        """The targets by their names; says what became of them.
+
+        Args:
+            seeds: Places of points that somebody marked.
+            report: Takes a note.
+        """
+        ends = sorted({name for bar in self.wanted.bars for name in (bar.a, bar.b)})
+        points = [name for name, *_ in self.wanted.points]
+        names = points + [name for name in ends if name not in points]
+        found = named_tracks(self.finds, names, (self.model, self.photos), self._expected(points), seeds)
+        if found.named:
+            marks = sum(len(each.track.finds) for each in found.named)
+            told = some([each.name for each in found.named])
+            report.note(f"Targets found in the photos: {told}, with {marks} marks.")
+        refused = [f"{count} {what}" for what, count in sorted(found.refused.items())]
+        if refused:
+            report.note(f"Targets not used: {', '.join(refused)}.")
+        return found
+
+    def _expected(self, points: list[str]) -> Expected | None:
+        if not points:
+            return None
+        try:
+            if self.frame is None:
+                return Expected(tuple(points), free_enu(self.wanted, self.approximate_crs), None)
+            enu = expected_enu(self.wanted, self.frame, self.model, self.approximate_crs)
+            return Expected(tuple(points), enu, self.frame.world_from_model)
+        except SplatpipeError:  # of the CRS; it is told where control is placed
+            return None
+
+
+def marker_of(
+    survey: TargetSurvey, control: Path, report: Reporter, seen: list[TargetMarks]
+) -> Callable[[Survey], dict[str, dict[str, tuple[float, float]]]]:
+    """What gives a control file's points the marks that targets are, but for photos that are said not to show them."""
+
+    def find(points: Survey) -> dict[str, dict[str, tuple[float, float]]]:
+        seeds = {point.name: point.found.xyz for point in points.points if point.found is not None}
+        found = survey.marks(seeds, report)
+        seen.append(found)
+        hidden = ControlText.read(control, NameFinder(sorted(survey.photos))).hidden
+        named = {point.name for point in points.points}
+        return {
+            name: {photo: pixel for photo, pixel in pixels.items() if (name, photo) not in hidden}
+            for name, pixels in found.pixels().items()
+            if name in named
+        }
+
+    return find
+
+
+def scale_of(
+    survey: TargetSurvey, found: TargetMarks, marked: Mapping[str, Float64[np.ndarray, " 3"]], report: Reporter
+) -> Scale | None:
+    """What the scale bars say of the model; warns of bars that contradict the others or were not found."""
+    bars = survey.wanted.bars
+    if not bars:
+        return None
+    places = dict(marked) | {each.name: each.track.place for each in found.named}
+    scale = scale_by(bars, places)
+    missing = [f"{bar.a} to {bar.b}" for bar in bars if bar.a not in places or bar.b not in places]
+    if missing:
+        report.warning(
+            f"{len(missing)} of {len(bars)} scale bars have a target that was not found: {some(missing)}.",
+            "Names of coded targets end in their number; each has to be sharp in two photos, with 20 pixels at least.",
+        )
+    if scale is None:
+        return None
+    wrong = [
+        f"{bar.a} to {bar.b} ({scale.errors_m[k]:+.3f} m)"
+        for k, bar in enumerate(bars)
+        if k not in scale.used and np.isfinite(scale.errors_m[k])
+    ]
+    if wrong:
+        report.warning(f"Scale bars contradict the others and are left out: {some(wrong)}.", "Measure them again.")
+    return scale
+
+
+def scaled(frame: Frame, scale: Scale) -> Frame:
+    """An arbitrary frame with the bars' metres."""
+    factor = scale.metres_per_unit / frame.world_from_model.scale
+    old = frame.world_from_model
+    similarity = Similarity(old.scale * factor, old.rotation, old.translation * factor)
+    upright = frame.note.partition(" Up is")[2]
+    note = f"Metres by {len(scale.used)} scale bars, good to {scale.sigma:.2%}; place and heading are arbitrary. Up is"
+    return replace(frame, world_from_model=similarity, metres=True, note=note + upright)
+
+
+def compare(frame: Frame, scale: Scale, report: Reporter) -> None:
+    """Say how far the frame's metres are the bars'."""
+    ratio = frame.world_from_model.scale / scale.metres_per_unit - 1.0
+    bars = f"{len(scale.used)} scale bars (good to {scale.sigma:.3%})"
+    what = f"By {bars} lengths in this result are {ratio:+.3%} off."
+    if abs(ratio) > SCALE_OFF * scale.sigma + 0.01:
+        report.warning(what, "Check the bars, and the coordinates or positions that the scale is from.")
+    else:
+        report.note(what)
+
+
+def scale_summary(scale: Scale | None) -> dict[str, JSON]:
+    """Of the stage."""
+    if scale is None:
+        return {}
+    errors = [None if not np.isfinite(error) else float(error) for error in scale.errors_m]
+    return {"scale_bars": len(scale.used), "scale_sigma": scale.sigma, "scale_bar_errors_m": errors}

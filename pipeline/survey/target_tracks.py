@@ -1,0 +1,163 @@
+"""Finds of one target in several photos: the point of the model where their rays meet."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.geometry.triangulation import Rays, triangulate
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.target_finds import TargetFind
+
+LEAST_TOLERANCE_PX = 3.0
+FIT_TOLERANCE = 4.0  # times the model's mean reprojection error
+LEAST_UNNAMED = 3  # photos of a target that carries no number: two rays meet by chance
+LEAST_CODED = 2
+MOST_PARTNERS = 40  # of a find, to make hypotheses with
+MOST_SEEDS = 4000
+BEYOND = 2.0  # how much farther, or nearer, than the sparse points that a photo shows a target may be
+
+
+@dataclass(frozen=True)
+class Track:
+    """A target in several photos.
+
+    Attributes:
+        kind: ``quadrant``, or its dictionary.
+        number: Of a coded one.
+        finds: One a photo, by the photos' names.
+        place: In the model.
+    """
+
+    kind: str
+    number: int | None
+    finds: tuple[TargetFind, ...]
+    place: Float64[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Finds in photos that have a pose, with their rays."""
+
+    finds: tuple[TargetFind, ...]
+    rays: Rays
+    tolerance_px: float
+
+    def only(self, chosen: Bool[np.ndarray, " n"]) -> _Seen:
+        kept = tuple(find for find, keep in zip(self.finds, chosen.tolist(), strict=True) if keep)
+        return _Seen(kept, self.rays.only(chosen), self.tolerance_px)
+
+
+def coded_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> list[Track]:
+    """Tracks of coded targets; of one number that meets in several places, the one that most photos show."""
+    groups: defaultdict[tuple[str, int], list[TargetFind]] = defaultdict(list)
+    for find in finds:
+        if find.number is not None:
+            groups[find.kind, find.number].append(find)
+    tracks = []
+    for _, group in sorted(groups.items()):
+        seen = _seen(group, model, photos)
+        track = None if seen is None else _track(seen, LEAST_CODED)
+        if track is not None:
+            tracks.append(track)
+    return tracks
+
+
+def unnamed_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> list[Track]:
+    """Tracks of targets that carry no number: which finds belong together is told by the geometry alone."""
+    seen = _seen(finds, model, photos)
+    tracks: list[Track] = []
+    if seen is None:
+        return tracks
+    reach = _reach(seen, model)
+    free = np.ones(len(seen.finds), dtype=bool)
+    for seed in range(min(len(seen.finds), MOST_SEEDS)):
+        if not free[seed]:
+            continue
+        group = _group(seen, seed, free, reach)
+        track = None if group.sum() < LEAST_UNNAMED else _track(seen.only(group), LEAST_UNNAMED)
+        if track is not None:
+            used = set(track.finds)
+            free &= np.array([find not in used for find in seen.finds])
+            tracks.append(track)
+        free[seed] = False
+    return tracks
+
+
+def _seen(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> _Seen | None:
+    index = {name: k for k, name in enumerate(model.names)}
+    posed = [find for find in finds if find.photo in index and find.photo in photos]
+    views = [model.view(index[find.photo], photos[find.photo].width) for find in posed]
+    rays = [view.ray(np.array([find.x, find.y])) for view, find in zip(views, posed, strict=True)]
+    pixels = [view.pixels_by_ray(ray) for view, ray in zip(views, rays, strict=True)]
+    good = [k for k in range(len(posed)) if np.isfinite(rays[k]).all() and np.isfinite(pixels[k]).all()]
+    if len(good) < 2:
+        return None
+    poses = np.stack([views[k].cam_from_model for k in good])
+    error = model.reconstruction.compute_mean_reprojection_error() / min(views[k].scale for k in good)
+    found = Rays(poses, np.stack([rays[k] for k in good]), np.stack([pixels[k] for k in good]))
+    return _Seen(tuple(posed[k] for k in good), found, max(LEAST_TOLERANCE_PX, FIT_TOLERANCE * float(error)))
+
+
+def _track(seen: _Seen, least: int) -> Track | None:
+    """The target whose rays meet; None where too few photos' do."""
+    found = triangulate(seen.rays, seen.tolerance_px)
+    if found is None:
+        return None
+    errors = np.linalg.norm(found.residuals_px, axis=1)
+    nearest: dict[str, int] = {}
+    for k in np.flatnonzero(found.agree).tolist():
+        photo = seen.finds[k].photo
+        if photo not in nearest or errors[k] < errors[nearest[photo]]:
+            nearest[photo] = k
+    if len(nearest) < least:
+        return None
+    chosen = tuple(seen.finds[nearest[photo]] for photo in sorted(nearest))
+    return Track(chosen[0].kind, chosen[0].number, chosen, found.xyz)
+
+
+def _reach(seen: _Seen, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
+    """The least and largest depth that each find's photo lets expect."""
+    depths: dict[str, tuple[float, float]] = {}
+    for name, number in zip(model.names, model.image_ids, strict=True):
+        image = model.reconstruction.images[number]
+        shown = [model.reconstruction.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]
+        pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+        depth = np.array(shown).reshape(-1, 3) @ pose[2, :3] + pose[2, 3]
+        low, high = np.percentile(depth, [1.0, 99.0]) if len(depth) else (0.0, np.inf)
+        depths[name] = float(low) / BEYOND, float(high) * BEYOND
+    return np.array([depths[find.photo] for find in seen.finds])
+
+
+def _group(
+    seen: _Seen, seed: int, free: Bool[np.ndarray, " n"], reach: Float64[np.ndarray, "n 2"]
+) -> Bool[np.ndarray, " n"]:
+    """The finds that agree best on what a find shows: its ray meets others', and each meeting has its witnesses."""
+    directions, centres = seen.rays.directions(), seen.rays.centres()
+    apart = np.array([find.photo != seen.finds[seed].photo for find in seen.finds])
+    partners = np.flatnonzero(free & apart)
+    best, group = (0, 0.0), np.zeros(len(seen.finds), dtype=bool)
+    d, e, between = directions[seed], directions[partners], centres[partners] - centres[seed]
+    cosine = e @ d
+    sine = np.maximum(1.0 - cosine**2, 1e-9)
+    along = (between @ d - cosine * np.einsum("ni,ni->n", between, e)) / sine
+    points = centres[seed] + along[:, None] * d
+    depth = points @ seen.rays.cam_from_world[seed, 2, :3] + seen.rays.cam_from_world[seed, 2, 3]
+    cameras, pixels, rays = (v[partners] for v in (seen.rays.cam_from_world, seen.rays.pixels, seen.rays.rays))
+    there = np.einsum("nij,nj->ni", cameras[:, :, :3], points) + cameras[:, :, 3]
+    ahead = there[:, 2] > 0.0
+    shown = there[:, :2] / np.where(ahead, there[:, 2], 1.0)[:, None]
+    gap = np.where(ahead, np.linalg.norm(np.einsum("nij,nj->ni", pixels, shown - rays), axis=1), np.inf)
+    meets = (depth > reach[seed, 0]) & (depth < reach[seed, 1]) & (gap < seen.tolerance_px) & (sine > 3e-4)
+    for point in points[meets][:MOST_PARTNERS]:
+        errors = np.linalg.norm(seen.rays.residuals_px(point), axis=1)
+        near = (errors < seen.tolerance_px) & free
+        score = len({seen.finds[k].photo for k in np.flatnonzero(near).tolist()}), -float(errors[near].mean())
+        if score > best:
+            best, group = score, near
+    return group
