@@ -85,7 +85,7 @@ def copy_of_run(undisturbed: Path, tmp_path: Path) -> Path:
 
 
 def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp_path: Path) -> None:
-    """georef anew, then only what reads the frame; once more with a point less, and with another CRS."""
+    """Targets and georef anew, then only what reads the frame; once more with a point less, and with another CRS."""
     lines = (capture_path().parent / "gcp_list.txt").read_text().splitlines()
     more = tmp_path / "more points.txt"
     more.write_text("\n".join(lines))
@@ -94,7 +94,7 @@ def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp
     before = json.loads((copy_of_run / "metrics.json").read_text())
     for file in (fewer, more):
         told = splatpipe("georef", copy_of_run, "--gcp", file)
-        assert ran(told) == ["georef", "evaluate", "export"]
+        assert ran(told) == ["control", "targets", "georef", "evaluate", "export"]
     after = json.loads((copy_of_run / "metrics.json").read_text())
     assert before["accuracy"]["splat"] is None and after["psnr"] == before["psnr"]
     tables = after["accuracy"]["tables"]
