@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.detail import (
     Brightness,
@@ -32,7 +32,6 @@ LEAST_SHARE = 0.2  # of the candidates: fewer agree by chance among many
 TOLERANCE_PX = 1.5  # at the low resolution
 ROUNDS = 1000  # of RANSAC
 CONFIDENCE = 0.999
-TURN_DEG = 180.0
 
 
 @dataclass(frozen=True)
@@ -120,9 +119,8 @@ def glimpse(photo: CheckedPhoto) -> Glimpse:
 def match_glimpses(glimpses: Sequence[Glimpse], pairs: Iterable[Pair], threads: int) -> dict[Pair, Agreement]:
     """Match pairs of photos; each with what agrees, nothing included."""
     listed = sorted(set(pairs))
-    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
-        found = pool.map(lambda pair: agreement(glimpses[pair[0]], glimpses[pair[1]]), listed)
-        return dict(zip(listed, found, strict=True))
+    found = ordered_map(lambda pair: agreement(glimpses[pair[0]], glimpses[pair[1]]), listed, threads)
+    return dict(zip(listed, found, strict=True))
 
 
 def agreement(first: Glimpse, second: Glimpse) -> Agreement:
@@ -140,11 +138,6 @@ def agreement(first: Glimpse, second: Glimpse) -> Agreement:
     if len(good) < max(LEAST_MATCHES, LEAST_SHARE * len(rows)):
         return NOTHING
     return Agreement(rows[good], columns[good])
-
-
-def counts(found: Mapping[Pair, Agreement]) -> dict[Pair, int]:
-    """How many keypoints agree, by pair."""
-    return {pair: len(agreed) for pair, agreed in found.items()}
 
 
 def _mutual(
