@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -429,3 +430,23 @@ def test_hundreds_of_photos_do_not_explode_it() -> None:
     chips = cut_chips(points, None, None)
     assert len(chips) == MOST_CHIPS
     assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(chips) and (0, 0) not in chips
+
+
+def test_no_folder_outside_out_is_told(copy_of_run: Path) -> None:
+    secret = "/home/jane doe/customers/Brown"
+    config = (copy_of_run / "config.toml").read_text()
+    photos = tomllib.loads(config)["photos"]
+    config = config.replace(photos, f"{secret}/photos").replace(
+        'control = "auto"', f'control = "{secret}/points 2.csv"'
+    )
+    (copy_of_run / "config.toml").write_text(config)
+    message = (
+        f"{secret}/photos/a.jpg and {copy_of_run}/x and {secret}/points 2.csv and /srv/backup/y and {Path.home()}/z"
+    )
+    warning = {"kind": "warning", "stage": "georef", "data": {"message": message, "hint": message}, "time_s": 1e9}
+    with (copy_of_run / "events.jsonl").open("a") as log:
+        log.write(json.dumps(warning) + "\n")
+    page = report_page(open_holdings(copy_of_run), drawn=False)
+    assert "PHOTOS/a.jpg and OUT/x and points 2.csv and y and z" in page
+    for folder in ("jane", "customers", "Brown", "/srv", str(copy_of_run.parent), f"{Path.home()}/"):
+        assert folder not in page
