@@ -22,6 +22,7 @@ from splatpipe.pipeline.app.batch.snakemake_process import open_profile, snakema
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
 from splatpipe.pipeline.app.batch.tries import NO_WORD, Ending, TryLog
 from splatpipe.pipeline.app.batch.workflow import workflow_text
+from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE
 from splatpipe.stages.line import LINE
 
@@ -291,3 +292,9 @@ def test_a_cell_of_the_table_is_never_a_formula() -> None:
     state = BatchState("night", (CaptureState("=1+1", reason="@SUM(A1)"),), as_of_s=0.0, began_s=0.0)
     (row,) = csv.DictReader(table_text(state).splitlines())
     assert tuple(row) == COLUMNS and row["capture"] == "'=1+1" and row["reason"] == "'@SUM(A1)"
+
+
+def test_a_time_budget_counts_what_the_captures_earlier_stages_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    for told, expected in (("90.5", 90.5), ("-3", 0.0), ("soon", 0.0)):
+        monkeypatch.setenv(SPENT_VARIABLE, told)
+        assert spent_s() == expected
