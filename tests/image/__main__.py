@@ -86,10 +86,10 @@ def run_demo(image: Image) -> None:
     command = ["run", "/photos", "/out", "--preset", "preview"]
     whole = Container(image, WORK / "bundle", Mounts(photos / "photos", outs["undisturbed"]))
     told = json.loads(whole.must_end(0, ["doctor", "--json"], say, cores=1))
-    limits = f"{told['cores']} cores, {told['memory']}"
+    limits = f"{told['cores']}; {told['memory']}"
     if not limits.startswith("1 ") or f"{MEMORY / 1e9:.1f} GB for this process" not in limits:
         raise Problem(f"It does not keep to its control group's limits: {limits}.")
-    say(f"Limited to one processor and {MEMORY / 1e9:.1f} GB it finds {limits}.")
+    say(f"Limited to one processor and {MEMORY / 1e9:.1f} GB it finds: {limits}.")
     whole.must_end(0, command, say)
     say("The demo ran undisturbed.")
     stopped = Container(image, WORK / "bundle", Mounts(photos / "photos", outs["stopped"]))
