@@ -103,7 +103,9 @@ def snakemake_command(call: Call, plan: Plan, profile: Profile) -> list[str]:
 def snakemake_environment(call: Call) -> dict[str, str]:
     """Variables for it: no profile that nobody named, no cache outside the batch's folder."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SNAKEMAKE_")}
-    return {**environment, "XDG_CACHE_HOME": str(call.folder / "cache")}
+    # Snakemake does not start without a HOME and a name, which a container's arbitrary user has not.
+    nobody = {"HOME": str(call.folder), "LOGNAME": f"user-{os.getuid()}"}
+    return {**nobody, **environment, "XDG_CACHE_HOME": str(call.folder / "cache")}
 
 
 def start_snakemake(call: Call, plan: Plan, profile: Profile) -> subprocess.Popen[bytes]:
