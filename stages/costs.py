@@ -57,7 +57,7 @@ REFERENCE = Costs(
             "ingest": StageCosts(0.0153, 179e6, 0.0, 508.0),
             "control": StageCosts(0.0001, 180e6, 0.0, 10.0),
             "features": StageCosts(0.341, 115e6, 282e6, 156.0),
-            "matches": StageCosts(1.44e-05, 298e6, 0.0, 30.1),
+            "matches": StageCosts(1.44e-05, 250e6, 185e6, 30.1),
             "sparse": StageCosts(6.86e-05, 282e6, 405.0, 30.4),
             "targets": StageCosts(0.0001, 250e6, 0.0, 10.0),
             "georef": StageCosts(0.0244, 235e6, 288.0, 30.4),

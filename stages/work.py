@@ -182,7 +182,7 @@ class Work:
             "ingest": Units(pixels, 0.0, photos),
             "control": Units(photos, 0.0, photos),
             "features": Units(looked, looked_at_once, keypoints),
-            "matches": Units(self.pairs * self.keypoints, self.threads * self.keypoints, keypoints),
+            "matches": Units(self.pairs * self.keypoints, float(self.threads), keypoints),
             "sparse": Units(keypoints * mapping, keypoints, keypoints),
             "targets": Units(pixels, at_once, photos),
             "georef": Units(photos, keypoints, keypoints),
