@@ -200,11 +200,12 @@ def little(folder: Path) -> Path:
 def test_what_cannot_be_reconstructed_ends_with_1_and_says_why(tmp_path: Path) -> None:
     photos = little(tmp_path / "photos")
     (photos / "gcp_list.txt").write_text("EPSG:32633\n388710 5299705 512 112 514\n")
+    (photos / "scale_bars.csv").write_text("name_a,name_b,metres\nA,A,1.0\n")
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "check", str(photos), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     told = json.loads(done.stdout)
     assert done.returncode == told["exit_code"] == 1, done.stderr
-    assert {"no-overlap", "control-broken"} <= {finding["code"] for finding in told["findings"]}
+    assert {"no-overlap", "control-broken", "scale-bars"} <= {finding["code"] for finding in told["findings"]}
     assert told["verdict"] == "error" and (tmp_path / "check.html").is_file()
     assert "Line 2 of gcp_list.txt" in done.stderr
 

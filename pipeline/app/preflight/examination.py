@@ -34,7 +34,13 @@ from splatpipe.pipeline.app.preflight.overlap import (
     overlap_findings,
     swap_findings,
 )
-from splatpipe.pipeline.app.preflight.places import control_findings, focal_findings, footprint, origin_of
+from splatpipe.pipeline.app.preflight.places import (
+    control_findings,
+    focal_findings,
+    footprint,
+    origin_of,
+    scale_bar_findings,
+)
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
 from splatpipe.pipeline.engine.needs import whole
 from splatpipe.pipeline.engine.parallel import ordered_map
@@ -148,11 +154,12 @@ def look_at(intake: Intake, threads: int, report: Reporter) -> Look:
 
 def _control(source: Source, config: LineConfig, intake: Intake) -> tuple[tuple[ControlPlace, ...], list[Finding]]:
     path = source.part_path("source.control")
+    bars = scale_bar_findings(source.part_path("source.scale_bars"))
     if not path.is_file():
-        return (), []
+        return (), bars
     half_pixel = 0.5 if config.georef.pixel_origin == "centre" else 0.0
     findings, places = control_findings(path, bool(config.georef.approximate_crs), intake, half_pixel)
-    return tuple(places), findings
+    return tuple(places), [*findings, *bars]
 
 
 def forecast_presets(

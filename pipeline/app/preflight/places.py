@@ -17,6 +17,7 @@ from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
 from splatpipe.pipeline.survey.position_doubts import WELL_KNOWN_M
+from splatpipe.pipeline.survey.scale_bars import read_scale_bars
 
 DOWN_DEG = -75.0  # pitch of the gimbal: further up, walls are seen, and the focal length with them
 ONE_HEIGHT = 0.1  # spread of the heights above take-off over their median
@@ -106,6 +107,17 @@ def control_findings(
         for point, at in zip(file.points, points, strict=True)
     ]
     return [*findings, *_outside(path.name, places, points, intake)], places
+
+
+def scale_bar_findings(path: Path) -> list[Finding]:
+    """What is wrong with the file of scale bars, where there is one."""
+    if not path.is_file():
+        return []
+    try:
+        read_scale_bars(path)
+    except SplatpipeError as error:
+        return [Finding("scale-bars", "error", error.message, error.hint)]
+    return []
 
 
 def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: float) -> list[Finding]:

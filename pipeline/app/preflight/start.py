@@ -13,12 +13,16 @@ def require_readable(request: Request) -> None:
     """Read the surveyor's files as georef will, and tell now what is wrong with them.
 
     Raises:
-        SplatpipeError: if the control file or the boundary cannot be read.
+        SplatpipeError: if the control file, the scale bars or the boundary cannot be read.
     """
     from splatpipe.pipeline.engine.source import open_source
 
     source = open_source(request.photos, request.out, request.stages, request.config)
-    readers = {"source.control": _read_control, "source.boundary": _read_boundary}
+    readers = {
+        "source.control": _read_control,
+        "source.scale_bars": _read_scale_bars,
+        "source.boundary": _read_boundary,
+    }
     for part, read in readers.items():
         path = source.part_path(part) if part in source.named else None
         if path is not None and path.is_file():
@@ -30,6 +34,12 @@ def _read_control(path: Path) -> None:
     from splatpipe.pipeline.survey.crs import parse_crs
 
     parse_crs(read_control_file(path).crs)
+
+
+def _read_scale_bars(path: Path) -> None:
+    from splatpipe.pipeline.survey.scale_bars import read_scale_bars
+
+    read_scale_bars(path)
 
 
 def _read_boundary(path: Path) -> None:
