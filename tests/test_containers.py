@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from splatpipe.demo import capture_path
+from splatpipe.pipeline.app.batch.plan import Call
+from splatpipe.pipeline.app.batch.snakemake_process import snakemake_environment
 
 DOCKER = Path(__file__).resolve().parents[1] / "docker"
 SLURM = DOCKER / "slurm.sh"
@@ -65,3 +67,15 @@ def test_the_slurm_job_hands_the_warning_on_and_waits_for_the_end(tmp_path: Path
     _, told = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 143, told
     assert "What was finished is kept" in told, told
+
+
+def test_a_batch_of_a_user_without_home_and_name_has_both_below_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Snakemake asks for both at its start; those that there are stay."""
+    for name in ("HOME", "LOGNAME"):
+        monkeypatch.delenv(name, raising=False)
+    call = Call(Path("/out/.batch/call"))
+    without = snakemake_environment(call)
+    assert Path(without["HOME"]) == call.folder and without["LOGNAME"]
+    monkeypatch.setenv("HOME", "/home/anna")
+    monkeypatch.setenv("LOGNAME", "anna")
+    assert snakemake_environment(call).items() >= {"HOME": "/home/anna", "LOGNAME": "anna"}.items()
