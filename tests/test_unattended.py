@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from splatpipe.pipeline.app.console import RunConsole, say, show_error
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, MachineError, SplatpipeError
@@ -213,6 +214,18 @@ def test_the_log_has_no_colours_whatever_the_terminal(
     walk(request_of(numbers, tmp_path / "out", fail="colours"))
     log = (tmp_path / "out" / "splatpipe.log").read_text()
     assert "no terminal here" in log and "\x1b" not in log
+
+
+def test_no_name_colours_or_commands_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    hostile = "\x1b[31mred\x1b]0;title\x07\x9b2J[bold]\ttab"
+    say(hostile)
+    show_error(MachineError(hostile, hostile))
+    console = RunConsole()
+    console(Event("warning", "train", {"message": hostile, "hint": hostile}))
+    console(Event("stage_failed", "train", {"message": hostile}))
+    console.close()
+    shown = capfd.readouterr().err
+    assert not {"\x1b", "\x07", "\x9b"} & set(shown) and shown.count("[bold]") >= 5
 
 
 def splatpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
+from rich.markup import escape as without_markup
 from rich.panel import Panel
 from rich.progress import (
     BarColumn,
@@ -35,6 +35,8 @@ LEAST_OFFSET_M = 0.01  # of a flight's positions, to be told
 POINTS_SHOWN = 40  # more are in metrics.json alone
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
+# What a file's name could tell a terminal, or write as colours into a file; tab and line feed stay.
+CONTROLS = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "\ufffd")
 
 
 class _RateColumn(ProgressColumn):
@@ -147,6 +149,11 @@ class RunConsole:
         if stage not in self._order:
             return stage.ljust(10)
         return f"{self._order.index(stage) + 1:>2}/{len(self._order)} {stage:<10}"
+
+
+def escape(text: str) -> str:
+    """A text as it is, whatever it holds: neither rich nor a terminal takes anything in it for a command."""
+    return without_markup(text.translate(CONTROLS))
 
 
 def show_error(error: SplatpipeError) -> None:
