@@ -102,6 +102,7 @@ def _fit_near(
     x = np.clip(middle[:, :1] + column[disc], 0, grey.shape[1] - 1)
     y = np.clip(middle[:, 1:] + row[disc], 0, grey.shape[0] - 1)
     seen = grey[y, x].astype(np.float64)
+    x, y = x.astype(np.float64), y.astype(np.float64)
     damping = np.full(len(values), 1e-3)
     shown, derivatives = model(values, x, y)
     cost = ((seen - shown) ** 2).sum(axis=1)

@@ -57,6 +57,11 @@ MOST_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
 LEAST_NEUTRAL = 0.75  # of white less black: the least colour's over the largest's
 MOST_BLUR_PX = 1.6
 LEAST_SIZE_PX = 9.0
+SMALL_PX, LARGE_PX = 11.0, 13.5
+STRICT_CORRELATION = (
+    0.985  # of small ones, whose few pixels look like anything by chance, and of large, which can be had
+)
+UNEVEN = 0.15  # of the contrast, between the two dark sectors, or the two bright ones
 
 
 @dataclass(frozen=True)
@@ -195,7 +200,7 @@ def _reach(grey: Float32[np.ndarray, "h w"], lines: Lines) -> Float64[np.ndarray
     steps = np.arange(1.0, REACH_PX, STEP_PX)
     reaches = []
     directions = lines.directions()
-    sine = abs(float(np.cross(directions[0], directions[1])))
+    sine = abs(float(np.linalg.det(directions)))
     if sine < np.sin(np.radians(LEAST_ANGLE_DEG)):
         return None
     for k in (0, 1):
@@ -242,17 +247,35 @@ def _judged(
     shown, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
     score = float(correlation(seen[None], shown[None])[0])
     middle, half = float(lines.values[4]), abs(float(lines.values[5]))
+    if not _even(lines, x, y, seen):
+        return None
     if score < LEAST_CORRELATION or middle - half > MOST_DARK * (middle + half) or not _neutral(pixels, x, y, shown):
         return None
     variance = float(((seen - shown) ** 2).sum()) / max(len(seen) - 7, 1)
     covariance = variance * np.linalg.pinv(derivatives.T @ derivatives)
     sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2.0, 0.0)))
     directions = lines.directions()
-    area = 4.0 * reach[0] * reach[1] * abs(float(np.cross(directions[0], directions[1])))
-    if area < LEAST_SIZE_PX**2:
+    area = 4.0 * reach[0] * reach[1] * abs(float(np.linalg.det(directions)))
+    strict = not SMALL_PX**2 <= area < LARGE_PX**2
+    if area < LEAST_SIZE_PX**2 or (strict and score < STRICT_CORRELATION):
         return None
     cx, cy = lines.values[:2].tolist()
     return QuadrantTarget(cx + 0.5, cy + 0.5, float(np.sqrt(area)), sigma, score)
+
+
+def _even(
+    lines: Lines, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, " n"]
+) -> bool:
+    """Whether sectors across from each other are equally bright: cars and their shadows are not."""
+    cx, cy, first, second, _, contrast = lines.values[:6].tolist()
+    u = -np.sin(first) * (x - cx) + np.cos(first) * (y - cy) > 0.0
+    v = np.sin(second) * (x - cx) - np.cos(second) * (y - cy) > 0.0
+    sectors = [seen[(u == a) & (v == b)] for a in (False, True) for b in (False, True)]
+    if min(len(sector) for sector in sectors) == 0:
+        return False
+    means = [float(sector.mean()) for sector in sectors]
+    off = max(abs(means[0] - means[3]), abs(means[1] - means[2]))
+    return bool(off < UNEVEN * 2.0 * abs(contrast))
 
 
 def _neutral(
