@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +20,7 @@ from splatpipe.pipeline.engine.runner import Line, Outcome, survey
 from splatpipe.pipeline.engine.session import Request, open_session, survey_line
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.engine.store import open_store
+from splatpipe.pipeline.engine.worker import Task
 
 LINES = Path(__file__).parent / "lines"
 sys.path.insert(0, str(LINES))
@@ -246,6 +247,22 @@ def test_interrupt_ends_a_stage_that_ignores_signals(numbers: Path, out: Path) -
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) != 0
     assert walk(request_of(numbers, out))[0].ran == ["count", "tell"]
+
+
+def test_a_worker_that_is_asked_to_end_is_not_waited_for(numbers: Path, tmp_path: Path) -> None:
+    """Its stdin stays open: it ends for having been asked, and not when somebody loses patience."""
+    machine, config = asdict(Machine("cpu", 1)), {"steps": 3000, "step_s": 0.1}
+    told = {"parts": {}, "photos_dir": str(numbers), "out": str(tmp_path), "settings": {}, "summaries": {}}
+    task = Task("count", "arithmetic:count", "arithmetic:CountConfig", config, machine=machine, **told)
+    command = [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
+        assert worker.stdin is not None and worker.stdout is not None
+        worker.stdin.write(json.dumps({"task": asdict(task)}) + "\n")
+        worker.stdin.flush()
+        assert "progress" in worker.stdout.readline()
+        worker.terminate()
+        assert worker.wait(timeout=60) == 143
+        assert json.loads(worker.stdout.readlines()[-1]) == {"failed": {"type": "KeyboardInterrupt"}}
 
 
 def test_a_second_process_is_refused_and_told_who_works_there(

@@ -24,7 +24,7 @@ from types import FrameType
 from typing import IO
 
 from splatpipe.pipeline.engine.children import CHILDREN_MEMORY, die_with_parent
-from splatpipe.pipeline.engine.errors import ERRORS, MachineError, SplatpipeError, StageError
+from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, SplatpipeError, StageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, StageConfig, load_body
@@ -79,6 +79,9 @@ def execute(task: Task, send: IO[str]) -> None:
     Args:
         task: What to run.
         send: Takes JSON lines: ``{"event": …}``, then ``{"done": …}`` or ``{"failed": …}``.
+
+    Raises:
+        KeyboardInterrupt: where it was asked to end, which is told before.
     """
 
     lock = threading.Lock()
@@ -106,6 +109,7 @@ def execute(task: Task, send: IO[str]) -> None:
         summary = body(config, task.inputs(), Path(task.out), EventReporter(task.stage, sink))
     except KeyboardInterrupt:
         tell({"failed": {"type": "KeyboardInterrupt"}})
+        raise
     except BaseException as error:
         traceback.print_exc(file=sys.stderr)
         sys.stderr.flush()
@@ -229,9 +233,11 @@ def main() -> None:
     _listen()
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    with contextlib.suppress(KeyboardInterrupt):
+    try:
         for task in _requests(sys.stdin):
             execute(task, events)
+    except KeyboardInterrupt:  # at once: who asked waits for it, and the reader of stdin would hold up an orderly exit
+        os._exit(EXIT_TERMINATED)
 
 
 if __name__ == "__main__":
