@@ -116,6 +116,33 @@ def test_another_machine_at_work_is_refused(out: Path) -> None:
     assert json.loads((out / "stages" / LOCK_FILE).read_text()) == ELSEWHERE
 
 
+def test_a_dead_machines_lock_that_a_server_keeps_is_told_how_to_break(out: Path) -> None:
+    """NFS 3 holds it until that machine is back."""
+    path = out / "stages" / LOCK_FILE
+    with holder(out) as process:
+        path.write_text(json.dumps(ELSEWHERE))
+        with pytest.raises(UsageError, match="node7") as refused, locked(out):
+            pass
+        assert str(path) in refused.value.hint
+        path.unlink()
+        with locked(out) as hold:  # as the hint says; who lives after all sees it, and ends
+            hold.confirm()
+        assert process.poll() is None
+
+
+def test_of_two_signatures_over_each_other_the_last_one_is_read(out: Path) -> None:
+    """Two machines that lock nothing from each other cut the file before either writes; names are of any length."""
+    path = out / "stages" / LOCK_FILE
+    with locked(out):
+        own = path.read_bytes()
+    assert len(own) == engine_lock.WIDTH
+    longer = json.dumps({**ELSEWHERE, "host": "node7" * 20}).encode().ljust(engine_lock.WIDTH)
+    path.write_bytes(longer)
+    with path.open("r+b") as file:
+        file.write(own)
+    assert is_locked(out) is False and engine_lock._signed(path) is not None
+
+
 def test_another_machine_that_died_is_outlasted(out: Path) -> None:
     (out / "stages" / LOCK_FILE).write_text(json.dumps(ELSEWHERE))
     told: list[str] = []

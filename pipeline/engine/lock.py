@@ -31,6 +31,7 @@ SILENCE_S = 20.0  # without a touch: five missed ones are no busy disk any more
 SETTLE_S = 1.0  # in which two machines that sign at once see who was last
 LOOK_S = 0.25
 LONGEST = 4096  # bytes of a signature
+WIDTH = 1024  # of all, so that of two written over each other the last one stands whole
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in all containers of a machine
 
@@ -172,7 +173,7 @@ def is_locked(out: Path) -> bool:
 def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
     """Lock the file against this machine and others, and sign it."""
     out = path.parents[1]
-    waiting = _Waiting(out, tell, wait)
+    waiting = _Waiting(path, tell, wait)
     deadline_s = time.monotonic() + PATIENCE_S
     while not _flocked(descriptor, out):
         if time.monotonic() > deadline_s:
@@ -181,13 +182,13 @@ def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
     _outlast(path, waiting)
     holder = Holder.here()
     os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"{json.dumps(asdict(holder))}\n".encode(), 0)
+    os.pwrite(descriptor, f"{json.dumps(asdict(holder))}\n".encode().ljust(WIDTH), 0)
     os.fsync(descriptor)
     mount = mount_of(out)
     if mount is not None and mount.kind not in LOCAL_KINDS:
         time.sleep(SETTLE_S)
         if (other := _signed(path)) not in (None, holder):
-            raise _refusal(out, other)
+            raise _refusal(path, other)
     return holder
 
 
@@ -195,7 +196,7 @@ def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
 class _Waiting:
     """What is said to the user of another who works there, once."""
 
-    out: Path
+    path: Path
     tell: Tell
     allowed: bool
     told: bool = False
@@ -207,9 +208,11 @@ class _Waiting:
             UsageError: if nobody wants to wait.
         """
         if not self.allowed:
-            raise _refusal(self.out, other)
+            raise _refusal(self.path, other)
         if not self.told:
-            self.tell(f"Another splatpipe ({other or 'unknown'}) is working in {self.out}: waiting for it to end.")
+            self.tell(
+                f"Another splatpipe ({other or 'unknown'}) is working in {self.path.parents[1]}: waiting for it to end."
+            )
             self.told = True
 
 
@@ -222,23 +225,26 @@ def _outlast(path: Path, waiting: _Waiting) -> None:
     other = _signed(path)
     if other is None or not other.is_elsewhere:
         return  # this machine's own was killed: it would still hold the lock
-    touched, since_s = _touched(path), time.monotonic()
-    waiting.tell(f"Looking for up to {SILENCE_S:.0f} s whether {other} still works in {waiting.out}.")
-    while time.monotonic() - since_s < SILENCE_S:
+    touched, silence_s = _touched(path), 0.0
+    waiting.tell(f"Looking for up to {SILENCE_S:.0f} s whether {other} still works in {path.parents[1]}.")
+    while silence_s < SILENCE_S:
+        began_s = time.monotonic()
         time.sleep(LOOK_S)
         now = _touched(path)
+        # While a server does not answer, nobody's touch arrives: a look that hangs counts as BEAT_S at most.
+        silence_s += min(time.monotonic() - began_s, BEAT_S)
         if now != touched:
             if _signed(path) is None:
                 return
-            touched, since_s = now, time.monotonic()
+            touched, silence_s = now, 0.0
             waiting.begin(other)
 
 
-def _refusal(out: Path, other: Holder | None) -> UsageError:
-    return UsageError(
-        f"Another splatpipe ({other or 'unknown'}) is working in {out}.",
-        hint="Wait for it to end (--wait does that), or choose another OUT.",
-    )
+def _refusal(path: Path, other: Holder | None) -> UsageError:
+    hint = "Wait for it to end (--wait does that), or choose another OUT."
+    if other is not None and other.is_elsewhere:  # a server may keep a dead machine's lock: NFS 3 until that is back
+        hint += f" If {other.host} has crashed for good, remove {path}."
+    return UsageError(f"Another splatpipe ({other or 'unknown'}) is working in {path.parents[1]}.", hint=hint)
 
 
 def _flocked(descriptor: int, out: Path) -> bool:
