@@ -98,6 +98,14 @@ def test_a_list_gives_each_capture_its_options_and_paths_from_its_own_folder(
         ("a.toml", "[[capture]\n", "not valid TOML"),
         ("a.toml", "a = " + "[" * 100_000, "not valid TOML"),
         ("a.toml", "#" * (MAX_LIST_BYTES + 1), "too large"),
+        ("a.toml", f"a = {'1' * 5000}\n", "not valid TOML"),
+        ("a.toml", "[[capture]]\nphotos = 'x'\n[[capture]]\nphotos = '~nobody-here/x'\n", "no path"),
+        ("a.toml", '[[capture]]\nphotos = "a\\u0000b"\n', "no path"),
+        (
+            "a.toml",
+            "[[capture]]\nphotos = 'x'\nname = '\u00e9'\n[[capture]]\nphotos = 'y'\nname = 'e\u0301'\n",
+            "Two captures",
+        ),
         ("a.csv", "name,photo\nx,y\n", 'unknown column "photo"'),
         ("a.csv", "name,preset\nx,y\n", "none with photos"),
         ("a.csv", "photos,photos\nx,y\n", "a column twice"),
@@ -126,3 +134,12 @@ def test_no_list_and_no_text_are_refused(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"\xff\xfe\x00p\x80")
         with pytest.raises(UsageError, match=r"no UTF-8 text|not valid TOML"):
             read_captures(tmp_path / name, tmp_path / "out")
+
+
+@pytest.mark.parametrize("column", ["config", "georef.control"])
+@pytest.mark.parametrize("path", ["~nobody-here/x", "a\\u0000b"])
+def test_a_path_that_can_be_none_is_its_captures_own_trouble(tmp_path: Path, column: str, path: str) -> None:
+    told = f'config = "{path}"' if column == "config" else f'set = ["{column}={path}"]'
+    (tmp_path / "a.toml").write_text(f'[[capture]]\nphotos = "x"\n{told}\n[[capture]]\nphotos = "y"\n')
+    wrong, right = read_captures(tmp_path / "a.toml", tmp_path / "out")
+    assert wrong.trouble is not None and "no path" in wrong.trouble.message and right.trouble is None

@@ -53,7 +53,7 @@ def load_file(path: Path) -> Table:
         raise UsageError(
             f"Cannot read {path}: {error.strerror}.", hint="Check the path given with --config."
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, a number of thousands of digits
         raise UsageError(
             f"{path} is not valid TOML: {error}.",
             hint='Write it like: [train] and below it "iterations = 7000".',
@@ -129,7 +129,7 @@ def _takes_text(model: type[BaseModel], keys: Sequence[str]) -> bool:
 def _parse_value(raw: str) -> JSON:
     try:
         return tomllib.loads(f"value = {raw}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError, KeyError):
+    except (ValueError, RecursionError, KeyError):  # no TOML, or a number of thousands of digits
         return raw
 
 

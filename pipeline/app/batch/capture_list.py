@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import tomllib
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,7 +113,7 @@ def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
         if path.stat().st_size > MAX_LIST_BYTES:
             raise UsageError(f"{name} is too large.", hint=TOML_HINT)
         told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, a number of thousands of digits
         raise UsageError(f"{name} is not valid TOML: {error}.", hint=TOML_HINT) from error
     except OSError as error:
         raise UsageError(f"{name} cannot be read: {error.strerror}.", hint="Check its permissions.") from error
@@ -167,7 +168,10 @@ def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -
     """A capture from its row or table; paths in it count from the list's folder."""
     if not told.get("photos"):
         raise UsageError("A capture of the list names no photos.", hint="Name its folder under photos.")
-    photos = folder / Path(str(told["photos"])).expanduser()
+    try:
+        photos = _below(folder, str(told["photos"]))
+    except SplatpipeError as error:
+        raise UsageError(error.message, hint=error.hint) from error
     name = str(told.get("name") or photos.resolve().name)
     preset = str(told.get("preset", ""))
     try:
@@ -178,7 +182,7 @@ def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -
 
 def _tables(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> Iterator[Table]:
     if told.get("config"):
-        table = load_file(folder / Path(str(told["config"])).expanduser())
+        table = load_file(_below(folder, str(told["config"])))
         table.pop("photos", None), table.pop("splatpipe", None)
         yield with_files_from(folder, table)
     if told.get("time_budget"):
@@ -189,6 +193,20 @@ def _tables(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) 
     yield with_files_from(folder, merge(parse_set(text, LineConfig) for text in assignments))
 
 
+def _below(folder: Path, text: str) -> Path:
+    """A path as it was written, counted from a folder.
+
+    Raises:
+        SplatpipeError: if no file can be called that.
+    """
+    try:
+        if "\0" in text:
+            raise ValueError("a NUL")
+        return folder / Path(text).expanduser()
+    except (ValueError, RuntimeError) as error:  # ~nobody, or ~ where no HOME is
+        raise SplatpipeError(f"{text!r} is no path that this machine knows.", "Write it whole, without ~.") from error
+
+
 def with_files_from(folder: Path, table: Table) -> Table:
     """Options with the paths of files in them made absolute: those that are not count from a folder."""
     files = {(stage.name, option) for stage in LINE for option in stage.files}
@@ -196,7 +214,7 @@ def with_files_from(folder: Path, table: Table) -> Table:
     for section, option in files:
         value = taken.get(section, {}).get(option) if isinstance(taken.get(section), Mapping) else None
         if isinstance(value, str) and value not in ("auto", "none"):
-            taken = merge([taken, {section: {option: str(folder / Path(value).expanduser())}}])
+            taken = merge([taken, {section: {option: str(_below(folder, value))}}])
     return taken
 
 
@@ -212,6 +230,7 @@ def _check_names(captures: Sequence[Capture], listed: Path) -> None:
                 f"{name[:MAX_NAME]!r} cannot be the name of a folder of results.",
                 hint="Rename the capture's folder, or give the capture another name in a list.",
             )
-        if name.casefold() in seen:
+        plain = unicodedata.normalize("NFC", name).casefold()  # some file systems take é in both its forms for one
+        if plain in seen:
             raise UsageError(f'Two captures are called "{name}".', hint="Give one of them another name in a list.")
-        seen.add(name.casefold())
+        seen.add(plain)
