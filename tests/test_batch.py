@@ -1,8 +1,10 @@
 """A night of captures on Snakemake: each in its right state, nothing done twice, nothing left behind, never a lie."""
 
+import ast
 import csv
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,13 +12,16 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.batch.account import Account
+from splatpipe.pipeline.app.batch.capture_list import read_captures
 from splatpipe.pipeline.app.batch.driver import fresh_call
 from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
 from splatpipe.pipeline.app.batch.snakemake_process import open_profile, snakemake_command
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
@@ -275,6 +280,34 @@ def test_the_workflow_has_a_rule_for_each_stage_that_runs_and_asks_for_what_it_n
     assert text.count("gpu=1") == 1 and "0002-barn" not in text
     assert '"train": [2, 900, 21, 50]' in text
     assert "gpu" not in workflow_text(call, call.plan(), LINE)
+
+
+def test_a_folder_of_any_name_is_one_word_of_the_workflows_command(tmp_path: Path) -> None:
+    call = call_of(tmp_path / "a\nb \"c\" \\n {d} 'e' $(f) é😀", planned("house", "georef"))
+    (line,) = [line for line in workflow_text(call, call.plan(), LINE).splitlines() if line.startswith('        "exec')]
+    told = ast.literal_eval(line.strip()).format(
+        wildcards=SimpleNamespace(capture=Plain("x")), threads=1, output=Plain("y")
+    )
+    assert shlex.split(told)[4] == str(call.folder)
+
+
+class Plain(str):
+    """What Snakemake puts in by ``:q``."""
+
+    def __format__(self, _form: str) -> str:
+        return str(self)
+
+
+def test_a_control_file_that_cannot_be_read_is_told_without_a_job_until_it_is_mended(tmp_path: Path) -> None:
+    house = link(tmp_path / "captures" / "house", demo()[:2])
+    (house / "gcp_list.txt").write_text("EPSG:4326\n1 2 three 4 5 a.jpg\n")
+    call = fresh_call(tmp_path / "out")
+    for settings in (Settings("preview"), Settings("preview", retry_failed=True)):
+        (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, settings).captures
+        assert "three" in planned.message and planned.jobs == () and planned.photo_count == 2
+    (house / "gcp_list.txt").unlink()
+    (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, Settings("preview")).captures
+    assert planned.message == "" and len(planned.jobs) == len(LINE)
 
 
 def test_a_profile_decides_where_jobs_run_and_without_one_memory_does(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from statistics import median
 from splatpipe.pipeline.app.batch.capture_list import Capture, is_photo
 from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
 from splatpipe.pipeline.app.cli_runs import Overrides, request_of
+from splatpipe.pipeline.app.preflight.start import require_readable
 from splatpipe.pipeline.app.report.story import read_story
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
 from splatpipe.pipeline.engine.durable import write_durably
@@ -143,8 +144,19 @@ def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Se
     first = next((standing for standing in standings if standing.stage.name in names), None)
     if first is not None and not settings.retry_failed:
         planned = _with_kept_failure(planned, first, request.out)
+    if names and not planned.message:
+        planned = _with_broken_file(planned, request)
     foresee = partial(forecast, size, config, speed=machine_speed())
     return _Outlook(planned, tuple(needed), () if planned.message else names, foresee)
+
+
+def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCapture:
+    """What the run would end with before its first stage is told without one: such an end leaves no trace in OUT."""
+    try:
+        require_readable(request)
+    except SplatpipeError as error:
+        return replace(planned, message=error.message, hint=error.hint)
+    return planned
 
 
 def _standings(request: Request, needed: Sequence[str]) -> list[Standing]:

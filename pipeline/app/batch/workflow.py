@@ -77,7 +77,8 @@ def workflow_text(call: Call, plan: Plan, stages: Sequence[Stage]) -> str:
     done = f"done-{plan.began_s:.3f}"  # a storage that outlives the call has those of earlier ones
     wanted = {name for stages_of in jobs.values() for name in stages_of}
     words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder)]
-    job = shlex.join(words).replace("\\", "\\\\").replace('"', '\\"').replace("{", "{{").replace("}", "}}")
+    job = shlex.join(words).encode("unicode_escape").decode("ascii")  # as it stands in a text of Python's
+    job = job.replace('"', '\\"').replace("{", "{{").replace("}", "}}")
     rules = [
         # Broken photos are told first; then what is nearest to its end goes first, so that captures are finished one
         # after the other and not all in the morning.

@@ -96,7 +96,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     folder = photos.expanduser().resolve()
     config = next(iter(configs.values()))
     # No OUT is written: any folder that does not lie in the photos stands for one.
-    source = open_source(photos, folder.with_name(f"{folder.name}-out"), LINE, config)
+    source = open_source(photos, folder.parent / f"{folder.name}-out", LINE, config)
     intake, findings = take_in(source, config, threads, report)
     look = look_at(intake, threads, report)
     control, told = _control(source, config, intake)
