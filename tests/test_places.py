@@ -29,6 +29,8 @@ PLACES = Places.of(OUT, PHOTOS, {"georef": {"control": GCP, "crs": "EPSG:32633+5
         ("[Errno 2] No such file: '/root/.cache/x/y.bin'", "[Errno 2] No such file: 'y.bin'"),
         ("~/secret/keys.txt and ../../jane/work/z.toml", "keys.txt and z.toml"),
         (f"{OUT.parent}/other job", "other job"),
+        ("cannot open:/home/jane/grids/x.tif", "cannot open:x.tif"),
+        ("file:///home/jane/grids/x.tif", "x.tif"),
     ],
 )
 def test_folders_are_left_out(said: str, shown: str) -> None:

@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from splatpipe.pipeline.app.console import RunConsole, say, show_error
+from splatpipe.pipeline.app.ending import for_the_user
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, MachineError, SplatpipeError
@@ -267,6 +269,12 @@ def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> 
         assert waiting.returncode == 143 and "did not end within" in said
         assert (tmp_path / "told").read_text() == "stopped\n"
         holder.kill()
+
+
+def test_a_fault_of_ours_is_told_where_nothing_temporary_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a read-only root without /dev/shm."""
+    monkeypatch.setattr(tempfile, "tempdir", "/nowhere")
+    assert "ValueError: odd" in for_the_user(ValueError("odd")).message
 
 
 def test_home_is_not_needed(tmp_path: Path) -> None:

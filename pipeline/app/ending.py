@@ -171,6 +171,9 @@ def for_the_user(error: Exception) -> SplatpipeError:
         return error
     if isinstance(error, OSError):
         return MachineError(str(error), "Check the free space and the permissions.")
-    with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:
-        traceback.print_exception(error, file=file)
-    return StageError(f"A fault of splatpipe: {type(error).__name__}: {error}", f"Please report it with {file.name}")
+    hint = "Please report it."
+    with suppress(OSError):  # a container may have no place for it
+        with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:
+            traceback.print_exception(error, file=file)
+        hint = f"Please report it with {file.name}"
+    return StageError(f"A fault of splatpipe: {type(error).__name__}: {error}", hint)

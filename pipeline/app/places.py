@@ -14,7 +14,7 @@ from typing import Any
 
 SYSTEM = ("dev", "proc", "sys")  # the same on every machine, and what a message on them is about
 _END = r"\s\"'<>|,;:()\[\]"
-_ELSEWHERE = re.compile(rf"(?<![\w./:~-])~?/(?!(?:{'|'.join(SYSTEM)})\b)(?:[^/{_END}]+/)+([^/{_END}]*)")
+_ELSEWHERE = re.compile(rf"(?<![\w./~-])(?:file://)?~?/(?!(?:{'|'.join(SYSTEM)})\b)(?:[^/{_END}]+/)+([^/{_END}]*)")
 _BESIDE = re.compile(rf"(?<![\w./-])(?:\.\./)+(?:[^/{_END}]+/)*([^/{_END}]+)")
 
 
