@@ -57,8 +57,10 @@ def test_an_interruption_ends_them_at_once() -> None:
     assert seen and not any(map(is_alive, seen))
 
 
-def test_they_die_with_the_process_that_started_them() -> None:
-    statement = SLEEP[1].format(parent="os.getppid()").replace("import time", "import os, time")
+@pytest.mark.parametrize("platform", [sys.platform, "darwin"])
+def test_they_die_with_the_process_that_started_them(platform: str) -> None:
+    statement = SLEEP[1].format(parent="os.getppid()")
+    statement = statement.replace("c.die", f"import os; c.sys.platform = '{platform}'; c.die")
     script = (
         "from splatpipe.pipeline.engine.children import run_children\n"
         f"run_children([('{CODE}', {statement!r})], lambda: None, '')"

@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 
@@ -24,15 +25,23 @@ MAXRSS_BYTES = 1 if sys.platform == "darwin" else 1024  # the unit of ru_maxrss
 
 
 def die_with_parent(parent: int) -> None:
-    """Have the kernel end this process when the one that started it dies.
+    """Have this process ended when the one that started it dies: by Linux, elsewhere by a look now and then.
 
     Args:
         parent: Who that is; if it is dead already this process ends here.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        threading.Thread(target=_outlive_nobody, args=(parent,), daemon=True).start()
     if os.getppid() != parent:
         os._exit(1)
+
+
+def _outlive_nobody(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK_S)
+    os._exit(1)
 
 
 def run_children(commands: Sequence[Sequence[str]], look: Callable[[], None], what: str) -> int:
