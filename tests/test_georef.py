@@ -16,6 +16,7 @@ from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_li
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.target_finds import WantedTargets, save_finds, save_wanted
 from splatpipe.stages.georef import run
 
 PLACE = Origin(46.84266, -91.994, 199.0)
@@ -106,12 +107,16 @@ def ingested(folder: Path, positions: list[dict[str, object]], names: list[str])
     (folder / "positions.json").write_text(json.dumps({"positions": positions, "orientations": {}}))
     (folder / "cameras.json").write_text('{"cameras": [{"focal_px": 2300.0, "width": 4000, "has_prior": true}]}')
     save_photo_list(PhotoList(tuple(Photo(name, "0" * 64, 4000, 3000, 0) for name in names)), folder)
+    save_wanted(WantedTargets("", (), ()), folder / "points.json")
+    save_finds((), folder / "targets.json")
     return {
         "ingest.positions": folder / "positions.json",
         "ingest.photos": folder,
         "ingest.cameras": folder / "cameras.json",
         "source.control": ABSENT,
         "source.boundary": ABSENT,
+        "control.points": folder / "points.json",
+        "targets.found": folder / "targets.json",
     }
 
 

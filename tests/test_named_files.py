@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.store import Part
 from splatpipe.stages.line import GEOREF, INGEST, LINE
 from splatpipe.stages.options import LineConfig
 
-PARTS = {"source.photos", "source.geo", "source.lens", "source.control", "source.boundary"}
+PARTS = {"source.photos", "source.geo", "source.lens", "source.control", "source.scale_bars", "source.boundary"}
 
 
 @pytest.fixture

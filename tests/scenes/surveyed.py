@@ -20,6 +20,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vec
 from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
 from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.target_finds import WantedTargets, save_finds, save_wanted
 
 Array = NDArray[np.float64]
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
@@ -161,6 +162,8 @@ def capture_parts(
         json.dumps({"cameras": [{"focal_px": 853.0, "width": WIDTH, "has_prior": True}]})
     )
     (folder / "gcp_list.txt").write_text(control, encoding="utf-8")
+    save_wanted(WantedTargets("", (), ()), folder / "points.json")
+    save_finds((), folder / "targets.json")
     return {
         "sparse.model": folder / "model",
         "ingest.positions": folder / "positions.json",
@@ -168,6 +171,8 @@ def capture_parts(
         "ingest.cameras": folder / "cameras.json",
         "source.control": folder / "gcp_list.txt",
         "source.boundary": ABSENT,
+        "control.points": folder / "points.json",
+        "targets.found": folder / "targets.json",
     }
 
 
