@@ -19,7 +19,7 @@ import pytest
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.batch.account import Account
 from splatpipe.pipeline.app.batch.capture_list import read_captures
-from splatpipe.pipeline.app.batch.driver import fresh_call
+from splatpipe.pipeline.app.batch.driver import STOPPED_NOTICE_S, Driver, Told, fresh_call
 from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
@@ -28,7 +28,7 @@ from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
 from splatpipe.pipeline.app.batch.tries import NO_WORD, Ending, TryLog
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
-from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED, Stopped
 from splatpipe.stages.line import LINE
 
 SLOW = ("--until", "features", "--set", "features.extractor=sift")
@@ -319,6 +319,28 @@ def test_a_profile_decides_where_jobs_run_and_without_one_memory_does(tmp_path: 
         elsewhere = snakemake_command(call, call.plan(), profile)
         assert not profile.local and "--resources" not in elsewhere
         assert elsewhere[elsewhere.index("--cores") + 1] == "2"  # no job gets more
+
+
+def test_a_stopped_batch_tells_of_itself_alone_and_waits_for_no_notice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Docker kills ten seconds after SIGTERM, and the jobs may have taken eight of them."""
+    call = call_of(tmp_path, planned("house", "train"), planned("barn", "train"))
+    said: list[str] = []
+    hangs = "echo $SPLATPIPE_STATE,$SPLATPIPE_CAPTURE >> told; sleep 99"
+    driver = Driver(call, open_profile(None), Told(said.append, hangs))
+
+    def stop(_lock: int) -> None:
+        raise Stopped(EXIT_TERMINATED)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(driver, "_work", stop)
+    with pytest.raises(Stopped):
+        driver.run(0)
+    assert (tmp_path / "told").read_text() == f"stopped,{tmp_path.name}\n"
+    assert [line for line in said if "--notify" in line] == [
+        f"The --notify command did not end within {STOPPED_NOTICE_S:.0f} s and was ended."
+    ]
 
 
 def test_a_cell_of_the_table_is_never_a_formula() -> None:

@@ -26,16 +26,17 @@ from splatpipe.pipeline.app.batch.snakemake_process import (
 )
 from splatpipe.pipeline.app.batch.state import RENEWED_EVERY_S, BatchState, CaptureState
 from splatpipe.pipeline.app.batch.workflow import write_workflow
-from splatpipe.pipeline.app.notice import notify
+from splatpipe.pipeline.app.notice import TIME_LIMIT_S, notify
 from splatpipe.pipeline.app.report import REPORT_FILE
 from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, UsageError, exit_code
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, Stopped, UsageError, exit_code
 from splatpipe.pipeline.engine.lock import locked
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.store import unwritable
 from splatpipe.stages.line import LINE
 
 POLL_S = 1.0
+STOPPED_NOTICE_S = 1.5  # after a signal: the jobs may have taken eight seconds to end, and Docker kills after ten
 CHANGED_EVERY_S = 5.0  # progress is told that often; another state of a capture at once
 LOCK_PATIENCE_S = 15.0  # a killed call's guard ends its jobs within that
 NAMES_FILE = "captures.json"  # below BATCH_FOLDER: every capture that was ever listed
@@ -123,6 +124,7 @@ class Driver:
         self._published_s = 0.0
         self._last: BatchState | None = None
         self._unwritten = ""
+        self._notice_s = TIME_LIMIT_S
 
     def run(self, lock: int) -> BatchState:
         """Run it.
@@ -145,6 +147,8 @@ class Driver:
             succeeded = self._account.state().all_succeeded
             return self._finish(0 if succeeded else EXIT_INPUT, "")
         except BaseException as error:
+            if isinstance(error, Stopped | KeyboardInterrupt):
+                self._notice_s = STOPPED_NOTICE_S
             self._finish(exit_code(error), str(error))
             raise
 
@@ -192,7 +196,7 @@ class Driver:
         other = self._last is None or replace(state, as_of_s=0.0) != replace(self._last, as_of_s=0.0)
         if changed or not state.at_work or waited_s >= (CHANGED_EVERY_S if other else RENEWED_EVERY_S):
             self._publish(state)
-        for capture in changed:
+        for capture in changed if self._notice_s == TIME_LIMIT_S else ():  # a signal's end is told once, of the batch
             before = self._before.get(capture.name)
             if capture.state in ENDS and (before is None or before.state != capture.state):
                 self._notify(ENDS[capture.state], capture.name, f"{capture.name}/{REPORT_FILE}")
@@ -213,7 +217,8 @@ class Driver:
         if not self._told.command:
             return
         path = self._call.out / page
-        trouble = notify(self._told.command, state, name, path if path.is_file() else None, self._call.out)  # type: ignore[arg-type]
+        report = path if path.is_file() else None
+        trouble = notify(self._told.command, state, name, report, self._call.out, self._notice_s)  # type: ignore[arg-type]
         if trouble:
             self._told.say(trouble)
 
