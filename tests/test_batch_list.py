@@ -28,6 +28,16 @@ def test_a_capture_is_told_from_a_folder_of_captures(tmp_path: Path) -> None:
     assert "splatpipe run" in caught.value.hint
 
 
+@pytest.mark.parametrize("out", ["captures/north/out", "captures/north"])
+def test_results_never_lie_among_a_captures_photos(tmp_path: Path, out: str) -> None:
+    folders(tmp_path / "captures", "north/out", "south")
+    (tmp_path / "linked").symlink_to(tmp_path / "captures" / "north")
+    (tmp_path / "a.toml").write_text("[[capture]]\nphotos = 'captures/south'\n[[capture]]\nphotos = 'linked'\n")
+    for listed in (tmp_path / "a.toml", *([tmp_path / "captures"] if out.endswith("out") else [])):
+        with pytest.raises(UsageError, match="inside the photos of the capture"):
+            read_captures(listed, tmp_path / out)
+
+
 TOML = """
 preset = "preview"
 set = ["train.iterations=900"]

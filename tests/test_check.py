@@ -210,6 +210,18 @@ def test_what_cannot_be_reconstructed_ends_with_1_and_says_why(tmp_path: Path) -
     assert "Line 2 of gcp_list.txt" in done.stderr
 
 
+def test_what_was_found_is_told_also_where_the_page_cannot_be_written(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "[red]broken[bold].jpg").write_bytes(b"none")
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "check", str(photos), "--json", "-o", "none/c.html"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    told = json.loads(done.stdout)
+    assert done.returncode == told["exit_code"] == 4 and "Cannot write the page none/c.html" in told["error"]["message"]
+    assert {"unreadable", "too-few"} == {finding["code"] for finding in told["findings"]}
+    assert "[red]broken[bold].jpg" in done.stderr and "only one usable" not in done.stderr
+
+
 def test_a_run_tells_a_broken_control_file_before_its_first_stage(tmp_path: Path) -> None:
     photos = little(tmp_path / "photos")
     (photos / "gcp_list.txt").write_text("EPSG:32633\n388710 5299705 512 112 514\n")

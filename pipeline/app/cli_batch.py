@@ -123,12 +123,14 @@ def _run(captures: Path, out: Path, settings: Settings, profile: Profile, comman
 
 def _dry_run(captures: Path, out: Path, settings: Settings, profile: Profile) -> int:
     from splatpipe.pipeline.app.batch.capture_list import read_captures
-    from splatpipe.pipeline.app.batch.driver import dry_run, fresh_call
+    from splatpipe.pipeline.app.batch.driver import check_folder, dry_run, fresh_call
     from splatpipe.pipeline.app.batch.planning import make_plan
 
+    listed = read_captures(captures, out)
+    check_folder(out)
     call = fresh_call(out, "dry-run")
     try:
-        call.write_plan(make_plan(read_captures(captures, out), call, settings))
+        call.write_plan(make_plan(listed, call, settings))
         return dry_run(call, profile)
     finally:
         shutil.rmtree(call.folder, ignore_errors=True)

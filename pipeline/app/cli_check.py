@@ -10,7 +10,7 @@ import typer
 from splatpipe.pipeline.app.cli_options import ConfigOption, JsonOption, PhotosArgument, SetOption, ThreadsOption
 from splatpipe.pipeline.app.cli_runs import overrides
 from splatpipe.pipeline.app.ending import Ending
-from splatpipe.pipeline.engine.errors import EXIT_INPUT
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, MachineError
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.preflight.findings import Preflight
@@ -35,7 +35,7 @@ def check(
     """Say what is wrong with a capture while you are still there; what a run would take."""
     page = page.expanduser()
     with Ending(page, as_json) as done:
-        from splatpipe.pipeline.app.console import RunConsole
+        from splatpipe.pipeline.app.console import RunConsole, say
         from splatpipe.pipeline.app.preflight.examination import examine_capture
         from splatpipe.pipeline.app.preflight.findings import as_json as told_as_json
         from splatpipe.pipeline.app.preflight.page import write_page
@@ -51,19 +51,22 @@ def check(
             preflight = examine_capture(photos, configs, threads or available_cores(), report)
         finally:
             console.close()
-        write_page(preflight, page)
+        done.told = told = told_as_json(preflight)
+        _show(preflight)  # first: what was found is told also where the page cannot be written
+        try:
+            write_page(preflight, page)
+        except OSError as error:
+            raise MachineError(
+                f"Cannot write the page {page}: {error.strerror}.", hint="Name another place for it: -o FILE."
+            ) from error
         failed = preflight.worst == "error"
-        done.told = {
-            **told_as_json(preflight),
-            "exit_code": EXIT_INPUT if failed else 0,
-            "outputs": [str(page)],
-        }
-        _show(preflight, page)
+        done.told = {**told, "exit_code": EXIT_INPUT if failed else 0, "outputs": [str(page)]}
+        say(str(page))
     if failed:
         raise typer.Exit(EXIT_INPUT)
 
 
-def _show(preflight: Preflight, page: Path) -> None:
+def _show(preflight: Preflight) -> None:
     from splatpipe.pipeline.app.console import say
 
     for finding in preflight.findings:
@@ -76,4 +79,4 @@ def _show(preflight: Preflight, page: Path) -> None:
         "error": "This capture cannot be reconstructed as it is",
         "warning": "It can be reconstructed; see above what is lost",
     }
-    say(f"{len(preflight.photos)} photos. {verdict.get(preflight.worst or '', 'Nothing is wrong with it')}. {page}")
+    say(f"{len(preflight.photos)} photos. {verdict.get(preflight.worst or '', 'Nothing is wrong with it')}.")

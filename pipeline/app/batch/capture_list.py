@@ -78,6 +78,7 @@ def read_captures(captures: Path, out: Path) -> tuple[Capture, ...]:
     if not found:
         raise UsageError(f"{captures} names no capture.", hint="Put each capture's photos into a folder of its own.")
     _check_names(found, captures)
+    _check_places(found, out.expanduser().resolve())
     return tuple(found)
 
 
@@ -216,6 +217,17 @@ def with_files_from(folder: Path, table: Table) -> Table:
         if isinstance(value, str) and value not in ("auto", "none"):
             taken = merge([taken, {section: {option: str(_below(folder, value))}}])
     return taken
+
+
+def _check_places(captures: Sequence[Capture], out: Path) -> None:
+    """One capture's results must not lie among another's photos: its pictures would count as such."""
+    around = {out, *out.parents}
+    for capture in captures:
+        if capture.photos.resolve() in around:
+            raise UsageError(
+                f'OUT lies inside the photos of the capture "{capture.name}".',
+                hint="Choose an OUT beside the photos, not among them.",
+            )
 
 
 def _check_names(captures: Sequence[Capture], listed: Path) -> None:

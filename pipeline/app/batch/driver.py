@@ -43,6 +43,18 @@ NAMES_FILE = "captures.json"  # below BATCH_FOLDER: every capture that was ever 
 ENDS = {"done": "done", "failed": "failed", "stopped": "stopped"}
 
 
+def check_folder(out: Path) -> None:
+    """Refuse an OUT that can be no batch's.
+
+    Raises:
+        UsageError: if it is a file, or the folder of one run.
+    """
+    if (out / "stages").exists():
+        raise UsageError(f"{out} is the folder of one run.", hint="Choose another OUT for the batch.")
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is made if it is not there.")
+
+
 @contextmanager
 def hold(out: Path) -> Iterator[int]:
     """Hold a batch's folder; two calls at a time would tell different things of it.
@@ -54,10 +66,7 @@ def hold(out: Path) -> Iterator[int]:
         UsageError: if it is no batch's folder, or another call works in it.
         MachineError: if it cannot be written.
     """
-    if (out / "stages").exists():
-        raise UsageError(f"{out} is the folder of one run.", hint="Choose another OUT for the batch.")
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is made if it is not there.")
+    check_folder(out)
     try:
         (out / BATCH_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
