@@ -3,7 +3,7 @@
 #SBATCH --cpus-per-task=8
 #SBATCH --mem=16G
 #SBATCH --time=08:00:00
-#SBATCH --signal=B:TERM@60
+#SBATCH --signal=B:USR1@60
 #SBATCH --requeue
 #SBATCH --open-mode=append
 # sbatch docker/slurm.sh PHOTOS OUT [options of splatpipe run]
@@ -25,10 +25,13 @@ else
   command=(splatpipe run "$photos" "$out" "$@")
 fi
 
-# Slurm signals this shell alone: it hands that on, and waits for the end.
+# Slurm signals this shell alone: it hands that on, and waits for the end. USR1 is the time that is nearly over, TERM is scancel
+# (or a preemption, after which Slurm itself may queue it again): whoever cancels a job does not want it back.
+again=
 "${command[@]}" &
 job=$!
 trap 'kill -TERM "$job"' TERM
+trap 'again=1; kill -TERM "$job"' USR1
 code=0
 wait "$job" || code=$?
 while kill -0 "$job" 2>/dev/null; do # the trap ended the first wait
@@ -36,7 +39,7 @@ while kill -0 "$job" 2>/dev/null; do # the trap ended the first wait
   wait "$job" || code=$?
 done
 
-if [ "$code" = 143 ] && [ -n "${SLURM_JOB_ID:-}" ]; then # terminated, not failed
+if [ "$code" = 143 ] && [ -n "$again" ] && [ -n "${SLURM_JOB_ID:-}" ]; then # terminated, not failed
   scontrol requeue "$SLURM_JOB_ID"
 fi
 exit "$code"

@@ -45,7 +45,9 @@ def slurm(tmp_path: Path, *arguments: object) -> subprocess.Popen[str]:
     (programs / "splatpipe").write_text(f'#!/bin/sh\nexec {sys.executable} -m splatpipe.pipeline.app.cli "$@"\n')
     (programs / "splatpipe").chmod(0o755)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
-    environment |= {"PATH": f"{programs}:{os.environ['PATH']}", "SPLATPIPE_IMAGE": ""}
+    (programs / "scontrol").write_text('#!/bin/sh\necho "$@" >> "$TOLD_SLURM"\n')
+    (programs / "scontrol").chmod(0o755)
+    environment |= {"SLURM_JOB_ID": "7", "PATH": f"{programs}:{os.environ['PATH']}", "SPLATPIPE_IMAGE": ""}
     command = ["bash", str(SLURM), *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
@@ -57,16 +59,21 @@ def test_the_slurm_job_ends_with_the_exit_code_of_its_command(tmp_path: Path) ->
     assert "There is no folder" in told
 
 
-def test_the_slurm_job_hands_the_warning_on_and_waits_for_the_end(tmp_path: Path) -> None:
-    out = tmp_path / "out"
+@pytest.mark.parametrize(("number", "queued"), [(signal.SIGUSR1, "requeue 7\n"), (signal.SIGTERM, "")])
+def test_the_slurm_job_hands_the_warning_on_waits_for_the_end_and_is_queued_again_unless_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, queued: str
+) -> None:
+    out, told_slurm = tmp_path / "out", tmp_path / "told_slurm"
+    monkeypatch.setenv("TOLD_SLURM", str(told_slurm))
     process = slurm(tmp_path, capture_path(), out, "--preset", "preview")
     until_s = time.monotonic() + PATIENCE_S
     while not (out / "events.jsonl").exists() and time.monotonic() < until_s and process.poll() is None:
         time.sleep(0.05)
-    process.send_signal(signal.SIGTERM)  # Slurm's B: the shell alone
+    process.send_signal(number)  # Slurm's B: the shell alone
     _, told = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 143, told
     assert "What was finished is kept" in told, told
+    assert (told_slurm.read_text() if told_slurm.exists() else "") == queued
 
 
 def test_a_batch_of_a_user_without_home_and_name_has_both_below_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
