@@ -75,7 +75,7 @@ CONTROL = Stage(
 )
 TARGETS = Stage(
     "targets",
-    version=1,
+    version=2,
     config=TargetsConfig,
     reads=("control.points", "sparse.model", "ingest.photos", "ingest.positions"),
     parts={"found": "targets.json"},

@@ -51,16 +51,18 @@ LARGEST_FIT_PX = 14.0  # more pixels tell hardly more
 MOST_MOVED_PX = 2.5  # from where the lines near by meet
 APART_PX = 3.0  # one target has one centre
 NEAR_CORRELATION = 0.9  # of the first fit
-LEAST_CORRELATION = 0.982
+LEAST_CORRELATION = 0.975  # of one that lies alone: a shadow's edge may cross it
+CORRELATION_AMONG = 0.986  # of one with others like it around, as gravel, leaves and façades have them everywhere
+AROUND_PX = (2.0, 16.0)  # beyond a target's corners
+MOST_AROUND = 0.5  # of a saddle's own strength: the strongest around one that lies alone
+OWN_PX = 1.6  # from its centre
 LEAST_ANGLE_DEG = 18.0  # between the lines
 MOST_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
 LEAST_NEUTRAL = 0.75  # of white less black: the least colour's over the largest's
 MOST_BLUR_PX = 1.6
-LEAST_SIZE_PX = 9.0
-SMALL_PX, LARGE_PX = 11.0, 13.5
-STRICT_CORRELATION = (
-    0.985  # of small ones, whose few pixels look like anything by chance, and of large, which can be had
-)
+# A disc of 12 px covers the area of a square of 10.6 px, and blur takes some of it. Below, so few pixels differ that
+# gravel correlates with 0.99.
+LEAST_SIZE_PX = 10.0
 UNEVEN = 0.15  # of the contrast, between the two dark sectors, or the two bright ones
 
 
@@ -124,12 +126,7 @@ def _found_in(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
 def _saddles(grey: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "n 2"]:
     """Places of strong saddles, the strongest first; (0, 0) is the first pixel's centre."""
     smooth = cv2.GaussianBlur(grey, (0, 0), SADDLE_SIGMA_PX)
-    # The kernels are 2 to the power of their orders too large.
-    xx, yy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, scale=0.25), cv2.Sobel(smooth, cv2.CV_32F, 0, 2, scale=0.25)
-    saddle = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, scale=0.25)
-    cv2.multiply(saddle, saddle, saddle)
-    cv2.multiply(xx, yy, xx)
-    cv2.subtract(saddle, xx, saddle)
+    saddle = _saddle_strengths(smooth)
     largest = cv2.dilate(saddle, np.ones((3, 3), np.uint8))
     rows, columns = np.nonzero((saddle >= largest) & (saddle > LEAST_SADDLE**2))
     border = int(np.ceil(RINGS_PX[-1])) + 1
@@ -139,6 +136,17 @@ def _saddles(grey: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "n 2"]:
     order = np.argsort(-saddle[rows, columns], kind="stable")[:MOST_SADDLES]
     rows, columns = rows[order], columns[order]
     return np.asarray(np.stack([columns, rows], axis=1) + _to_level(smooth, rows, columns))
+
+
+def _saddle_strengths(smooth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """The negative determinant of the Hessian."""
+    # The kernels are 2 to the power of their orders too large.
+    xx, yy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, scale=0.25), cv2.Sobel(smooth, cv2.CV_32F, 0, 2, scale=0.25)
+    saddle = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, scale=0.25)
+    cv2.multiply(saddle, saddle, saddle)
+    cv2.multiply(xx, yy, xx)
+    cv2.subtract(saddle, xx, saddle)
+    return np.asarray(saddle)
 
 
 def _to_level(
@@ -256,11 +264,26 @@ def _judged(
     sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2.0, 0.0)))
     directions = lines.directions()
     area = 4.0 * reach[0] * reach[1] * abs(float(np.linalg.det(directions)))
-    strict = not SMALL_PX**2 <= area < LARGE_PX**2
-    if area < LEAST_SIZE_PX**2 or (strict and score < STRICT_CORRELATION):
-        return None
     cx, cy = lines.values[:2].tolist()
-    return QuadrantTarget(cx + 0.5, cy + 0.5, float(np.sqrt(area)), sigma, score)
+    size = float(np.sqrt(area))
+    if size < LEAST_SIZE_PX or (score < CORRELATION_AMONG and not _alone(grey, cx, cy, size)):
+        return None
+    return QuadrantTarget(cx + 0.5, cy + 0.5, size, sigma, score)
+
+
+def _alone(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: float) -> bool:
+    """Whether nothing around a target of a size is nearly as strong a saddle as its centre."""
+    corners = size_px / np.sqrt(2.0)
+    reach = int(np.ceil(corners + AROUND_PX[1]))
+    left, top = max(int(cx) - reach, 0), max(int(cy) - reach, 0)
+    piece = grey[top : int(cy) + reach + 1, left : int(cx) + reach + 1]
+    strengths = _saddle_strengths(cv2.GaussianBlur(piece, (0, 0), SADDLE_SIGMA_PX))
+    row, column = np.indices(piece.shape)
+    away = np.hypot(column + left - cx, row + top - cy)
+    around = (away > corners + AROUND_PX[0]) & (away < corners + AROUND_PX[1])
+    if not around.any():
+        return False
+    return bool(strengths[around].max() < MOST_AROUND**2 * strengths[away < OWN_PX].max())
 
 
 def _even(
