@@ -16,11 +16,15 @@ from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.cli_runs import overrides
 from splatpipe.pipeline.app.preflight.examination import examine_capture
 from splatpipe.pipeline.app.preflight.findings import Finding, Preflight, as_json
+from splatpipe.pipeline.app.preflight.intake import take_in
+from splatpipe.pipeline.app.preflight.places import control_findings
 from splatpipe.pipeline.engine.config import load_preset
 from splatpipe.pipeline.engine.events import EventReporter
+from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.photos.detail import detail_at, levels_at
 from splatpipe.pipeline.survey.flight_gaps import find_missing
 from splatpipe.pipeline.survey.swapped_positions import Flight, find_swapped
+from splatpipe.stages.line import LINE
 
 RING = range(1, 17)  # photos of the demo's lower orbit
 Picture = Callable[[np.ndarray], np.ndarray]
@@ -220,6 +224,26 @@ def test_what_was_found_is_told_also_where_the_page_cannot_be_written(tmp_path: 
     assert done.returncode == told["exit_code"] == 4 and "Cannot write the page none/c.html" in told["error"]["message"]
     assert {"unreadable", "too-few"} == {finding["code"] for finding in told["findings"]}
     assert "[red]broken[bold].jpg" in done.stderr and "only one usable" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("north_m", "severities"),
+    [((0.0, 5.0, -5.0), []), ((0.0, 5.0, 900.0), ["warning"]), ((20e3, 20.1e3, 20.2e3), ["error"])],
+)
+def test_points_that_no_photo_can_show_are_told(
+    tmp_path: Path, north_m: tuple[float, ...], severities: list[str]
+) -> None:
+    photos = ring(tmp_path / "photos", leave_out=tuple(number for number in RING if number not in (1, 6, 11)))
+    config = overrides(None, [], None).resolve(load_preset("preview"))
+    source = open_source(photos, tmp_path / "out", LINE, config)
+    intake, _ = take_in(source, config, 1, EventReporter("check", lambda _event: None))
+    stated = intake.positions.positions  # around the house, which all of them show
+    latitude, longitude = np.mean([(each.latitude, each.longitude) for each in stated], axis=0)
+    rows = [f"P{k},{latitude + step / 111_195.0:.8f},{longitude:.8f}" for k, step in enumerate(north_m)]
+    (tmp_path / "points.csv").write_text("\n".join(["name,lat,lon", *rows]))
+    findings, places = control_findings(tmp_path / "points.csv", False, intake, 0.0)
+    assert [(finding.code, finding.severity) for finding in findings] == [("control-outside", s) for s in severities]
+    assert len(places) == 3 and ("P2" in findings[0].message if severities == ["warning"] else True)
 
 
 def test_a_run_tells_a_broken_control_file_before_its_first_stage(tmp_path: Path) -> None:

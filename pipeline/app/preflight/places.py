@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.app.preflight.findings import ControlPlace, Finding, Place
 from splatpipe.pipeline.app.preflight.intake import Intake
@@ -167,16 +168,14 @@ def _outside(
     positions = intake.layout.positions_m[intake.layout.located(), :2]
     if not len(positions) or not len(points):
         return []
-    distances = np.linalg.norm(points[:, None] - positions[None], axis=2)
-    nearest = distances.min(axis=1)
+    tree = cKDTree(positions)
+    nearest = np.full(len(points), np.inf)
+    placed = np.isfinite(points).all(axis=1)
+    nearest[placed] = tree.query(points[placed])[0]
     if float(np.median(nearest)) > ELSEWHERE_M:
         text = f"The points of {name} lie {np.median(nearest) / 1000.0:,.1f} km from the photos."
         return [Finding("control-outside", "error", text, "Check the CRS and the zone, and that east comes first.")]
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2) if len(positions) <= 2000 else None
-    spacing = 0.0
-    if apart is not None and len(positions) > 1:
-        np.fill_diagonal(apart, np.inf)
-        spacing = float(np.median(apart.min(axis=1)))
+    spacing = float(np.median(tree.query(positions, k=2)[0][:, 1])) if len(positions) > 1 else 0.0
     reach = max(LEAST_REACH_M, REACH_SPACINGS * spacing)
     off = [
         place.name
