@@ -20,9 +20,9 @@ image=${SPLATPIPE_IMAGE-splatpipe.sif}
 mkdir -p "$out"
 
 if [ -n "$image" ]; then
-  command=(apptainer run --containall --no-home --bind "$photos:/photos:ro" --bind "$out:/out" "$image" run /photos /out "$@")
+  command=(apptainer run --containall --no-home --bind "$photos:/photos:ro" --bind "$out:/out" "$image" run /photos /out --wait "$@")
 else
-  command=(splatpipe run "$photos" "$out" "$@")
+  command=(splatpipe run "$photos" "$out" --wait "$@")
 fi
 
 # Slurm signals this shell alone: it hands that on, and waits for the end. USR1 is the time that is nearly over, TERM is scancel

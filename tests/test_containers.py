@@ -18,7 +18,7 @@ DOCKER = Path(__file__).resolve().parents[1] / "docker"
 SLURM = DOCKER / "slurm.sh"
 PATIENCE_S = 240.0  # of a busy machine
 REASONS = ("There is no folder", "Name a folder of capture folders", "holds no run", "CUDA does not work here")
-COMMAND = re.compile(r"^ +(?:command|args): \[(.+)\]$", re.MULTILINE)
+COMMAND = re.compile(r"^ +(?:command|args): \[([^]]+)\]", re.MULTILINE)
 
 
 def commands() -> list[list[str]]:
