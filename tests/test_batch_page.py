@@ -257,3 +257,10 @@ def test_pictures_that_cannot_be_read_cost_nothing_but_themselves(tmp_path: Path
     code = page.split("data:image/jpeg;base64,")[1].split('"')[0]
     with Image.open(io.BytesIO(base64.b64decode(code))) as picture:
         assert picture.convert("L").crop((0, 0, 480, 100)).getextrema()[1] > 60
+
+
+def test_a_pipe_among_the_photos_is_not_waited_for(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    os.mkfifo(photos / "pipe.jpg")
+    assert capture_picture(tmp_path / "out", photos, tmp_path / "kept") is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import stat
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,7 +80,9 @@ def _file_stamp(path: Path) -> tuple[int, int] | None:
         told = path.stat()
     except (OSError, ValueError):
         return None
-    return (told.st_mtime_ns, told.st_size) if told.st_size <= MOST_BYTES else None
+    if not stat.S_ISREG(told.st_mode) or told.st_size > MOST_BYTES:  # a pipe would be waited for
+        return None
+    return told.st_mtime_ns, told.st_size
 
 
 @lru_cache(maxsize=MOST_KEPT)
@@ -97,6 +100,8 @@ def _thumbnail(path: Path, side: int, orientation: int, _stamp: tuple[int, int])
 
 def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
     """A photo in RGB, turned for people, about twice `side` large if that is quicker; and whether it is whole."""
+    if _file_stamp(path) is None:
+        return None
     try:
         data = path.read_bytes()
     except (OSError, ValueError):
