@@ -55,7 +55,8 @@ def by_gps_alone(demo_run: Path, home: Path) -> Path:
     config = re.sub(r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text())
     (out / "config.toml").unlink()
     (out / "config.toml").write_text(config)
-    splatpipe("stage", "georef", out, "--set", "georef.control=none", "--set", "export.viewer_megabytes=0.0")
+    for stage in ("control", "targets", "georef"):
+        splatpipe("stage", stage, out, "--set", "georef.control=none", "--set", "export.viewer_megabytes=0.0")
     return out
 
 
@@ -409,6 +410,91 @@ def beside(line: list[list[float]], pixel: list[float]) -> float:
     a, b = np.array(line[:-1]), np.array(line[1:])
     along = np.clip(((np.array(pixel) - a) * (b - a)).sum(1) / np.maximum(((b - a) ** 2).sum(1), 1e-9), 0.0, 1.0)
     return float(np.linalg.norm(a + along[:, None] * (b - a) - pixel, axis=1).min())
+
+
+def test_found_targets_count_like_marks_and_are_never_written(gps_run: Path, tmp_path: Path) -> None:
+    """What somebody marks replaces what was found; what is taken away is found again; what is hidden is not."""
+    job = open_job(open_run_folder(gps_run, LINE), gps_run.parent / "points.csv")
+    assert job.found == {}
+    file = tmp_path / "gcp_list.txt"
+    text = ControlText.begin(file, "EPSG:32633", False, NameFinder(job.photos))
+    found = {name: {photo: tuple(at) for photo, at in TRUTH[name]["seen_px"].items()} for name in ("P01", "P04", "P05")}
+    marking = Marking(replace(job, text=text, found=found))
+    here, (x, y) = next(iter(found["P01"].items()))
+
+    def seen() -> tuple[object, bool, bool]:
+        row = next(row for row in marking.detail("P01")["photos"] if row["name"] == here)
+        return row["mark"], row["found"], row["hidden"]
+
+    def counts() -> tuple[int, int]:
+        point = next(point for point in marking.overview()["points"] if point["name"] == "P01")
+        return point["marks"], point["found"]
+
+    every = len(found["P01"])
+    told = marking.overview()
+    assert told["tables"]["control"]["count"] == 3 and not told["warnings"] and not told["exists"]
+    assert counts() == (every, every) and seen() == ([round(x, 2), round(y, 2)], True, False)
+    marking.change("P01", here, (x + 1.0, y))
+    assert counts() == (every, every - 1) and seen() == ([round(x + 1.0, 2), round(y, 2)], False, False)
+    assert list(marks_in(file)) == [("P01", here)]  # and no other of those that were found
+    marking.change("P01", here, None)
+    assert counts() == (every, every) and seen()[1] and read_points(file) == []
+    marking.change("P01", here, "hidden")
+    assert counts() == (every - 1, every - 1) and seen() == (None, False, True)
+    marking.undo()
+    assert counts() == (every, every) and seen()[1] and "not visible" not in file.read_text()
+
+
+@pytest.fixture(scope="module")
+def found_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo with coordinates alone: its marks are targets that were found."""
+    home = tmp_path_factory.mktemp("found")
+    shutil.copytree(capture_path(), home / "photos of a house")
+    listed = [line.split() for line in (CAPTURE / "gcp_list.txt").read_text().splitlines()]
+    places = {fields[6]: fields[:3] for fields in listed[1:]}
+    rows = [",".join([name, *place]) for name, place in places.items()]
+    (home / "photos of a house" / "control.csv").write_text("\n".join([listed[0][0], "name,x,y,z", *rows, ""]))
+    out = linked_copy(demo_run, home / "out")
+    config = re.sub(r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text())
+    (out / "config.toml").unlink()
+    (out / "config.toml").write_text(config)
+    for stage in ("control", "targets", "georef"):
+        splatpipe("stage", stage, out)
+    return out
+
+
+def test_found_targets_are_shown_moved_and_refused_in_the_browser(found_run: Path, open_page: Callable) -> None:
+    file = found_run.parent / "photos of a house" / "control.csv"
+    begun = file.read_text()
+    with serving(found_run, "--mark") as server:
+        watched = opened(open_page, server, 1000, 640)
+        page = watched.page
+        told = state(page)["told"]
+        assert sum(point["found"] for point in told["points"]) == sum(point["marks"] for point in told["points"]) > 200
+        photo, pixel = "DJI_0034.JPG", TRUTH["P16"]["seen_px"]["DJI_0034.JPG"]
+        page.evaluate(f"splatpipe.mark.goTo('P16', '{photo}')")
+        chosen = page.locator("#photos li[aria-current]")
+        assert "found" in (chosen.get_attribute("class") or "") and "found" in (chosen.get_attribute("title") or "")
+        assert "were found" in (page.locator("#list li", has_text="P16").get_attribute("title") or "")
+        assert "found in" in page.locator("#about").inner_text()
+        page.keyboard.press("Enter")  # agreed to: nothing is written
+        state(page)
+        assert file.read_text() == begun
+        page.evaluate(f"splatpipe.mark.goTo('P16', '{photo}')")
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowRight")
+        state(page)
+        assert list(marks_in(file)) == [("P16", photo)]
+        assert marks_in(file)["P16", photo] == pytest.approx((pixel[0] + 2.0, pixel[1]), abs=0.3)
+        assert "marked" in (chosen.get_attribute("class") or "")
+        page.keyboard.press("u")  # both moves at once: as it was found
+        state(page)
+        assert marks_in(file) == {} and "found" in (chosen.get_attribute("class") or "")
+        page.keyboard.press("Delete")
+        state(page)
+        assert f"# not visible:\tP16\t{photo}" in file.read_text() and marks_in(file) == {}
+        assert "hidden" in (chosen.get_attribute("class") or "")
+        assert watched.errors == []
 
 
 def test_a_turned_photo_is_shown_as_it_is_stored(tmp_path: Path, open_page: Callable) -> None:

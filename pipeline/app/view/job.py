@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 from collections.abc import Mapping, Sequence
@@ -9,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpipe.pipeline.app.view.log import RunLog, contents_of
-from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.source import AUTO, NONE, open_source
 from splatpipe.pipeline.photos.names import NameFinder
@@ -28,6 +29,7 @@ from splatpipe.stages.options import LineConfig
 
 LIST_NAME, CSV_NAME = "gcp_list.txt", "control.csv"
 CONTROL = "source.control"
+Found = Mapping[str, Mapping[str, tuple[float, float]]]
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Job:
         positions: What the photos state.
         frame: What these give; None where they give none.
         config: georef's options, as the run has them.
+        found: Pixels, by point and photo, where the run's georeferencing found targets that nobody marked; (0, 0) is
+            the top-left corner of the first pixel.
         text: The file that marks go into, as it was when the job began.
         command: What makes a run take it.
     """
@@ -57,6 +61,7 @@ class Job:
     positions: Positions
     frame: Frame | None
     config: GeorefConfig
+    found: Found
     text: ControlText
     command: str
 
@@ -95,7 +100,31 @@ def open_job(run: RunFolder, points_file: Path | None) -> Job:
     command = _command(run, text.path, config.georef.control, source.named.get(CONTROL))
     places = (source.folder, parts["ingest.photos"])
     frame = _frame(model, positions, config.georef, photos)
-    return Job(points, crs, photos, *places, model, positions, frame, config.georef, text, command)
+    found = _found(parts.get("georef.control"), points, photos)
+    return Job(points, crs, photos, *places, model, positions, frame, config.georef, found, text, command)
+
+
+def _found(control: Path | None, points: Sequence[SurveyedPoint], photos: Mapping[str, Photo]) -> Found:
+    """The targets in georef's ``control.json``; none where the run was not georeferenced with control yet.
+
+    Raises:
+        SplatpipeError: if the file is broken.
+    """
+    if control is None:
+        return {}
+    names, found = {point.name for point in points}, {}
+    try:
+        for point in json.loads(control.read_text(encoding="utf-8"))["points"]:
+            pixels = {
+                str(seen["photo"]): (float(seen["pixel"][0]), float(seen["pixel"][1]))
+                for seen in point["observations"]
+                if seen.get("automatic") and seen["photo"] in photos
+            }
+            if pixels and point["name"] in names:
+                found[str(point["name"])] = pixels
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise SplatpipeError(f"The control {control} cannot be read: {error}", "Run with --rerun georef.") from error
+    return found
 
 
 def _without_missing_control(config: LineConfig) -> LineConfig:

@@ -1,10 +1,13 @@
-"""A session of marking: every change is on the disk before it is acknowledged, and can be taken back."""
+"""A session of marking: every change is on the disk before it is acknowledged, and can be taken back.
+
+Targets that were found are shown like marks and count like them, but are never written: the file has what somebody
+marked, and what somebody said not to be visible.
+"""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -15,6 +18,7 @@ from splatpipe.pipeline.app.view.estimate import (
     HELPFUL_MARKS,
     Estimate,
     Estimator,
+    Marks,
     Projection,
     Projector,
     residual_of,
@@ -157,9 +161,11 @@ class Marking:
         """All points, and what the marks tell: what the page shows beside the photo."""
         with self._lock:
             revision, estimate, projection = self._estimate()
-            marks, hidden = self._text.marks, self._text.hidden
+            marks, found, hidden = self._text.marks, self._found(), self._text.hidden
             can_undo, can_redo = bool(self._done), bool(self._undone)
-        points = [self._told_point(k, estimate, projection, marks, hidden) for k in range(len(self.job.points))]
+        points = [
+            self._told_point(k, estimate, projection, (marks, found), hidden) for k in range(len(self.job.points))
+        ]
         return {
             "revision": revision,
             "file": str(self.job.text.path),
@@ -191,7 +197,8 @@ class Marking:
             raise WrongRequestError("There is no such point.")
         with self._lock:
             revision, estimate, projection = self._estimate()
-            marks, hidden = self._text.marks.get(name, {}), self._text.hidden
+            marks, found = self._text.marks.get(name, {}), self._found().get(name, {})
+            hidden = self._text.hidden
         number = list(self._points).index(name)
         shown = {s.photo: s for s in estimate.survey.points[number].sightings}
         index = {photo: k for k, photo in enumerate(self.job.model.names)}
@@ -201,8 +208,10 @@ class Marking:
             row = self._seen(photo, index.get(photo), number, projection)
             sighting = shown.get(photo)
             off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
+            mark = self._shifted(marks[photo]) if photo in marks else found.get(photo)
             row |= {
-                "mark": list(self._shifted(marks[photo])) if photo in marks else None,
+                "mark": None if mark is None else [round(mark[0], DIGITS), round(mark[1], DIGITS)],
+                "found": photo in found,
                 "hidden": (name, photo) in hidden,
                 "agrees": sighting.agrees if sighting is not None else True,
                 "residual_px": off,
@@ -222,6 +231,18 @@ class Marking:
         """Of a point that is marked in one photo: where the others may show it; None of any other."""
         posed = [seen for seen in estimate.survey.points[number].sightings if seen.index is not None]
         return self._projector.line(posed[0]) if len(posed) == 1 else None
+
+    def _found(self) -> dict[str, dict[str, tuple[float, float]]]:
+        """The targets that nobody marked, and of which nobody said that the photo does not show the point."""
+        marks, hidden = self._text.marks, self._text.hidden
+        return {
+            name: {
+                photo: pixel
+                for photo, pixel in pixels.items()
+                if photo not in marks.get(name, {}) and (name, photo) not in hidden
+            }
+            for name, pixels in self.job.found.items()
+        }
 
     def _shifted(self, pixel: tuple[float, float]) -> tuple[float, float]:
         shift = self.job.pixel_shift
@@ -246,10 +267,9 @@ class Marking:
     def _estimate(self) -> tuple[int, Estimate, Projection]:
         """For the marks as they are; called with the lock held."""
         if self._estimated is None or self._estimated[0] != self.revision:
-            marks = {
-                name: {photo: self._shifted(pixel) for photo, pixel in seen.items()}
-                for name, seen in self._text.marks.items()
-            }
+            marks = {name: dict(pixels) for name, pixels in self._found().items()}
+            for name, seen in self._text.marks.items():
+                marks.setdefault(name, {}).update((photo, self._shifted(pixel)) for photo, pixel in seen.items())
             estimate = self._estimator.estimate(marks)
             self._estimated = self.revision, estimate, self._projector.project(estimate.places, estimate.radius_m)
         return self._estimated
@@ -259,11 +279,13 @@ class Marking:
         number: int,
         estimate: Estimate,
         projection: Projection,
-        marks: Mapping[str, Mapping[str, tuple[float, float]]],
+        marks: tuple[Marks, Marks],
         hidden: set[tuple[str, str]],
     ) -> dict[str, JSON]:
+        """A point for the list; ``marks`` are those in the file, and the targets that were found."""
         point, stated = estimate.survey.points[number], self.job.points[number]
-        seen = marks.get(stated.name, {})
+        made, found = (each.get(stated.name, {}) for each in marks)
+        seen = {*made, *found}
         away = {photo for name, photo in hidden if name == stated.name}
         likely = {
             name
@@ -278,8 +300,9 @@ class Marking:
             "why": point.why if seen else "",
             "coordinates": _coordinates(stated),
             "marks": len(seen),
+            "found": len(found),
             "wrong": wrong,
-            "left": len(likely - away - set(seen)),
+            "left": len(likely - away - seen),
             "enough": len(seen) - wrong >= HELPFUL_MARKS,
             "residual_m": residual if any(value is not None for value in residual) else None,
         }

@@ -15,7 +15,7 @@ const KEYS = [
   ["Click", "mark the point; again to correct"],
   ["Arrows", "move the mark by a pixel; with Shift by a tenth, with Alt by ten"],
   ["Enter", "accept, and on to the next photo that remains"],
-  ["Del", "remove the mark"],
+  ["Del", "remove the mark; one that was found is noted as not visible here"],
   ["X", "the point is not visible in this photo (again: it is)"],
   ["N  P", "next, previous photo"],
   ["J  K", "next, previous point"],
@@ -134,7 +134,7 @@ function mark([x, y], nudge) {
   const inside = (value, most) => Math.round(Math.min(most, Math.max(0, value)) * 100) / 100;
   const here = row();
   here.mark = [inside(x, size.width), inside(y, size.height)];
-  Object.assign(here, { hidden: false, agrees: true, residual_px: null });
+  Object.assign(here, { hidden: false, found: false, agrees: true, residual_px: null });
   state.moved = null;
   hint("");
   send({ action: "mark", x: here.mark[0], y: here.mark[1], nudge });
@@ -144,7 +144,7 @@ function mark([x, y], nudge) {
 function nudge(dx, dy) {
   const at = place() ?? [picture.x, picture.y];
   const to = [at[0] + dx, at[1] + dy];
-  if (row().mark) mark(to, true);
+  if (row().mark) mark(to, !row().found); // a found one that is moved is somebody's from here on
   else state.moved = to;
   picture.keepInSight(to);
   picture.draw();
@@ -176,15 +176,17 @@ async function onward() {
 function remove() {
   const here = row();
   if (!here.mark) return;
-  Object.assign(here, { mark: null, residual_px: null });
-  send({ action: "unmark" });
+  const { found } = here; // the next georeferencing would find it again: the file has to say no
+  Object.assign(here, { mark: null, found: false, hidden: found, residual_px: null });
+  send({ action: found ? "hide" : "unmark" });
   showAll();
+  if (found) hint("What was found here is not used any more: noted as not visible. X takes that back.");
 }
 
 async function hide() {
   const here = row();
   here.hidden = !here.hidden;
-  if (here.hidden) Object.assign(here, { mark: null, residual_px: null });
+  if (here.hidden) Object.assign(here, { mark: null, found: false, residual_px: null });
   send({ action: here.hidden ? "hide" : "unmark" });
   showAll();
   if (here.hidden) await onward();
@@ -238,9 +240,10 @@ function showAll() {
   if (detail) {
     showPhotos(document.querySelector("#photos ol"), detail.photos, state.photo, (number) => atOnce(() => choosePhoto(number)));
     $("point").textContent = detail.name;
-    const marked = detail.photos.filter((each) => each.mark).length;
+    const marked = detail.photos.filter((each) => each.mark && !each.found).length;
+    const found = detail.photos.filter((each) => each.found).length;
     const left = detail.photos.filter(isLeft).length;
-    $("about").textContent = `marked in ${marked}, ${left} to do`;
+    $("about").textContent = `marked in ${marked},${found ? ` found in ${found},` : ""} ${left} to do`;
     $("photo").textContent = state.told.photos[state.photo]?.name ?? "";
   }
   picture.draw();

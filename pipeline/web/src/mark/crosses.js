@@ -1,6 +1,6 @@
-// What is drawn over a photo: where the point is expected, where it is marked, and where the pointer is.
+// What is drawn over a photo: where the point is expected, where it is marked or was found, and where the pointer is.
 
-const INK = { expected: "#ffb000", marked: "#3ddc68", moved: "#4cc2ff", wrong: "#ff5a5f" };
+const INK = { expected: "#ffb000", marked: "#3ddc68", found: "#d08cff", moved: "#4cc2ff", wrong: "#ff5a5f" };
 const GAP = 4; // screen pixels left free at the place itself
 const ARM = 16;
 
@@ -12,8 +12,10 @@ export function paintOver(context, picture, row, moved) {
   if (row.predicted && row.mark) dot(context, picture.screenAt(row.predicted));
   if (moved && !row.mark) cross(context, picture.screenAt(moved), INK.moved);
   else if (!row.mark && row.predicted) cross(context, picture.screenAt(row.predicted), INK.expected);
-  if (row.mark) cross(context, picture.screenAt(row.mark), row.agrees ? INK.marked : INK.wrong);
+  if (row.mark) cross(context, picture.screenAt(row.mark), inkOf(row));
 }
+
+const inkOf = (row) => (!row.agrees ? INK.wrong : row.found ? INK.found : INK.marked);
 
 function stroke(context, colour, path) {
   context.beginPath();

@@ -67,6 +67,7 @@ function title(point) {
   const [x, y, z] = point.coordinates;
   const lines = [`${point.name}: ${x}  ${y}  ${z ?? "(no height)"}`];
   if (point.residual_m) lines.push(`found less surveyed: ${point.residual_m.map(metres).join(", ")} (east, north, up)`);
+  if (point.found) lines.push(`${point.found} of ${point.marks} marks were found: nobody made them`);
   if (point.why) lines.push(point.why);
   if (point.wrong) lines.push(`${point.wrong} of its marks do not agree with the others`);
   return lines.join("\n");
@@ -74,9 +75,17 @@ function title(point) {
 
 export const isLeft = (row) => row.predicted != null && !row.mark && !row.hidden && !row.doubtful;
 
+const FOUND = "found: a target that nobody marked. Move it and it is your mark; Del says that it is wrong.";
+
+function stateOfPhoto(row) {
+  if (row.mark) return !row.agrees ? "wrong" : row.found ? "found" : "marked";
+  return row.hidden ? "hidden" : "open";
+}
+
 export function showPhotos(root, rows, chosen, choose) {
   const groups = [
-    ["marked", (row) => row.mark],
+    ["marked", (row) => row.mark && !row.found],
+    ["found", (row) => row.found],
     ["to do", (row) => isLeft(row)],
     ["perhaps", (row) => row.predicted && !row.mark && !row.hidden && row.doubtful],
     ["not visible", (row) => row.hidden],
@@ -93,7 +102,7 @@ export function showPhotos(root, rows, chosen, choose) {
       root.append(
         element(
           "li",
-          { class: `photo ${row.mark ? (row.agrees ? "marked" : "wrong") : row.hidden ? "hidden" : "open"}`, "aria-current": current, onclick: () => choose(row.photo) },
+          { class: `photo ${stateOfPhoto(row)}`, "aria-current": current, title: row.found ? FOUND : null, onclick: () => choose(row.photo) },
           element("span", {}, row.name),
           element("span", { class: "off" }, off == null ? "" : `${off.toFixed(1)} px`),
         ),
