@@ -23,8 +23,9 @@ def sleeping() -> tuple[str, ...]:
 
 
 def children_of(pid: int) -> list[int]:
-    listed = subprocess.run(["ps", "-o", "pid=,comm=", "--ppid", str(pid)], capture_output=True, text=True, check=False)
-    return [int(line.split()[0]) for line in listed.stdout.splitlines() if line.split()[1] != "ps"]
+    """Those that run our code; the tests' browser is a child, too."""
+    listed = subprocess.run(["ps", "-o", "pid=,args=", "--ppid", str(pid)], capture_output=True, text=True, check=False)
+    return [int(line.split()[0]) for line in listed.stdout.splitlines() if f"-m {CODE}" in line]
 
 
 def is_alive(pid: int) -> bool:
