@@ -36,6 +36,7 @@ from splatpipe.pipeline.survey.target_survey import (
     TargetSurvey,
     compare,
     marker_of,
+    scale_json,
     scale_of,
     scale_summary,
     scaled,
@@ -95,7 +96,10 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     save_frame(frame, out / "frame.json")
     placed_points = (controlled.placed.model if controlled is not None else model).points
     bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
-    accuracy = _write_accuracy(config, out, controlled, (model, positions, frame), photos, report)
+    control, accuracy = _accuracy(config, controlled, (model, positions, frame), photos, report)
+    accuracy |= scale_json(targets.wanted.bars, scale, frame)
+    for name, value in (("control.json", control), ("accuracy.json", accuracy)):
+        write_json(out / name, value)
     if controlled is not None and controlled.bent is not None:
         write_model(controlled.bent, out / "sparse" / "0")
     else:
@@ -157,15 +161,14 @@ def _focal_priors(path: Path, model: SparseModel, photos: Mapping[str, Photo]) -
     return priors
 
 
-def _write_accuracy(
+def _accuracy(
     config: GeorefConfig,
-    out: Path,
     controlled: ByControl | None,
     alone: tuple[SparseModel, Positions, Frame],
     photos: Mapping[str, Photo],
     report: Reporter,
-) -> JSON:
-    """Write ``control.json`` and ``accuracy.json``; returns the latter."""
+) -> tuple[JSON, dict[str, JSON]]:
+    """What ``control.json`` and ``accuracy.json`` hold."""
     if controlled is not None:
         control = control_json(controlled.survey, controlled.site, controlled.placed, photos, config.mark_sigma_px)
         gsd = gsd_m(controlled.survey, controlled.placed.model, controlled.placed.world_from_model.scale)
@@ -174,9 +177,7 @@ def _write_accuracy(
     else:
         control = no_control()
         accuracy = _accuracy_of_positions(*alone)
-    for name, value in (("control.json", control), ("accuracy.json", accuracy)):
-        write_json(out / name, value)
-    return accuracy
+    return control, dict(accuracy)
 
 
 def _tell_heights(tables: JSON, report: Reporter) -> None:
@@ -192,7 +193,7 @@ def _tell_heights(tables: JSON, report: Reporter) -> None:
 def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Frame) -> JSON:
     placed = Placed(model, frame.world_from_model, np.zeros((0, 3)))
     if frame.kind != "enu" or frame.origin is None:
-        return accuracy_json(None, None, placed, None)
+        return accuracy_json(None, None, placed, model.gsd(frame.world_from_model.scale) if frame.metres else None)
     stations = stations_of(model, positions, frame)
     nothing = Targets(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
     site = Site(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))

@@ -15,8 +15,10 @@ from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vec
 from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.georeference import georeference
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.target_finds import WantedTargets, save_finds, save_wanted
+from splatpipe.pipeline.survey.scale_bars import ScaleBar
+from splatpipe.pipeline.survey.target_finds import TargetFind, WantedTargets, save_finds, save_wanted
 from splatpipe.stages.georef import run
 
 PLACE = Origin(46.84266, -91.994, 199.0)
@@ -44,12 +46,15 @@ class Notes:
 
 @dataclass
 class Survey:
-    """Cameras in the world, and what their photos state of it."""
+    """Cameras in the world, what their photos state of it, and coded targets in it by their numbers."""
 
     centres: np.ndarray
     cam_from_world: np.ndarray
     names: list[str]
     positions: list[dict[str, object]]
+    targets: dict[int, np.ndarray] = field(default_factory=dict)
+    bars: tuple[ScaleBar, ...] = ()
+    control: str = ""
 
     def at(self, name: str) -> dict[str, object]:
         return next(record for record in self.positions if record["name"] == name)
@@ -102,6 +107,19 @@ def write_model(scene: Survey, folder: Path, points: np.ndarray | None = None) -
 GROUND = np.random.default_rng(1).uniform(-10, 70, (300, 3)) * [1.0, 1.0, 0.001]
 
 
+def finds(scene: Survey) -> list[TargetFind]:
+    """The targets in all photos that show them, good to a tenth of a pixel."""
+    rng = np.random.default_rng(2)
+    found = []
+    for name, pose, centre in zip(scene.names, scene.cam_from_world, scene.centres, strict=True):
+        for number, place in scene.targets.items():
+            x, y, z = pose @ (place - centre)
+            at = np.array([2300.0 * x / z + 2000.0, 2300.0 * y / z + 1500.0]) + rng.normal(size=2) * 0.1
+            if z > 0.0 and (at > 0.0).all() and (at < [4000.0, 3000.0]).all():
+                found.append(TargetFind(name, "4x4_50", number, *at.tolist(), 40.0, 0.1))
+    return found
+
+
 def ingested(folder: Path, positions: list[dict[str, object]], names: list[str]) -> dict[str, Path]:
     """The parts that ingest would leave."""
     (folder / "positions.json").write_text(json.dumps({"positions": positions, "orientations": {}}))
@@ -131,6 +149,13 @@ def georef(
     out.mkdir()
     notes = Notes()
     parts = {"sparse.model": model} | ingested(tmp_path, scene.positions, scene.names if photos is None else photos)
+    points = [line.split(",") for line in scene.control.splitlines()[2:]]
+    wanted = [(name, float(x), float(y), float(z)) for name, x, y, z in points]
+    save_wanted(WantedTargets(scene.control[:10], tuple(wanted), scene.bars), tmp_path / "points.json")
+    save_finds(finds(scene), tmp_path / "targets.json")
+    if scene.control:
+        parts["source.control"] = tmp_path / "control.csv"
+        parts["source.control"].write_text(scene.control)
     summary = run(GeorefConfig(**options), Inputs(parts, tmp_path / "photos"), out, notes)
     assert {path.name: path.read_bytes() for path in model.iterdir()} == {
         path.name: path.read_bytes() for path in (out / "sparse" / "0").iterdir()
@@ -278,3 +303,58 @@ def test_models_of_the_user_are_copied_and_never_linked(tmp_path: Path) -> None:
     parts = {"sparse.model": tmp_path / "project" / "sparse"} | ingested(tmp_path, [], scene.names)
     run(GeorefConfig(), Inputs(parts, tmp_path / "project"), tmp_path / "out", Notes())
     assert all(path.stat().st_nlink == 1 for path in (tmp_path / "out" / "sparse" / "0").iterdir())
+
+
+TARGETS = {1: np.array([5.0, 5.0, 0.0]), 2: np.array([35.0, 5.0, 0.4]), 7: np.array([5.0, 40.0, 0.1])}
+
+
+def bar(a: int, b: int, longer: float = 1.0) -> ScaleBar:
+    return ScaleBar(f"T{a}", f"T{b}", longer * float(np.linalg.norm(TARGETS[a] - TARGETS[b])), 0.001)
+
+
+def test_scale_bars_make_a_metric_frame_without_any_position(tmp_path: Path) -> None:
+    scene = survey(grid())
+    scene.positions, scene.targets = [], TARGETS
+    scene.bars = (bar(1, 2), bar(1, 7), bar(2, 7, longer=1.2), ScaleBar("T1", "T9", 4.0, 0.001))
+    frame, summary, warnings = georef(scene, tmp_path)
+    assert frame.kind == "arbitrary" and frame.origin is None and frame.in_metres
+    assert frame.world_from_model.scale == pytest.approx(TRUTH.scale, rel=2e-4)
+    assert abs(frame.world_from_model.rotation @ TRUTH.rotation.T @ [0.0, 0.0, 1.0])[2] > np.cos(np.radians(3.0))
+    assert "Metres by 2 scale bars" in frame.note and "place and heading are arbitrary" in frame.note
+    told = georeference(frame, np.zeros((2, 3)))
+    assert told["frame"] == "z up, metres, arbitrary place and heading" and told["origin"] is None
+    accuracy = json.loads((tmp_path / "out" / "accuracy.json").read_text())
+    assert accuracy["scale"]["metric"] and not accuracy["scale"]["placed"]
+    bars = accuracy["scale"]["bars"]
+    assert [one["used"] for one in bars] == [True, True, False, False] and bars[3]["error_m"] is None
+    assert abs(bars[0]["error_m"]) < 0.01 and bars[2]["error_m"] == pytest.approx(-bars[2]["metres"] / 6.0, abs=0.02)
+    assert summary["scale_bars"] == 2
+    assert any("contradict the others" in text and "T2 to T7" in text for text in warnings)
+    assert any("was not found: T1 to T9" in text for text in warnings)
+    assert not any("Arbitrary scale" in text for text in warnings)
+
+
+def test_scale_bars_that_contradict_each_other_give_no_metres(tmp_path: Path) -> None:
+    scene = survey(grid())
+    scene.positions, scene.targets, scene.bars = [], TARGETS, (bar(1, 2), bar(1, 7, longer=2.0))
+    frame, summary, warnings = georef(scene, tmp_path)
+    assert not frame.in_metres and "scale_bars" not in summary
+    assert any("contradict each other" in text for text in warnings) and any("Arbitrary scale" in t for t in warnings)
+
+
+def test_scale_bars_check_the_metres_of_positions(tmp_path: Path) -> None:
+    scene = survey(grid(), (0.02, 0.03))
+    scene.targets, scene.bars = TARGETS, (bar(1, 2, longer=1.1), bar(1, 7, longer=1.1))
+    frame, _, warnings = georef(scene, tmp_path)
+    assert frame.kind == "enu" and frame.world_from_model.scale == pytest.approx(TRUTH.scale, rel=1e-3)
+    assert any("2 scale bars" in text and "-9.1" in text for text in warnings)  # 1 / 1.1
+    scale = json.loads((tmp_path / "out" / "accuracy.json").read_text())["scale"]
+    assert scale["placed"] and scale["bars"][0]["error_m"] == pytest.approx(-3.0, abs=0.05)
+
+
+def test_points_without_marks_and_targets_leave_the_frame_to_the_positions(tmp_path: Path) -> None:
+    scene = survey(grid(), (0.02, 0.03))
+    scene.control = "EPSG:32615\nname,x,y,z\nG1,576870.0,5188000.0,199.0\nG2,576900.0,5188010.0,199.0\n"
+    frame, summary, warnings = georef(scene, tmp_path)
+    assert frame.kind == "enu" and errors_m(frame, scene).max() < 0.1 and "control_points" not in summary
+    assert any("no marks of them" in text and "no targets were found" in text for text in warnings)

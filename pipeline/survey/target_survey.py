@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.expected_places import expected_enu, free_enu
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.scale_bars import Scale, scale_by
+from splatpipe.pipeline.survey.scale_bars import Scale, ScaleBar, scale_by
 from splatpipe.pipeline.survey.surveyed_points import Survey
 from splatpipe.pipeline.survey.target_finds import TargetFind, WantedTargets
 from splatpipe.pipeline.survey.target_marks import Expected, TargetMarks, named_tracks
@@ -110,10 +110,12 @@ def scale_of(
     missing = [f"{bar.a} to {bar.b}" for bar in bars if bar.a not in places or bar.b not in places]
     if missing:
         report.warning(
-            f"{len(missing)} of {len(bars)} scale bars have a target that was not found: {some(missing)}.",
+            f"Of {len(missing)} of {len(bars)} scale bars a target was not found: {some(missing)}.",
             "Names of coded targets end in their number; each has to be sharp in two photos, with 20 pixels at least.",
         )
     if scale is None:
+        if len(missing) < len(bars):
+            report.warning("The scale bars contradict each other, and none of them is used.", "Measure them again.")
         return None
     wrong = [
         f"{bar.a} to {bar.b} ({scale.errors_m[k]:+.3f} m)"
@@ -131,19 +133,48 @@ def scaled(frame: Frame, scale: Scale) -> Frame:
     old = frame.world_from_model
     similarity = Similarity(old.scale * factor, old.rotation, old.translation * factor)
     upright = frame.note.partition(" Up is")[2]
-    note = f"Metres by {len(scale.used)} scale bars, good to {scale.sigma:.2%}; place and heading are arbitrary. Up is"
+    note = f"Metres by {_counted(scale)}, good to {scale.sigma:.2%}; place and heading are arbitrary. Up is"
     return replace(frame, world_from_model=similarity, metres=True, note=note + upright)
 
 
 def compare(frame: Frame, scale: Scale, report: Reporter) -> None:
     """Say how far the frame's metres are the bars'."""
     ratio = frame.world_from_model.scale / scale.metres_per_unit - 1.0
-    bars = f"{len(scale.used)} scale bars (good to {scale.sigma:.3%})"
+    bars = f"{_counted(scale)} (good to {scale.sigma:.3%})"
     what = f"By {bars} lengths in this result are {ratio:+.3%} off."
     if abs(ratio) > SCALE_OFF * scale.sigma + 0.01:
         report.warning(what, "Check the bars, and the coordinates or positions that the scale is from.")
     else:
         report.note(what)
+
+
+def scale_json(bars: Sequence[ScaleBar], scale: Scale | None, frame: Frame) -> dict[str, JSON]:
+    """What ``accuracy.json`` holds of scale bars; nothing where none gave a scale.
+
+    Each bar's error is the length in the result less the stated one.
+    """
+    if scale is None:
+        return {}
+    ratio = frame.world_from_model.scale / scale.metres_per_unit
+    told = f"metres are of {_counted(scale)}, good to {scale.sigma:.2%}."
+    if frame.origin is not None:
+        told = f"by {_counted(scale)} (good to {scale.sigma:.2%}) lengths are {ratio - 1.0:+.2%} off."
+    rows = [
+        {
+            "a": bar.a,
+            "b": bar.b,
+            "metres": bar.metres,
+            "error_m": (bar.metres + error) * ratio - bar.metres if np.isfinite(error) else None,
+            "used": k in scale.used,
+        }
+        for k, (bar, error) in enumerate(zip(bars, scale.errors_m, strict=True))
+    ]
+    placed = frame.origin is not None
+    return {"scale": {"metric": True, "placed": placed, "sentence": told, "sigma": scale.sigma, "bars": rows}}
+
+
+def _counted(scale: Scale) -> str:
+    return f"{len(scale.used)} scale bar{'' if len(scale.used) == 1 else 's'}"
 
 
 def scale_summary(scale: Scale | None) -> dict[str, JSON]:

@@ -89,8 +89,11 @@ def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapt
 
 
 def unit_of(holdings: Holdings) -> str:
-    """``m`` where the model has a scale, else nothing."""
-    return "m" if holdings.read("georef.frame").get("kind") == "enu" else ""
+    """``m`` of a model that has its place, ``metres`` of one that has a scale alone, else nothing."""
+    frame = holdings.read("georef.frame")
+    if frame.get("kind") == "enu":
+        return "m"
+    return "metres" if frame.get("metres") else ""
 
 
 def held_out(holdings: Holdings) -> list[str]:

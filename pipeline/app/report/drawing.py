@@ -85,14 +85,14 @@ def as_map(axes: Axes, box: tuple[float, float, float, float], unit: str) -> Non
     Args:
         axes: Of the chart.
         box: West, east, south, north.
-        unit: ``m``, or empty for a model without a scale.
+        unit: ``m``; ``metres`` of a model whose axes are not east and north; empty of one without a scale.
     """
     axes.set_xlim(box[0], box[1])
     axes.set_ylim(box[2], box[3])
     axes.set_aspect("equal")
-    metric = unit == "m"
-    axes.set_xlabel("east (m)" if metric else "x (model units)")
-    axes.set_ylabel("north (m)" if metric else "y (model units)")
+    placed = unit == "m"
+    axes.set_xlabel("east (m)" if placed else f"x ({unit or 'model units'})")
+    axes.set_ylabel("north (m)" if placed else f"y ({unit or 'model units'})")
 
 
 def map_size(box: tuple[float, float, float, float]) -> tuple[float, float]:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 Chapter = dict[str, Any]
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 MOST_POINTS = 200  # rows of the table; thousands are in metrics.json
+MOST_BARS = 20
 AXES = ("east", "north", "up", "horizontal", "3d")
 
 
@@ -63,7 +64,8 @@ def _frame_facts(
     frame, control, report = parts
     if frame.get("kind") != "enu":
         if frame.get("metres"):
-            return [("Frame", "z up, in metres by scale bars; place and heading are arbitrary")]
+            gsd = ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel")
+            return [("Frame", "z up, in metres by scale bars; place and heading are arbitrary"), gsd, *_bars(report)]
         return [("Frame", "z up; scale, place and heading are arbitrary: no metres")]
     origin = frame["origin"]
     place = f"{origin['latitude']:.7f}°, {origin['longitude']:.7f}°, {number(origin['height_m'])} m"
@@ -86,6 +88,23 @@ def _frame_facts(
         moved = f"{number(summary.get('moved_px'), 3)} px"
         told = f"bent the model by {moved}" if bent else f"fits it as it is (bending would move the photos by {moved})"
         facts.append(("Control and the model", told if summary.get("moved_px") is not None else "not adjusted"))
+    return facts + _bars(report)
+
+
+def _bars(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What scale bars say, of `accuracy.json`; nothing where there are none."""
+    scale = report.get("scale")
+    if not scale:
+        return []
+    facts = [("Scale bars", str(scale["sentence"]))]
+    for bar in scale["bars"][:MOST_BARS]:
+        off = (
+            "a target of it was not found"
+            if bar["error_m"] is None
+            else f"{1000 * bar['error_m']:+.1f} mm in the model"
+        )
+        left_out = "" if bar["used"] or bar["error_m"] is None else ", left out"
+        facts.append((f"{bar['a']} to {bar['b']}", f"{metres(bar['metres'])} m, {off}{left_out}"))
     return facts
 
 

@@ -161,10 +161,19 @@ def _focal(holdings: Holdings) -> Finding | None:
     return Finding("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from what the photos state.")
 
 
+UNPLACED = "Lengths and heights can be measured; where on the earth it lies and where north is, nothing tells."
+SCALE_GOOD = 0.005  # relative standard deviation of scale bars: five millimetres a metre
+
+
 def _place(holdings: Holdings) -> Finding | None:
     if "georef" not in holdings.artifacts:
         return None
     frame = holdings.read("georef.frame")
+    if frame.get("kind") != "enu" and frame.get("metres"):
+        scale = holdings.read("georef.accuracy").get("scale") or {}
+        text = f"The model is metric but not placed: {scale.get('sentence', 'its metres are of scale bars.')}"
+        good = scale.get("sigma", 1.0) <= SCALE_GOOD and sum(bar["used"] for bar in scale.get("bars", [])) > 1
+        return Finding("good" if good else "doubt", "Georeferencing", f"{text} {UNPLACED}")
     if frame.get("kind") != "enu":
         why = str(frame.get("note", "")).removeprefix("Arbitrary scale: ").partition(". Up is from")[0].rstrip(".")
         text = f"The model has neither scale nor place: {why or 'nothing tells them'}, and no control places it."
