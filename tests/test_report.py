@@ -22,9 +22,11 @@ from PIL import Image
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.console import show_bad_cameras
 from splatpipe.pipeline.app.report import make_report, write_report
+from splatpipe.pipeline.app.report.capturing import unit_of
 from splatpipe.pipeline.app.report.holdings import open_holdings
 from splatpipe.pipeline.app.report.page import report_page
 from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.app.report.placing import placing_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
 
@@ -363,6 +365,7 @@ def show_nothing_inside(told: dict[str, Any]) -> None:
             "own positions alone",
         ),
         ("georef.frame", lambda told: told.update(kind="arbitrary"), "doubt", "neither scale nor place"),
+        ("georef.frame", lambda told: told.update(kind="arbitrary", metres=True), "doubt", "metric but not placed"),
     ],
 )
 def test_the_verdict_follows_the_figures(
@@ -373,6 +376,27 @@ def test_the_verdict_follows_the_figures(
     rewrite(open_holdings(copy_of_run).part(part), change)
     found = next(finding for finding in judge(open_holdings(copy_of_run)).findings if said in finding.text)
     assert found.level == level
+
+
+def test_scale_bars_are_told_one_by_one(copy_of_run: Path) -> None:
+    """Metric, not placed: lengths have a unit, and no axis is called east."""
+    bars = [("P1", "P2", 12.5, 0.0012, True), ("P2", "P3", 8.0, -0.9, False), ("P3", "P9", 4.0, None, False)]
+    rows = [dict(zip(("a", "b", "metres", "error_m", "used"), bar, strict=True)) for bar in bars]
+    scale = {"metric": True, "placed": False, "sentence": "by one bar.", "sigma": 0.001, "bars": rows}
+    holdings = open_holdings(copy_of_run)
+    rewrite(holdings.part("georef.frame"), lambda told: told.update(kind="arbitrary", metres=True, origin=None))
+    rewrite(holdings.part("georef.accuracy"), lambda told: told.update(scale=scale))
+    holdings = open_holdings(copy_of_run)
+    chapter = placing_chapter(holdings, None)
+    assert chapter is not None
+    facts = dict(chapter["facts"])
+    assert "place and heading are arbitrary" in facts["Frame"] and "a pixel" in facts["Ground sample distance"]
+    assert facts["P1 to P2"].endswith("m, +1.2 mm in the model")
+    assert facts["P2 to P3"].endswith("-900.0 mm in the model, left out")
+    assert facts["P3 to P9"].endswith("a target of it was not found")
+    assert unit_of(holdings) == "metres"
+    finding = next(finding for finding in judge(holdings).findings if "metric but not placed" in finding.text)
+    assert finding.level == "doubt"  # one bar, which no other proves
 
 
 def test_bad_cameras_are_the_first_words_of_page_and_console(

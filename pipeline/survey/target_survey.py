@@ -156,7 +156,7 @@ def scale_json(bars: Sequence[ScaleBar], scale: Scale | None, frame: Frame) -> d
     if scale is None:
         return {}
     ratio = frame.world_from_model.scale / scale.metres_per_unit
-    told = f"metres are of {_counted(scale)}, good to {scale.sigma:.2%}."
+    told = f"its metres are those of {_counted(scale)}, good to {scale.sigma:.2%} where they lie."
     if frame.origin is not None:
         told = f"by {_counted(scale)} (good to {scale.sigma:.2%}) lengths are {ratio - 1.0:+.2%} off."
     rows = [
