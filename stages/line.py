@@ -84,7 +84,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=6,
+    version=7,
     config=GeorefConfig,
     reads=(
         "sparse.model",

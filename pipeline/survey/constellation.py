@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ LEAST_TOLERANCE_M = 0.15  # after the similarity: the model is bent a little
 RESIDUALS = 4.0  # times their median
 LEAST_MATCHES = 3  # fewer places lie like points by chance
 MOST_HYPOTHESES = 2000
+MOST_TRIPLES = 500  # of known pairs, to make hypotheses with
 ROUNDS = 5
 FLAT = 0.1  # of the longest extent: what lies on a line tells no tilt
 WRONG = 3.0  # times the tolerance: a place that is known by its number is another point's
@@ -53,7 +55,7 @@ def overlay(
     """
     if len(known) >= LEAST_MATCHES:
         pairs = np.array(sorted(known.items()), dtype=np.int64).reshape(-1, 2)
-        start = _fitted(places, points, pairs)
+        start = _agreed(places, points, pairs)
     else:
         moved = _moved(places, points, known)
         if moved is None:
@@ -70,6 +72,25 @@ def overlay(
         tolerance = min(TOLERANCE_M, max(LEAST_TOLERANCE_M, RESIDUALS * float(np.median(residuals))))
     pairs, residuals = _assigned(current.apply(places), points, tolerance)
     return Overlay(pairs, residuals, tolerance, current) if len(pairs) >= LEAST_MATCHES else None
+
+
+def _agreed(
+    places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], known: Int64[np.ndarray, "k 2"]
+) -> Similarity:
+    """What most of the known pairs agree on: targets may have been laid out with each other's numbers."""
+    whole = _fitted(places, points, known)
+    target = points[known[:, 1]]
+    if (_distances(whole.apply(places)[known[:, 0]], target) <= TOLERANCE_M).all():
+        return whole
+    triples = list(itertools.combinations(range(len(known)), LEAST_MATCHES))
+    best = np.ones(len(known), dtype=bool)
+    most = 0
+    for triple in triples[:: max(1, len(triples) // MOST_TRIPLES)]:
+        moved = _fitted(places, points, known[list(triple)]).apply(places)
+        good = _distances(moved[known[:, 0]], target) <= TOLERANCE_M
+        if good.sum() > most:
+            best, most = good, int(good.sum())
+    return _fitted(places, points, known[best] if most >= LEAST_MATCHES else known)
 
 
 def _moved(
