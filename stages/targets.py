@@ -29,6 +29,7 @@ def run(config: TargetsConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     wanted = load_wanted(inputs["control.points"])
     if not wanted or not config.search:
         save_finds((), out / "targets.json")
+        report.progress(1, 1, "no targets are looked for", "steps")
         return {"photos": 0, "coded": 0, "quadrants": 0}
     photos = load_photo_list(inputs["ingest.photos"]).by_name()
     model = read_model(inputs["sparse.model"], photos)
