@@ -55,11 +55,11 @@ REFERENCE = Costs(
     stages=MappingProxyType(
         {
             "ingest": StageCosts(0.0153, 179e6, 0.0, 508.0),
-            "control": StageCosts(0.0001, 180e6, 0.0, 10.0),
+            "control": StageCosts(0.1, 180e6, 0.0, 1200.0),
             "features": StageCosts(0.341, 115e6, 282e6, 156.0),
             "matches": StageCosts(1.44e-05, 250e6, 185e6, 30.1),
             "sparse": StageCosts(6.86e-05, 282e6, 405.0, 30.4),
-            "targets": StageCosts(0.0001, 250e6, 0.0, 10.0),
+            "targets": StageCosts(0.21, 230e6, 100e6, 1300.0),
             "georef": StageCosts(0.0244, 235e6, 288.0, 30.4),
             "undistort": StageCosts(0.0304, 290e6, 15.6e6, 0.911e6),
             "split": StageCosts(0.0001, 284e6, 0.0, 18.3),

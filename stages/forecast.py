@@ -86,8 +86,9 @@ def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
     if not groups:
         return None
     shorter, longer = sorted(max(groups, key=lambda group: int(group["photos"]))["size"])
-    photos = int(told["photos"])
-    return CaptureSize(photos, shorter * longer / MEGA, 2 * int(told["positions"]) > photos, shorter / longer)
+    photos, wanted = int(told["photos"]), summaries.get("control", {})
+    control = bool(wanted.get("points") or wanted.get("scale_bars"))
+    return CaptureSize(photos, shorter * longer / MEGA, 2 * int(told["positions"]) > photos, shorter / longer, control)
 
 
 def seconds(need: Need, threads: int) -> float:

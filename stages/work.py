@@ -25,6 +25,7 @@ STEPS_POWER = 1.3  # of the steps, that Gaussians grow with: 1.5 on brighton (94
 SIZE_POWER = 0.5  # of the photos' size, the same: from 0.1 to 0.3 megapixels on the demo
 PREVIEW_MEGAPIXELS = 0.3  # at which the costs' Gaussians were counted
 GAUSSIAN_MEGAPIXELS = 1.7e-6  # of a photo that cost as much in an iteration: 1.2 on seneca, 2.3 on brighton (894,000)
+TARGETS_TILE = 2.4  # megapixels, that targets are looked for in at once
 START_SHARE = 0.2  # of the final Gaussians, at the start
 LEAST_SHARE = 0.1  # of a time budget for the training, even where nothing is left
 FEWEST_GAUSSIANS = 1000  # whatever the time
@@ -53,12 +54,14 @@ class CaptureSize:
         megapixels: Of one photo as flown, the median.
         positions: Whether most have a position.
         shape: A photo's shorter side over its longer one.
+        control: Whether a control file or scale bars ask for targets.
     """
 
     photos: int
     megapixels: float
     positions: bool
     shape: float = USUAL_SHAPE
+    control: bool = False
 
 
 @dataclass(frozen=True)
@@ -178,13 +181,15 @@ class Work:
         state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.trained_at
         looked = photos * self.looked_at * SIFT_WORK[extractor]
         looked_at_once = self.threads * self.looked_at * SIFT_MEMORY[extractor]
+        controlled = float(size.control)
+        targets_at_once = self.threads * min(size.megapixels, TARGETS_TILE)
         return {
             "ingest": Units(pixels, 0.0, photos),
-            "control": Units(photos, 0.0, photos),
+            "control": Units(controlled, 0.0, controlled),
             "features": Units(looked, looked_at_once, keypoints),
             "matches": Units(self.pairs * self.keypoints, float(self.threads), keypoints),
             "sparse": Units(keypoints * mapping, keypoints, keypoints),
-            "targets": Units(pixels, at_once, photos),
+            "targets": Units(controlled * pixels, controlled * targets_at_once, controlled * photos),
             "georef": Units(photos, keypoints, keypoints),
             "undistort": Units(pixels, at_once, trained),
             "split": Units(photos, 0.0, photos),
