@@ -15,6 +15,7 @@ from functools import cached_property
 
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.needs import whole as whole
+from splatpipe.pipeline.engine.source import Source
 from splatpipe.pipeline.engine.stage import Summary
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
@@ -89,6 +90,11 @@ def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
     photos, wanted = int(told["photos"]), summaries.get("control", {})
     control = bool(wanted.get("points") or wanted.get("scale_bars"))
     return CaptureSize(photos, shorter * longer / MEGA, 2 * int(told["positions"]) > photos, shorter / longer, control)
+
+
+def has_control(source: Source) -> bool:
+    """Whether files of the user's ask for targets."""
+    return any(source.named.get(part) is not None for part in ("source.control", "source.scale_bars"))
 
 
 def seconds(need: Need, threads: int) -> float:

@@ -28,8 +28,8 @@ from splatpipe.pipeline.engine.runner import Line, Standing, survey
 from splatpipe.pipeline.engine.session import Request, survey_line
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.store import Part, is_copy
-from splatpipe.stages.forecast import forecast, machine_speed
-from splatpipe.stages.work import CaptureSize
+from splatpipe.stages.forecast import forecast, has_control, machine_speed
+from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
 
 SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly alike
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
@@ -132,7 +132,9 @@ def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Se
     request = request_of(capture.photos.absolute(), call.out / capture.name, config)
     source = open_source(request.photos, request.out, request.stages, config)
     paths = [path for path in source.part_files["source.photos"].values() if is_photo(path)]
-    size = capture_size(paths, has_file=source.named.get("source.geo") is not None)
+    size = replace(
+        capture_size(paths, has_file=source.named.get("source.geo") is not None), control=has_control(source)
+    )
     line = Line(request.stages, config, {name: Part(source.folder, "") for name in source.part_files}, source.folder)
     needed = [stage.name for stage in line.needed(settings.until or None)]
     planned = replace(planned, photos=str(request.photos), photo_count=size.photos)
@@ -218,7 +220,7 @@ def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
     megapixels = median(width * height for width, height in sizes) / 1e6 if sizes else 0.0
     shapes = [min(size) / max(size) for size in sizes]
     positions = has_file or 2 * placed > len(sizes)
-    return CaptureSize(len(paths), megapixels, positions, *([median(shapes)] if shapes else []))
+    return CaptureSize(len(paths), megapixels, positions, median(shapes) if shapes else USUAL_SHAPE)
 
 
 def _threads(outlooks: Sequence[_Outlook], *, local: bool) -> int:

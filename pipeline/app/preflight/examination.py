@@ -90,6 +90,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     Raises:
         SplatpipeError: if there is no such folder, or a file that an option names.
     """
+    from splatpipe.stages.forecast import has_control
     from splatpipe.stages.line import LINE
 
     began_s, when_s = time.monotonic(), time.time()
@@ -104,7 +105,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     if (boundary := source.part_path("source.boundary")).is_file():
         controlled = source.part_path("source.control").is_file()
         findings += boundary_findings(boundary, config.georef, intake.positions.positions, controlled)
-    forecasts, machine = forecast_presets(intake, configs, threads)
+    forecasts, machine = forecast_presets(intake, has_control(source), configs, threads)
     return Preflight(
         folder=source.folder,
         photos=_facts(intake, look),
@@ -163,7 +164,7 @@ def _control(source: Source, config: LineConfig, intake: Intake) -> tuple[tuple[
 
 
 def forecast_presets(
-    intake: Intake, configs: Mapping[str, LineConfig], threads: int
+    intake: Intake, control: bool, configs: Mapping[str, LineConfig], threads: int
 ) -> tuple[tuple[PresetForecast, ...], MachineFacts]:
     """What a run with each preset would need, and whether this machine has it."""
     from splatpipe.stages.forecast import forecast, machine_speed
@@ -175,7 +176,7 @@ def forecast_presets(
         return (), machine
     megapixels = float(np.median([photo.width * photo.height for photo in intake.photos])) / 1e6
     shape = float(np.median([min(photo.width / photo.height, photo.height / photo.width) for photo in intake.photos]))
-    size = CaptureSize(len(intake.photos), megapixels, bool(intake.layout.located().mean() > 0.5), shape)
+    size = CaptureSize(len(intake.photos), megapixels, bool(intake.layout.located().mean() > 0.5), shape, control)
     speed = machine_speed()
     told = []
     for preset, config in configs.items():
