@@ -1,6 +1,7 @@
 """Shared by all tests: where the real photos are, and a browser."""
 
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -21,6 +22,11 @@ DEMO = (
     "split.every=4",
 )
 PATIENCE_MS = 240_000.0  # for what the browser is to show: far more than it takes, of a busy machine
+
+
+def pytest_configure() -> None:
+    """Hear Ctrl-C: a run of tests in the background has SIGINT ignored, and so would all that it starts."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

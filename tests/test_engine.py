@@ -213,12 +213,7 @@ def run_in_background(numbers: Path, out: Path, **count: object) -> subprocess.P
         "    runner.walk()\n"
     )
     command = [sys.executable, "-c", code]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True, preexec_fn=hear_ctrl_c)
-
-
-def hear_ctrl_c() -> None:
-    """In the child: a test run in the background has SIGINT ignored, and so would all that it starts."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
 
 
 @pytest.mark.parametrize("whole_group", [False, True])

@@ -205,11 +205,6 @@ def test_kill_9_in_every_stage_loses_nothing(photos: Path, undisturbed: Path, tm
     assert sha256(out / "splat.ply") == sha256(undisturbed / "splat.ply")
 
 
-def hear_ctrl_c() -> None:
-    """In the child: a test run in the background has SIGINT ignored, and so would all that it starts."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_command_says_so_and_goes_on_later(
     photos: Path, copy_of_run: Path, number: signal.Signals, code: int
@@ -218,7 +213,7 @@ def test_a_stopped_command_says_so_and_goes_on_later(
     longer = sets(*QUICK, "train.iterations=100000")
     told_before = len((copy_of_run / "events.jsonl").read_text())
     pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([*command, *longer], **pipes, preexec_fn=hear_ctrl_c) as running:
+    with subprocess.Popen([*command, *longer], **pipes) as running:
         events = copy_of_run / "events.jsonl"
         while '"what": "training"' not in events.read_text()[told_before:]:
             assert running.poll() is None, running.stderr and running.stderr.read()

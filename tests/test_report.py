@@ -178,8 +178,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     before = len((copy_of_run / "events.jsonl").read_text())
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "stage", "train", str(copy_of_run)]
     command += sets("train.iterations=100000")
-    hear = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **hear) as running:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
         while (copy_of_run / "events.jsonl").read_text()[before:].count('"name": "loss"') < 3:
             assert running.poll() is None, running.stderr and running.stderr.read()
             time.sleep(0.1)

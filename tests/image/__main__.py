@@ -36,10 +36,10 @@ def main() -> int:
         tools = ImageTools(WORK / "storage")
         if not options.no_build:
             build_image(tools, ROOT, options.torch_index, say)
-        image = tools.open_image()
-        show_sizes(tools, image)
-        check_contents(image)
-        run_demo(image)
+        with tools.open_image() as image:
+            show_sizes(tools, image)
+            check_contents(image)
+            run_demo(image)
     except Problem as problem:
         say(f"FAILED: {problem}")
         return 1

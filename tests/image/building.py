@@ -9,7 +9,8 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,13 +82,20 @@ class ImageTools:
         """Whether an image of that name is in the storage."""
         return name in self.buildah("images", "--format", "{{.Name}}:{{.Tag}}").split()
 
-    def open_image(self) -> Image:
-        """The image that was built, unpacked."""
+    @contextmanager
+    def open_image(self) -> Iterator[Image]:
+        """The image that was built, unpacked; nothing of it stays mounted."""
         container = "splatpipe-test"
         if container in self.buildah("containers", "--format", "{{.ContainerName}}").split():
             self.buildah("rm", container)
         self.buildah("from", "--pull-never", "--name", container, TAG)
         root = Path(self.buildah("mount", container))
+        try:
+            yield self._image(root)
+        finally:
+            self.buildah("rm", container)
+
+    def _image(self, root: Path) -> Image:
         config = json.loads(self.buildah("inspect", "--type", "image", TAG))["OCIv1"]["config"]
         return Image(
             root,
