@@ -20,6 +20,23 @@ from jaxtyping import Float64, Int64
 
 
 @dataclass(frozen=True)
+class Window:
+    """Where a part lies in the whole picture that it was cut from.
+
+    Attributes:
+        left: The whole picture's column that is the part's first.
+        top: The whole picture's row that is the part's first.
+        whole_width: Of the whole picture, pixels.
+        whole_height: Of the whole picture, pixels.
+    """
+
+    left: int
+    top: int
+    whole_width: int
+    whole_height: int
+
+
+@dataclass(frozen=True)
 class Camera:
     """A photo's pinhole camera and where it stood.
 
@@ -32,6 +49,7 @@ class Camera:
         cx: Principal point x, pixels; the middle of the image is ``width / 2``.
         cy: Principal point y, pixels.
         cam_from_world: Rigid transform, world units.
+        window: Where this lies in a whole picture that it is a part of; None for a whole picture.
     """
 
     name: str
@@ -42,6 +60,7 @@ class Camera:
     cx: float
     cy: float
     cam_from_world: Float64[np.ndarray, "4 4"]
+    window: Window | None = None
 
     def centre(self) -> Float64[np.ndarray, " 3"]:
         """The projection centre in the world."""
@@ -57,7 +76,12 @@ class Camera:
         Args:
             width: New width, pixels.
             height: New height, pixels.
+
+        Raises:
+            ValueError: for a part of a picture, whose pixels would not fall on those of the whole.
         """
+        if self.window is not None:
+            raise ValueError(f"{self.name}: a part of a picture cannot be resampled, scale the whole and cut it")
         by_x, by_y = width / self.width, height / self.height
         return replace(
             self,
@@ -67,6 +91,49 @@ class Camera:
             fy=self.fy * by_y,
             cx=self.cx * by_x,
             cy=self.cy * by_y,
+        )
+
+    def cut(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The view of a part of the picture: what it shows is what the whole shows there.
+
+        Args:
+            left: First column of the part, in this picture's pixels.
+            top: First row.
+            width: Its columns, at least 1.
+            height: Its rows, at least 1.
+
+        Returns:
+            The part, which knows the whole picture; that itself where the part is all of it.
+
+        Raises:
+            ValueError: if the part is not inside this picture.
+        """
+        if min(left, top) < 0 or min(width, height) < 1 or left + width > self.width or top + height > self.height:
+            raise ValueError(f"{width}×{height} from ({left}, {top}) is no part of {self.width}×{self.height} pixels")
+        if (width, height) == (self.width, self.height):
+            return self
+        held = self.window or Window(0, 0, self.width, self.height)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            cx=self.cx - left,
+            cy=self.cy - top,
+            window=replace(held, left=held.left + left, top=held.top + top),
+        )
+
+    def whole(self) -> Camera:
+        """The whole picture's view; itself where it is whole."""
+        part = self.window
+        if part is None:
+            return self
+        return replace(
+            self,
+            width=part.whole_width,
+            height=part.whole_height,
+            cx=self.cx + part.left,
+            cy=self.cy + part.top,
+            window=None,
         )
 
     def depths(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
