@@ -41,6 +41,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import iteration
 from splatpipe.pipeline.train.draws import permutation
 from splatpipe.pipeline.train.iteration import iterate
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.pipeline.train.state import TrainState
@@ -174,7 +175,7 @@ def time_case(case: Case) -> Row:
     if steps >= plan.schedule.density.first:
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
-    with same_bits(case.threads), PhotoStream(views, [0] * steps, case.seed, 1, Path(case.dataset)) as photos:
+    with same_bits(case.threads), PhotoStream(views, [Look()] * steps, case.seed, 1, Path(case.dataset)) as photos:
         state = TrainState.begin(start, plan, make_techniques(plan))
         for photo in islice(photos, warmup):
             iterate(state, plan, photo)

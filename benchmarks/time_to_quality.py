@@ -105,12 +105,12 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     options = decided_exposure(config.train, trained_on, dataset, arguments.threads, SilentReporter())
     room = start.within(options.max_gaussians)
     plan = make_plan(options, views, split, len(room))
-    levels = plan.schedule.coarse_levels_to(plan.options.iterations)
+    looks = plan.schedule.looks_to(plan.options.iterations)
     with same_bits(arguments.threads):
         clocks.start()
         sky = begin_sky(options, trained_on, dataset, arguments.threads, SilentReporter())
         state = TrainState.begin(room, plan, make_techniques(plan, sky, trained_on, dataset))
-        with PhotoStream(trained_on, levels, plan.options.seed, 1, dataset) as photos:
+        with PhotoStream(trained_on, looks, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
                 iterate(state, plan, photo)
                 last = state.iteration == ends_at(plan, state.history.flat_at)

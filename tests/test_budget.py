@@ -135,7 +135,7 @@ def test_no_cost_is_below_zero_whatever_was_measured() -> None:
 
 def test_forecast_is_the_sum_over_the_iterations() -> None:
     schedule = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
-    levels = schedule.coarse_levels_to(2400)
+    levels = [look.level for look in schedule.looks_to(2400)]
     each = [SPEED.seconds(room_at(schedule.density, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
     assert forecast(SPEED, schedule, 8_000, 0.4) == pytest.approx(math.fsum(each), rel=0.01)
 

@@ -41,13 +41,13 @@ def test_a_part_sees_what_the_whole_sees_there_and_knows_the_whole(camera: Camer
     part = camera.cut(31, 7, 40, 29)
     assert (part.width, part.height, part.window) == (40, 29, Window(31, 7, 90, 60))
     places = camera.unproject(pixels_everywhere(), np.linspace(0.5, 30.0, 40))
-    np.testing.assert_allclose(part.project(places) + [31.0, 7.0], camera.project(places), atol=1e-10)
+    np.testing.assert_allclose(np.add(part.project(places), [31.0, 7.0]), camera.project(places), atol=1e-10)
     whole, inner = part.whole(), part.cut(5, 6, 10, 12)
     assert (whole.width, whole.height, whole.fx, whole.fy) == (camera.width, camera.height, camera.fx, camera.fy)
     np.testing.assert_allclose([whole.cx, whole.cy], [camera.cx, camera.cy], atol=1e-10)
     assert whole.window is None and whole.whole() is whole
     assert inner.window == Window(36, 13, 90, 60)  # a part of a part is a part of the whole
-    np.testing.assert_allclose(inner.project(places) + [36.0, 13.0], camera.project(places), atol=1e-10)
+    np.testing.assert_allclose(np.add(inner.project(places), [36.0, 13.0]), camera.project(places), atol=1e-10)
 
 
 def test_all_of_a_picture_is_no_part_and_what_is_outside_is_refused(camera: Camera) -> None:

@@ -19,6 +19,7 @@ from splatpipe.pipeline.train.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import (
     Plan,
@@ -140,8 +141,8 @@ def test_how_to_render_follows_from_the_plan_and_survives_its_file(
 
 def test_coarse_photos_come_first_in_equal_shares() -> None:
     schedule = resolve_schedule(TrainConfig(iterations=12, coarse_levels=2))
-    assert schedule.coarse_levels_to(10) == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
-    assert resolve_schedule(TrainConfig(iterations=3)).coarse_levels_to(3) == [0, 0, 0]
+    assert [look.level for look in schedule.looks_to(10)] == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
+    assert resolve_schedule(TrainConfig(iterations=3)).looks_to(3) == [Look()] * 3
 
 
 def test_held_out_photos_are_not_trained_on() -> None:

@@ -81,9 +81,9 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         if state is None:
             begun = start.within(plan.options.max_gaussians)
             state = TrainState.begin(begun.to(device.tensors), plan, techniques())
-        levels = plan.schedule.coarse_levels_to(ends_at(plan, state.history.flat_at))
+        looks = plan.schedule.looks_to(ends_at(plan, state.history.flat_at))
         first, size = state.iteration + 1, plan.megapixels
-        with PhotoStream(trained_on, levels, plan.options.seed, first, out, size).to(device.tensors) as photos:
+        with PhotoStream(trained_on, looks, plan.options.seed, first, out, size).to(device.tensors) as photos:
             photos.tell(report)
             optimise(Training(state, plan, device, out / CHECKPOINT), photos, report)
         if (flat_at := state.history.flat_at) > 0:

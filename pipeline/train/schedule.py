@@ -8,6 +8,7 @@ from typing import Any
 
 from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
 from splatpipe.pipeline.train.draws import BACKGROUND, uniform
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
 
@@ -129,9 +130,13 @@ class Schedule:
             return 0
         return self.coarse_levels - (iteration - 1) * self.coarse_levels // self.coarse_until
 
-    def coarse_levels_to(self, last: int) -> list[int]:
-        """``coarse_level_at`` for every iteration up to the last."""
-        return [self.coarse_level_at(iteration) for iteration in range(1, last + 1)]
+    def look_at(self, iteration: int) -> Look:
+        """What an iteration (from 1) looks at of its photo."""
+        return Look(self.coarse_level_at(iteration))
+
+    def looks_to(self, last: int) -> list[Look]:
+        """``look_at`` for every iteration up to the last."""
+        return [self.look_at(iteration) for iteration in range(1, last + 1)]
 
 
 def tail_of(flat_at: int) -> int:

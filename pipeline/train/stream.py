@@ -18,6 +18,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.train.draws import permutation
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.photo_cache import PhotoCache, stored_bytes
 from splatpipe.pipeline.train.upload import Upload, Uploader
 
@@ -52,7 +53,7 @@ class PhotoStream:
 
     Args:
         views: The photos to train on.
-        levels: How often each iteration's photo is halved, ``levels[i]`` for iteration ``i`` + 1.
+        looks: What each iteration looks at of its photo, ``looks[i]`` for iteration ``i`` + 1.
         seed: Of the order; each epoch has its own.
         first: The first iteration, from 1.
         cache: Folder on whose disk the decoded photos lie meanwhile.
@@ -66,21 +67,21 @@ class PhotoStream:
     def __init__(
         self,
         views: Sequence[View],
-        levels: Sequence[int],
+        looks: Sequence[Look],
         seed: int,
         first: int,
         cache: Path,
         max_megapixels: float | None = None,
     ) -> None:
         self._views = views
-        self._levels = levels
+        self._looks = looks
         self._seed = seed
         self._next = first
         self._max_megapixels = max_megapixels
         self._uploader = Uploader(torch.device("cpu"))
         self._pending: deque[Future[tuple[Camera, Upload, bool]]] = deque()
         self._epoch = (-1, np.zeros(0, np.int64))
-        wanted = Counter(self._key(iteration) for iteration in range(first, len(levels) + 1))
+        wanted = Counter(self._key(iteration) for iteration in range(first, len(looks) + 1))
         self._wanted_again = {key for key, times in wanted.items() if times > 1}
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
@@ -101,7 +102,7 @@ class PhotoStream:
         return self
 
     def __next__(self) -> TrainingPhoto:
-        while len(self._pending) < READ_AHEAD and self._next <= len(self._levels):
+        while len(self._pending) < READ_AHEAD and self._next <= len(self._looks):
             self._pending.append(self._reader.submit(self._photo, self._next))
             self._next += 1
         if not self._pending:
@@ -136,7 +137,7 @@ class PhotoStream:
             )
 
     def _key(self, iteration: int) -> tuple[int, int]:
-        return self.view_index(iteration), self._levels[iteration - 1]
+        return self.view_index(iteration), self._looks[iteration - 1].level
 
     def _photo(self, iteration: int) -> tuple[Camera, Upload, bool]:
         camera, pixels, mask = self._decoded(self._key(iteration))
