@@ -41,10 +41,10 @@ def ending() -> Case:
 
 
 def long() -> Case:
-    """Over more tile rows than a thread takes on by itself."""
+    """Over more tile rows than a thread takes on by itself; a part of a picture, at the limits of the whole."""
     scene = random_scene(13, 40, 0, size=-1.5)
     scene.log_scales[:, 0] += 2.5
-    return case_of(scene, random_camera(13, 20, 150), depths=False, magnitudes=True)
+    return case_of(scene, random_camera(13, 60, 180).cut(15, 10, 20, 150), depths=False, magnitudes=True)
 
 
 def many() -> Case:
@@ -69,10 +69,11 @@ def loss() -> Loss:
     render, photo = (rng.random((21, 37, 3)).astype(np.float32) for _ in range(2))
     mask = rng.random((21, 37)) > 0.1
     leaf = torch.from_numpy(render).double().requires_grad_()
-    value = photo_loss_reference(leaf, torch.from_numpy(photo).double(), 0.2, torch.from_numpy(mask))
+    inner = (5, 4, 32, 21)
+    value = photo_loss_reference(leaf, torch.from_numpy(photo).double(), 0.2, torch.from_numpy(mask), inner)
     value.backward()
     assert leaf.grad is not None
-    return Loss(render, photo, mask.astype(np.uint8), 0.2, value.item(), leaf.grad.numpy())
+    return Loss(render, photo, mask.astype(np.uint8), inner, 0.2, value.item(), leaf.grad.numpy())
 
 
 def draws() -> Draws:

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda_api import SplatRectangle
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
-from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
+from splatpipe.pipeline.raster.loss import Rectangle, photo_loss, photo_loss_reference
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import _split_offsets
 from splatpipe.pipeline.train.draws import DROPOUT, SPLIT_POSITION, uniform
@@ -28,6 +29,7 @@ LOSS_RTOL = 1e-5
 GRADIENT_RTOL = 5e-5
 CPU_RTOL = 2e-5  # against the CPU's kernel, whose sums have another order
 COLOUR_RTOL = 1e-6
+FLOAT = 2.0**-23  # what torch is given is rounded
 NORMAL_ATOL = 1e-5  # offsets of scales up to 1: logarithm, cosine and exponential are the device's
 
 SIZES = [(6, 6), (6, 40), (7, 9), (11, 33), (16, 32), (37, 70), (49, 98)]
@@ -72,13 +74,19 @@ def called(kernels: Kernels, function: Callable[..., int], *arguments: object) -
 
 
 def device_loss(
-    kernels: Kernels, render: Tensor, photo: Tensor, weight: float = 0.2, mask: Tensor | None = None
+    kernels: Kernels,
+    render: Tensor,
+    photo: Tensor,
+    weight: float = 0.2,
+    mask: Tensor | None = None,
+    inner: Rectangle | None = None,
 ) -> tuple[float, Tensor]:
     height, width = render.shape[:2]
     value, gradient = untouched(1, dtype=torch.float64), untouched(height, width, 3)
     pointer, size, kept = memory_of(kernels.splat_loss_bytes(width, height))
     pictures = (at(render), at(photo), at(mask if mask is None else mask.view(torch.uint8)), width, height)
-    weighted = (ctypes.c_double(weight), at(gradient), at(value), pointer, size)
+    counted = None if inner is None else ctypes.byref(SplatRectangle(*inner))
+    weighted = (counted, ctypes.c_double(weight), at(gradient), at(value), pointer, size)
     called(kernels, kernels.splat_photo_loss, *pictures, *weighted)
     assert bool((kept[-(512 - 256) :] == 0xFF).all()), "written past the memory"
     return float(value), gradient
@@ -129,6 +137,34 @@ def test_loss_and_gradient_are_the_references_and_the_cpus(
     cpu = loss_and_gradient(photo_loss, render, photo, 0.2, mask)
     assert loss == pytest.approx(cpu[0], rel=CPU_RTOL, abs=1e-12)
     assert relative(gradient, cpu[1]) < GRADIENT_RTOL
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("inner", [(0, 0, 1, 1), (5, 3, 40, 30), (33, 0, 70, 17), (0, 5, 70, 37), (69, 36, 70, 37)])
+def test_of_a_part_that_counts_they_are_too(kernels: Kernels, inner: Rectangle, masked: bool) -> None:
+    render, photo = pair("random", 37, 70)
+    mask = some_mask(37, 70) if masked else None
+    loss, gradient = device_loss(kernels, render, photo, 0.2, mask, inner)
+    exact = loss_and_gradient(photo_loss_reference, render.double(), photo.double(), 0.2, mask, inner)
+    assert loss == pytest.approx(exact[0], rel=LOSS_RTOL, abs=1e-12)
+    assert relative(gradient, exact[1]) < GRADIENT_RTOL if bool(exact[1].any()) else not gradient.any()
+    with use_kernels(CudaKernels(CudaLibrary(build_on_cpu()), torch.device("cpu"))):
+        through = loss_and_gradient(photo_loss, render, photo, 0.2, mask, inner)
+    assert through[0] == pytest.approx(loss, rel=FLOAT)
+    assert torch.equal(through[1], gradient)
+
+
+def test_all_that_counts_is_no_part_of_it(kernels: Kernels) -> None:
+    render, photo = pair("random", 20, 40)
+    without, whole = (device_loss(kernels, render, photo, inner=inner) for inner in (None, (0, 0, 40, 20)))
+    assert without[0] == whole[0]
+    assert torch.equal(without[1], whole[1])
+
+
+@pytest.mark.parametrize("inner", [(0, 0, 41, 20), (5, 5, 5, 20), (-1, 0, 20, 20), (0, 8, 20, 7)])
+def test_a_part_that_lies_outside_is_refused(kernels: Kernels, inner: Rectangle) -> None:
+    with pytest.raises(AssertionError):
+        device_loss(kernels, *pair("random", 20, 40), inner=inner)
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
@@ -183,7 +219,7 @@ def test_too_small_pictures_and_too_little_memory_are_refused(kernels: Kernels) 
     picture = torch.zeros(6, 8, 3)
     size = kernels.splat_loss_bytes(8, 6)
     for height, given, code in ((5, size, -1), (6, size - 1, -2)):
-        pictures = (at(picture), at(picture), None, 8, height, ctypes.c_double(0.2))
+        pictures = (at(picture), at(picture), None, 8, height, None, ctypes.c_double(0.2))
         out = (at(picture), at(picture), at(picture), ctypes.c_int64(given))
         assert kernels.splat_photo_loss(*pictures, *out, None) == code
 

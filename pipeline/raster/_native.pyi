@@ -36,6 +36,7 @@ class Frame:
         camera: tuple[np.ndarray[Any, Any], tuple[int, int], tuple[float, float, float, float]],
         options: tuple[int, bool, float, float, tuple[float, float, float]],
         outputs: tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor] | None, Tensor, Tensor],
+        window: tuple[int, int, int, int] | None = None,
     ) -> None:
         """Render.
 
@@ -45,6 +46,8 @@ class Frame:
             options: SH degree, antialias, near plane, origin of the squared depths, background.
             outputs: Written: colour (h, w, 3), alpha (h, w); None, or depth_sum, depth_square_sum and median_depth
                 (h, w); radii (n,) float32; visible (n,) uint8.
+            window: Left and top in the whole picture, its width and height, where the camera's is a part of it; None:
+                it is the whole.
 
         Raises:
             TooManyPairs, MemoryError: if the scene is too much.
@@ -76,10 +79,17 @@ class Frame:
     def contributing_pairs(self) -> int:
         """Pairs of a pixel and a splat blended into it; slow, for benchmarks."""
 
-def photo_loss(render: Tensor, photo: Tensor, mask: Tensor | None, ssim_weight: float, gradient: Tensor) -> float:
+def photo_loss(
+    render: Tensor,
+    photo: Tensor,
+    mask: Tensor | None,
+    ssim_weight: float,
+    gradient: Tensor,
+    inner: tuple[int, int, int, int] | None = None,
+) -> float:
     """(1 - w) L1 + w (1 - SSIM) of two float32 (h, w, 3) images; its gradient by the render goes to `gradient`.
 
-    `mask` is uint8 (h, w), zero does not count.
+    `mask` is uint8 (h, w), zero does not count. `inner`: left, top, right, bottom of what counts; None: all.
     """
 
 def affine_colour(affine: Tensor, picture: Tensor, out: Tensor) -> None:

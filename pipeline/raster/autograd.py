@@ -56,6 +56,7 @@ class _Rasterize(torch.autograd.Function):
         alpha = torch.empty(h, w)
         depths = (torch.empty(h, w), torch.empty(h, w), torch.empty(h, w)) if options.depth else None
         radii, visible = torch.empty(n), torch.empty(n, dtype=torch.uint8)
+        part = camera.window
         pose = np.ascontiguousarray(camera.cam_from_world, np.float64)
         frame = _native.Frame()
         try:
@@ -64,6 +65,7 @@ class _Rasterize(torch.autograd.Function):
                 (pose, (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
                 (options.sh_degree, options.antialias, options.near, options.depth_origin, options.background),
                 (colour, alpha, depths, radii, visible),
+                None if part is None else (part.left, part.top, part.whole_width, part.whole_height),
             )
         except (_native.TooManyPairs, MemoryError) as error:
             _refuse(error, n)

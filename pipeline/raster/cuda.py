@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatRows, SplatShot
+from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatRectangle, SplatRows, SplatShot
 from splatpipe.pipeline.raster.cuda_forecast import Forecast, most_pairs_of
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, load, why_not
 from splatpipe.pipeline.splat.upload import upload
@@ -87,7 +87,12 @@ class CudaKernels:
         return self._library.size("splat_back_bytes", ctypes.byref(shot), count, capacity)
 
     def photo_loss(
-        self, render: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], mask: Tensor | None, ssim_weight: float
+        self,
+        render: Float[Tensor, "h w 3"],
+        photo: Float[Tensor, "h w 3"],
+        mask: Tensor | None,
+        ssim_weight: float,
+        inner: tuple[int, int, int, int] | None = None,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
         """The loss, as a float32 on the device, and its gradient by the render.
 
@@ -96,14 +101,17 @@ class CudaKernels:
             photo: What it is compared with.
             mask: (h, w) uint8, zero where a pixel does not count; None: all do.
             ssim_weight: Share of 1 - SSIM.
+            inner: Left, top, right, bottom of what counts; None: all.
         """
         height, width = render.shape[:2]
         gradient = torch.empty_like(render)
         value = torch.empty((), dtype=torch.float64, device=self.device)
         size = self._library.size("splat_loss_bytes", width, height)
         memory = self.empty(size)
-        pictures = (self.at(render), self.at(photo), self.at(mask), width, height, ssim_weight)
-        self.call("splat_photo_loss", *pictures, self.at(gradient), self.at(value), self.at(memory), size)
+        rectangle = None if inner is None else ctypes.byref(SplatRectangle(*inner))
+        pictures = (self.at(render), self.at(photo), self.at(mask), width, height)
+        weighted = (rectangle, ssim_weight)
+        self.call("splat_photo_loss", *pictures, *weighted, self.at(gradient), self.at(value), self.at(memory), size)
         return value.to(torch.float32), gradient
 
     def affine_colour(self, affine: Float[Tensor, "3 4"], picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

@@ -6,7 +6,7 @@ import ctypes
 from ctypes import POINTER, c_char, c_double, c_float, c_int32, c_int64, c_uint64, c_void_p
 from typing import Any
 
-ABI = 2
+ABI = 3
 """Of the interface that is mirrored here, SPLAT_CUDA_ABI."""
 NO_KERNEL = -3
 """SPLAT_NO_KERNEL: for this device in this binary."""
@@ -37,6 +37,10 @@ class SplatShot(ctypes.Structure):
         ("background", c_double * 3),
         ("width", c_int32),
         ("height", c_int32),
+        ("left", c_int32),
+        ("top", c_int32),
+        ("whole_width", c_int32),
+        ("whole_height", c_int32),
         ("sh_degree", c_int32),
         ("sh_count", c_int32),
         ("antialias", c_int32),
@@ -56,6 +60,10 @@ class SplatPictures(ctypes.Structure):
 
 class SplatPictureGradients(ctypes.Structure):
     _fields_ = tuple((name, c_void_p) for name in ("colour", "alpha", "depth_sum", "depth_square_sum"))
+
+
+class SplatRectangle(ctypes.Structure):
+    _fields_ = (("left", c_int32), ("top", c_int32), ("right", c_int32), ("bottom", c_int32))
 
 
 class SplatFrame(ctypes.Structure):
@@ -138,6 +146,7 @@ STRUCTURES = (
     SplatRows,
     SplatPictures,
     SplatPictureGradients,
+    SplatRectangle,
     SplatFrame,
     SplatFrameFacts,
     SplatStep,
@@ -163,7 +172,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "splat_project_backward": (*_RENDER, _ROWS, c_void_p, c_void_p),
     "splat_step": (_SHOT, _FRAME, POINTER(SplatStep), c_void_p, c_void_p),
     "splat_photo_loss": (
-        *(c_void_p, c_void_p, c_void_p, c_int32, c_int32, c_double),
+        *(c_void_p, c_void_p, c_void_p, c_int32, c_int32, POINTER(SplatRectangle), c_double),
         *(c_void_p, c_void_p, c_void_p, c_int64, c_void_p),
     ),
     "splat_affine_colour": (c_void_p, c_void_p, c_int64, c_void_p, c_void_p),

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.camera import Camera, Window
 from splatpipe.pipeline.raster.cuda import CudaKernels
 from splatpipe.pipeline.raster.cuda_api import (
     SplatFrame,
@@ -292,10 +292,12 @@ def _can_wait(wanted: Sequence[bool], leaves: Sequence[bool], probe: Tensor | No
 def shot_of(camera: Camera, options: RenderOptions, sh_count: int) -> SplatShot:
     """A camera and what to render, as the library takes them."""
     pose = np.asarray(camera.cam_from_world, np.float64)[:3]
+    part = camera.window or Window(0, 0, camera.width, camera.height)
     return SplatShot(
         (ctypes.c_double * 12)(*pose.ravel().tolist()),
         *(camera.fx, camera.fy, camera.cx, camera.cy, options.near, options.depth_origin),
         (ctypes.c_double * 3)(*options.background),
-        *(camera.width, camera.height, options.sh_degree, sh_count),
+        *(camera.width, camera.height, part.left, part.top, part.whole_width, part.whole_height),
+        *(options.sh_degree, sh_count),
         *(options.antialias, options.depth, options.magnitudes),
     )

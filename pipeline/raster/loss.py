@@ -12,7 +12,13 @@ from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.splat.metrics import SSIM_WINDOW
 
-MIN_SIDE_PX = SSIM_WINDOW // 2 + 1
+Rectangle = tuple[int, int, int, int]
+"""Left, top, right, bottom, pixels: columns left to right - 1 of rows top to bottom - 1."""
+
+SSIM_REACH_PX = SSIM_WINDOW // 2
+"""How far from its pixel a window of SSIM looks."""
+
+MIN_SIDE_PX = SSIM_REACH_PX + 1
 """The smallest image whose border can be reflected by half a window."""
 
 
@@ -21,29 +27,35 @@ def photo_loss(
     photo: Float[Tensor, "h w 3"],
     ssim_weight: float = 0.2,
     mask: Bool[Tensor, "h w"] | None = None,
+    inner: Rectangle | None = None,
 ) -> Float[Tensor, ""]:
     """How far a render is from its photo: ``photo_loss_reference``, by kernels for float32 on the CPU and CUDA devices.
 
     The native one is within 5e-5 of the reference in float64 (the gradient within 2e-4, L2) and gives the same bits for
     any number of threads. On a device the value stays there, and nobody waits for it.
 
+    Of a part that was cut from larger pictures with ``SSIM_REACH_PX`` more on the sides where they go on, and ``inner``
+    without that, the loss is the whole's over those pixels: the losses of parts that share out a photo, weighted by how
+    many of their pixels count, add up to the photo's, and the gradients likewise.
+
     Args:
         render: 0..1; the only argument that gets a gradient.
         photo: 0..1.
         ssim_weight: λ of 3D Gaussian splatting, 0..1.
         mask: True where a pixel counts; None: everywhere. If none counts, the loss and its gradient are zero.
+        inner: What counts at most; windows look at everything all the same. None: all.
 
     Returns:
         A scalar, in the render's dtype.
 
     Raises:
-        ValueError: if the sizes differ, or a side is under 6 pixels.
+        ValueError: if the sizes differ, a side is under 6 pixels, or ``inner`` is empty or not within.
     """
-    _check(render, photo, mask)
+    _check(render, photo, mask, inner)
     kernels = kernels_of(render.device)
     if render.dtype != torch.float32 or (kernels is None and render.device.type != "cpu"):
-        return photo_loss_reference(render, photo, ssim_weight, mask)
-    result: Tensor = _PhotoLoss.apply(kernels, render, photo, ssim_weight, mask)  # type: ignore[no-untyped-call]
+        return photo_loss_reference(render, photo, ssim_weight, mask, inner)
+    result: Tensor = _PhotoLoss.apply(kernels, render, photo, ssim_weight, mask, inner)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -52,6 +64,7 @@ def photo_loss_reference(
     photo: Float[Tensor, "h w 3"],
     ssim_weight: float = 0.2,
     mask: Bool[Tensor, "h w"] | None = None,
+    inner: Rectangle | None = None,
 ) -> Float[Tensor, ""]:
     """The loss by its definition: Kerbl et al., 3D Gaussian Splatting (SIGGRAPH 2023), eq. 7, with kornia's SSIM.
 
@@ -61,13 +74,18 @@ def photo_loss_reference(
     """
     from kornia.metrics import ssim  # its import costs most of a second
 
-    _check(render, photo, mask)
+    _check(render, photo, mask, inner)
     photo = photo.to(render.dtype)
     counts = torch.ones(render.shape[:2], dtype=torch.bool, device=render.device) if mask is None else mask
     seen = torch.where(counts[..., None], render, photo)
+    if inner is not None:
+        left, top, right, bottom = inner
+        counted = torch.zeros_like(counts)
+        counted[top:bottom, left:right] = counts[top:bottom, left:right]
+        counts = counted
     similarity = ssim(seen.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None], SSIM_WINDOW)[0]  # (3, h, w)
     number = 3 * max(1, int(counts.sum()))
-    l1 = (seen - photo).abs().sum() / number  # what is masked differs by zero
+    l1 = torch.where(counts[..., None], (seen - photo).abs(), 0.0).sum() / number
     dissimilarity = torch.where(counts, 1.0 - similarity, 0.0).sum() / number
     return (1.0 - ssim_weight) * l1 + ssim_weight * dissimilarity
 
@@ -77,29 +95,35 @@ class _PhotoLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, kernels: CudaKernels | None, render: Tensor, photo: Tensor, ssim_weight: float, mask: Tensor | None
+        ctx: Any,
+        kernels: CudaKernels | None,
+        render: Tensor,
+        photo: Tensor,
+        ssim_weight: float,
+        mask: Tensor | None,
+        inner: Rectangle | None,
     ) -> Tensor:
         seen, compared = render.detach().contiguous(), photo.detach().to(torch.float32).contiguous()
         counts = None if mask is None else mask.contiguous().view(torch.uint8)
         ctx.on_device = kernels is not None
         if kernels is not None:
-            loss, gradient = kernels.photo_loss(seen, compared, counts, ssim_weight)
+            loss, gradient = kernels.photo_loss(seen, compared, counts, ssim_weight, inner)
         else:
             gradient = torch.empty_like(seen)
-            loss = render.new_tensor(_native.photo_loss(seen, compared, counts, ssim_weight, gradient))
+            loss = render.new_tensor(_native.photo_loss(seen, compared, counts, ssim_weight, gradient, inner))
         ctx.save_for_backward(gradient)
         return loss
 
     @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[None, Tensor, None, None, None]:
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[None, Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
         if ctx.on_device:  # where looking at the factor is waiting for it
-            return None, gradient * upstream[0], None, None, None
+            return None, gradient * upstream[0], None, None, None, None
         scale = float(upstream[0])
-        return None, (gradient if scale == 1.0 else gradient * scale), None, None, None
+        return None, (gradient if scale == 1.0 else gradient * scale), None, None, None, None
 
 
-def _check(render: Tensor, photo: Tensor, mask: Tensor | None) -> None:
+def _check(render: Tensor, photo: Tensor, mask: Tensor | None, inner: Rectangle | None) -> None:
     size = tuple(render.shape[:2])
     if render.ndim != 3 or render.shape[2] != 3 or render.shape != photo.shape:
         raise ValueError(f"render {tuple(render.shape)} and photo {tuple(photo.shape)} are not both (h, w, 3)")
@@ -107,3 +131,7 @@ def _check(render: Tensor, photo: Tensor, mask: Tensor | None) -> None:
         raise ValueError(f"mask {tuple(mask.shape)} of {mask.dtype} is not a bool mask of {size}")
     if min(size) < MIN_SIDE_PX:
         raise ValueError(f"the loss needs images of {MIN_SIDE_PX} pixels a side, got {size}")
+    if inner is not None:
+        left, top, right, bottom = inner
+        if not (0 <= left < right <= size[1] and 0 <= top < bottom <= size[0]):
+            raise ValueError(f"{inner} is no part of an image of {size}")

@@ -99,8 +99,10 @@ def projection_jacobian(points: Float[Tensor, "n 3"], camera: Camera) -> Float[T
 
     Args:
         points: Camera frame, z > 0.
-        camera: The view; its principal point need not be in the middle.
+        camera: The view; its principal point need not be in the middle. Of a part of a picture the whole's frustum
+            counts, so that the part shows what the whole shows there.
     """
+    camera = camera.whole()
     fx, fy = camera.fx, camera.fy
     x, y, z = points.unbind(-1)
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * camera.width, FRUSTUM_MARGIN * 0.5 * camera.height

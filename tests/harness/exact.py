@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from frames import GREY, PARAMETERS, Case, Outcome
 
-from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.camera import Camera, Window
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
@@ -16,7 +16,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object) -> Case:
     """The case of a scene, with random gradients of all pictures."""
     rng = np.random.default_rng(seed)
-    size = camera.height, camera.width
+    size, part = (camera.height, camera.width), camera.window
     upstream = {"colour": rng.normal(size=(*size, 3)), **{name: rng.normal(size=size) for name in GREY}}
     return Case(
         {name: getattr(scene, name).detach().numpy() for name in PARAMETERS},
@@ -24,6 +24,7 @@ def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object)
         (camera.fx, camera.fy, camera.cx, camera.cy),
         (camera.width, camera.height),
         {name: value.astype(np.float32) for name, value in upstream.items()},
+        window=part and (part.left, part.top, part.whole_width, part.whole_height),
         sh_degree=math.isqrt(scene.sh.shape[1]) - 1,
     ).changed(**settings)
 
@@ -31,7 +32,7 @@ def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object)
 def camera_of(case: Case) -> Camera:
     pose = np.eye(4)
     pose[:3] = case.pose
-    return Camera("view", *case.size, *case.intrinsics, pose)
+    return Camera("view", *case.size, *case.intrinsics, pose, None if case.window is None else Window(*case.window))
 
 
 def options_of(case: Case) -> RenderOptions:

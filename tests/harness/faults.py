@@ -17,7 +17,7 @@ class Fault:
 
     Attributes:
         name: What is wrong with it.
-        file: In `native/cuda`.
+        file: From `native/cuda` on.
         snippet: What stands in the file, exactly once.
         instead: What is put there; the same as long as ``ALIVE`` is false.
     """
@@ -249,6 +249,36 @@ FAULTS = (
         "(FAULT ? -v : v) > 0.0f ? 1.0f : ((FAULT ? -v : v) < 0.0f ? -1.0f : 0.0f)",
     ),
     Fault(
+        "pixels beside those that count have a share of the loss",
+        "loss.cu",
+        "const bool counts_here = is_inner(job, row, col) &&",
+        "const bool counts_here = (FAULT || is_inner(job, row, col)) &&",
+    ),
+    Fault(
+        "pixels beside those that count have L1's gradient",
+        "loss.cu",
+        "const float l1 = is_inner(job, row, col) ?",
+        "const float l1 = FAULT || is_inner(job, row, col) ?",
+    ),
+    Fault(
+        "a column beside those that count counts",
+        "loss.cu",
+        "col < job.inner.right &&",
+        "col < job.inner.right + (FAULT ? 1 : 0) &&",
+    ),
+    Fault(
+        "a part of a picture has limits of its own",
+        "../view.h",
+        "margin_x = kFrustumMargin * 0.5 * shot.whole_width",
+        "margin_x = kFrustumMargin * 0.5 * (FAULT ? shot.width : shot.whole_width)",
+    ),
+    Fault(
+        "a part of a picture lies elsewhere in it",
+        "../view.h",
+        "cx = shot.cx + shot.left,",
+        "cx = shot.cx + (FAULT ? 0 : shot.left),",
+    ),
+    Fault(
         "no barrier before the loss's rows are read",
         "loss.cu",
         "blur_pictures(job, tile, &shared.means);\n    __syncthreads();",
@@ -265,10 +295,11 @@ def planted() -> Path:
     """
     texts: dict[Path, str] = {}
     for number, fault in enumerate(FAULTS, start=1):
-        path = NATIVE / "cuda" / fault.file
+        path = (NATIVE / "cuda" / fault.file).resolve()
         text = path.read_text()
         assert text.count(fault.snippet) == 1, f"{fault.file} has '{fault.snippet}' {text.count(fault.snippet)} times"
         changed = texts.get(path, text)
         assert changed.count(fault.snippet) == 1, f"two faults in one place of {fault.file}: {fault.name}"
         texts[path] = changed.replace(fault.snippet, fault.instead.replace(ALIVE, f"(::harness::fault() == {number})"))
+    texts = {path: f'#include "device.h"\n{text}' for path, text in texts.items()}  # which knows the harness
     return build_on_cpu([*kernel_sources(), HARNESS / "peek.cu"], "splat_cuda_with_faults", changed=texts)

@@ -71,6 +71,7 @@ class Case:
         pose: cam_from_world, (3, 4).
         intrinsics: fx, fy, cx, cy.
         size: Width and height, pixels.
+        window: Left, top, width and height of the whole picture of which this is a part; None: it is the whole.
         upstream: dL/d(picture) by name: colour (h, w, 3), alpha, depth_sum, depth_square_sum (h, w).
     """
 
@@ -86,6 +87,7 @@ class Case:
     antialias: bool = False
     depths: bool = True
     magnitudes: bool = False
+    window: tuple[int, int, int, int] | None = None
 
     @property
     def count(self) -> int:
@@ -97,6 +99,7 @@ class Case:
         shot.fx, shot.fy, shot.cx, shot.cy = self.intrinsics
         shot.background[:] = self.background
         shot.width, shot.height = self.size
+        shot.left, shot.top, shot.whole_width, shot.whole_height = self.window or (0, 0, *self.size)
         shot.sh_count = self.rows["sh"].shape[1]
         shot.antialias, shot.depths, shot.magnitudes = int(self.antialias), int(self.depths), int(self.magnitudes)
         return shot

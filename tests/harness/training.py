@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from frames import PARAMETERS, Case, Frame, Memory, Outcome, pointer, rows_of
 
-from splatpipe.pipeline.raster.cuda_api import SplatStep
+from splatpipe.pipeline.raster.cuda_api import SplatRectangle, SplatStep
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 
 LOSS = 1e-5
@@ -29,11 +29,12 @@ KEY = (5, 600, 2)  # of the draws: seed, step, what for
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss of render and photo (h, w, 3), masked (h, w) where zero, and its gradient by the render."""
+    """A loss of render and photo (h, w, 3), masked (h, w) where zero, of what is inner; its gradient by the render."""
 
     render: np.ndarray
     photo: np.ndarray
     mask: np.ndarray
+    inner: tuple[int, int, int, int]
     weight: float
     value: float
     gradient: np.ndarray
@@ -45,7 +46,7 @@ class Loss:
         memory = at.empty("memory", (size,), np.uint8)
         given = [at.put(name, getattr(self, name)) for name in ("render", "photo", "mask")]
         gradient, value = at.empty("gradient", self.render.shape), at.empty("value", (1,), np.float64)
-        pictures = (*map(pointer, given), width, height, self.weight)
+        pictures = (*map(pointer, given), width, height, SplatRectangle(*self.inner), self.weight)
         library.call("splat_photo_loss", *pictures, pointer(gradient), pointer(value), pointer(memory), size, None)
         yield from (f"written beside {name}" for name in at.overrun())
         if not abs(value[0] - self.value) <= LOSS * self.value:

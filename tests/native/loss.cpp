@@ -15,6 +15,7 @@ constexpr double kWeight = 0.2;
 
 struct Pair {
     int height, width;
+    splat::LossRectangle inner;  // what counts
     std::vector<float> render, photo;
     std::vector<std::uint8_t> mask;  // empty: none
 };
@@ -22,7 +23,7 @@ struct Pair {
 Pair random_pair(int height, int width, bool masked) {
     Random random(static_cast<std::uint64_t>(height * 1000 + width));
     const std::size_t pixels = static_cast<std::size_t>(height) * static_cast<std::size_t>(width);
-    Pair pair{height, width, std::vector<float>(3 * pixels), std::vector<float>(3 * pixels), {}};
+    Pair pair{height, width, {0, 0, width, height}, std::vector<float>(3 * pixels), std::vector<float>(3 * pixels), {}};
     for (float& value : pair.render) value = random.uniform(0.0f, 1.0f);
     for (std::size_t i = 0; i < pair.photo.size(); ++i)  // far enough from the render for |render - photo| to be smooth
         pair.photo[i] = pair.render[i] + (random.below(2) ? 0.1f : -0.1f) * random.uniform(1.0f, 3.0f);
@@ -33,7 +34,7 @@ Pair random_pair(int height, int width, bool masked) {
 
 double loss_of(const Pair& pair, std::vector<float>* gradient) {
     return splat::photo_loss({pair.render.data(), pair.photo.data(), pair.mask.empty() ? nullptr : pair.mask.data(),
-                              gradient->data(), pair.height, pair.width},
+                              gradient->data(), pair.height, pair.width, pair.inner},
                              kWeight);
 }
 
@@ -56,8 +57,9 @@ void same_for_any_threads() {
 }
 
 void gradient_is_central_differences() {
-    for (bool masked : {false, true}) {
-        Pair pair = random_pair(13, 17, masked);
+    for (int given = 0; given < 4; ++given) {
+        Pair pair = random_pair(13, 17, given % 2);
+        if (given / 2) pair.inner = {3, 2, 12, 13};
         std::vector<float> gradient(pair.render.size()), unused(pair.render.size());
         loss_of(pair, &gradient);
         double error2 = 0.0, size2 = 0.0;

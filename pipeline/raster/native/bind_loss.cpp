@@ -1,10 +1,12 @@
 // Python faces of the loss, what is between it and the rasterizer, and the optimiser: checks around their drivers.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <array>
 #include <cstdint>
 #include <optional>
 #include <tuple>
@@ -25,6 +27,7 @@ namespace {
 using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using MutableImage = nb::ndarray<float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Mask = nb::ndarray<const std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Rectangle = std::array<int, 4>;  // left, top, right, bottom
 using Rows = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using ConstRows = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Rates = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
@@ -35,16 +38,24 @@ void require(bool holds, const char* message) {
 }
 
 double photo_loss(const Image& render, const Image& photo, const std::optional<Mask>& mask, double ssim_weight,
-                  const MutableImage& gradient) {
+                  const MutableImage& gradient, const std::optional<Rectangle>& inner) {
     const std::size_t height = render.shape(0), width = render.shape(1);
     require(photo.shape(0) == height && photo.shape(1) == width, "render and photo differ in size");
     require(gradient.shape(0) == height && gradient.shape(1) == width, "render and gradient differ in size");
     require(!mask || (mask->shape(0) == height && mask->shape(1) == width), "render and mask differ in size");
     require(height >= splat::kLossMinSide && width >= splat::kLossMinSide, "the loss needs 6 pixels a side");
     require(height <= INT32_MAX / 4 && width <= INT32_MAX / 4, "the image is too large");
-    const splat::LossImages images{
-        render.data(),          photo.data(), mask ? mask->data() : nullptr, gradient.data(), static_cast<int>(height),
-        static_cast<int>(width)};
+    const auto [left, top, right, bottom] =
+        inner.value_or(Rectangle{0, 0, static_cast<int>(width), static_cast<int>(height)});
+    require(0 <= left && left < right && right <= static_cast<int>(width), "no columns of the image count");
+    require(0 <= top && top < bottom && bottom <= static_cast<int>(height), "no rows of the image count");
+    const splat::LossImages images{render.data(),
+                                   photo.data(),
+                                   mask ? mask->data() : nullptr,
+                                   gradient.data(),
+                                   static_cast<int>(height),
+                                   static_cast<int>(width),
+                                   {left, top, right, bottom}};
     nb::gil_scoped_release release;
     return splat::photo_loss(images, ssim_weight);
 }
@@ -101,7 +112,7 @@ std::int64_t adam_step(const std::vector<Rows>& values, const std::vector<ConstR
 
 void bind_loss(nb::module_& m) {
     m.def("photo_loss", &photo_loss, "render"_a.noconvert(), "photo"_a.noconvert(), "mask"_a.noconvert().none(),
-          "ssim_weight"_a, "gradient"_a.noconvert(),
+          "ssim_weight"_a, "gradient"_a.noconvert(), "inner"_a = nb::none(),
           "(1 - w) L1 + w (1 - SSIM) of two (h, w, 3) images; its gradient by the render goes to `gradient`.");
     m.def("affine_colour", &affine_colour, "affine"_a.noconvert(), "picture"_a.noconvert(), "out"_a.noconvert(),
           "The colours of an (h, w, 3) picture through a (3, 4) affine map, to `out`.");

@@ -35,6 +35,8 @@ template <class T>
 using ParameterArrays = std::tuple<Grid<T>, Grid<T>, Grid<T>, Line<T>, Cube<T>>;
 // cam_from_world; width, height; fx, fy, cx, cy
 using CameraTuple = std::tuple<Pose, std::array<int, 2>, std::array<double, 4>>;
+// left, top; width and height of the whole picture of which the camera's is a part
+using WindowArray = std::array<int, 4>;
 // sh_degree, antialias, near, depth_origin, background
 using OptionsTuple = std::tuple<int, bool, double, double, std::array<double, 3>>;
 // depth_sum, depth_square_sum, median_depth
@@ -75,7 +77,8 @@ splat::Parameters parameters_of(const ParameterArrays<const float>& arrays) {
             checked(sh, n, sh.shape(1), "sh")};
 }
 
-splat::View view_of(const CameraTuple& camera, const OptionsTuple& options, size_t sh_count) {
+splat::View view_of(const CameraTuple& camera, const std::optional<WindowArray>& window, const OptionsTuple& options,
+                    size_t sh_count) {
     const auto& [pose, size, intrinsics] = camera;
     const auto& [degree, antialias, near_z, depth_origin, background] = options;
     SplatShot shot{};
@@ -84,6 +87,8 @@ splat::View view_of(const CameraTuple& camera, const OptionsTuple& options, size
     shot.near_z = near_z, shot.depth_origin = depth_origin;
     for (int c = 0; c < 3; ++c) shot.background[c] = background[c];
     shot.width = size[0], shot.height = size[1];
+    const auto [left, top, whole_width, whole_height] = window.value_or(WindowArray{0, 0, size[0], size[1]});
+    shot.left = left, shot.top = top, shot.whole_width = whole_width, shot.whole_height = whole_height;
     shot.sh_degree = degree, shot.antialias = antialias;
     shot.sh_count = static_cast<int32_t>(std::min<size_t>(sh_count, splat::kMaxShCount + 1));
     splat::View view{};
@@ -95,9 +100,9 @@ splat::View view_of(const CameraTuple& camera, const OptionsTuple& options, size
 class Frame {
   public:
     void forward(const ParameterArrays<const float>& arrays, const CameraTuple& camera, const OptionsTuple& options,
-                 const OutputArrays& outputs) {
+                 const OutputArrays& outputs, const std::optional<WindowArray>& window) {
         const splat::Parameters in = parameters_of(arrays);
-        view_ = view_of(camera, options, std::get<4>(arrays).shape(1));
+        view_ = view_of(camera, window, options, std::get<4>(arrays).shape(1));
         const size_t n = in.count, h = view_.height, w = view_.width;
         const auto& [colour, alpha, depths, radii, visible] = outputs;
         splat::Pictures out{};
@@ -159,7 +164,7 @@ void bind_raster(nb::module_& m) {
     nb::class_<Frame>(m, "Frame")
         .def(nb::init<>())
         .def("forward", &Frame::forward, nb::arg("parameters").noconvert(), nb::arg("camera").noconvert(), "options"_a,
-             nb::arg("outputs").noconvert())
+             nb::arg("outputs").noconvert(), "window"_a = nb::none())
         .def("backward", &Frame::backward, nb::arg("parameters").noconvert(), nb::arg("gradients").noconvert(),
              nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert(), "magnitudes"_a = false)
         .def_prop_ro("pairs", &Frame::pairs)

@@ -8,6 +8,11 @@
 
 namespace splat {
 
+// Pixels [row0, row1) x [col0, col1) of the image.
+struct LossTile {
+    int row0, row1, col0, col1;
+};
+
 // One call's images and constants. Images are (height, width, 3) float, contiguous.
 struct LossJob {
     const float* render;  // masked pixels already replaced by the photo's
@@ -16,6 +21,7 @@ struct LossJob {
     float* gradient;           // (height, width, 3), written whole
     int height;
     int width;
+    LossTile inner;    // pixels elsewhere are seen by windows and do not count
     float taps[6];     // the window's weight at a distance of 0..5 pixels
     float l1_scale;    // (1 - w) / (3 counting pixels)
     float ssim_scale;  // w / (3 counting pixels)
@@ -24,11 +30,6 @@ struct LossJob {
 constexpr int kLossTileRows = 128;
 constexpr int kLossTileCols = 256;
 constexpr std::size_t kLossScratch = 116'000;  // floats a tile works in
-
-// Pixels [row0, row1) x [col0, col1) of the image.
-struct LossTile {
-    int row0, row1, col0, col1;
-};
 
 // Sums over a tile's counting pixels and channels.
 struct LossSums {

@@ -24,7 +24,7 @@ constexpr int kMapStride = ((kLossTileCols + 2 * kRadius) * kChannels + kAlign -
 constexpr int kMeanStride = ((kLossTileCols + 4 * kRadius) * kChannels + kAlign - 1) / kAlign * kAlign;
 
 static_assert(kBand % kRegisterRows == 0, "a band is whole register blocks");
-static_assert(kMeanStride * kBand * 4 + kMapStride * (kRing * 3 + 3) <= int(kLossScratch), "scratch");
+static_assert(kMeanStride * kBand * 4 + kMapStride * (kRing * 3 + 4) <= int(kLossScratch), "scratch");
 
 SPLAT_INLINE int least(int a, int b) { return a < b ? a : b; }
 SPLAT_INLINE int most(int a, int b) { return a > b ? a : b; }
@@ -50,6 +50,7 @@ struct Scratch {
     float* maps[3];   // a, b_u, b_v: rings of kRing rows of kMapStride
     float* dissimilarity;
     float* counts;
+    float* inside;
     float* zeros;
 };
 
@@ -59,6 +60,7 @@ Scratch divide(float* memory) {
     for (float*& plane : s.maps) plane = memory, memory += kRing * kMapStride;
     s.dissimilarity = memory, memory += kMapStride;
     s.counts = memory, memory += kMapStride;
+    s.inside = memory, memory += kMapStride;
     s.zeros = memory;
     for (int i = 0; i < kMapStride; ++i) s.zeros[i] = 0.0f;
     return s;
@@ -138,6 +140,25 @@ const float* expand_mask(const std::uint8_t* mask, int pixels, float* out) {
     if (!masked) return nullptr;
     for (int i = 0; i < pixels; ++i)
         for (int c = 0; c < kChannels; ++c) out[i * kChannels + c] = mask[i] ? 1.0f : 0.0f;
+    return out;
+}
+
+// n pixels of a row from a column on, as far as the inner rectangle has them: [from, to) of them.
+struct Part {
+    int from, to;
+};
+
+SPLAT_INLINE Part inner_part(const LossTile& inner, int row, int col, int n) {
+    if (row < inner.row0 || row >= inner.row1) return {0, 0};
+    const int from = most(0, least(inner.col0 - col, n));
+    return {from, most(from, least(inner.col1 - col, n))};
+}
+
+// What counts (null: all of it) without what lies outside the inner rectangle, in out; itself where that is nothing.
+const float* confine(const Part& part, const float* counts, int pixels, float* out) {
+    if (part.from == 0 && part.to == pixels) return counts;
+    for (int i = 0; i < pixels * kChannels; ++i)
+        out[i] = i < part.from * kChannels || i >= part.to * kChannels ? 0.0f : (counts ? counts[i] : 1.0f);
     return out;
 }
 
@@ -223,6 +244,7 @@ double similarity_band(const LossJob& job, const Span& span, const Scratch& s, i
         const int pixels = span.col1 - span.col0;
         const float* counts = nullptr;
         if (job.mask) counts = expand_mask(job.mask + std::ptrdiff_t(r) * job.width + span.col0, pixels, s.counts);
+        counts = confine(inner_part(job.inner, r, span.col0, pixels), counts, pixels, s.counts);
         similarity_row(means, job.taps, counts, pixels * kChannels, maps, s.dissimilarity);
         if (r >= span.own.row0 && r < span.own.row1)
             sum += sum_of(s.dissimilarity + (span.own.col0 - span.col0) * kChannels,
@@ -231,20 +253,26 @@ double similarity_band(const LossJob& job, const Span& span, const Scratch& s, i
     return sum;
 }
 
+// What multiplies the values of a row: 0 where a pixel is masked; of the absolute difference, where it is not inside.
+struct Factors {
+    const float *counts, *inside;  // null: 1
+};
+
 // The gradient of n values of a row. maps: a, b_u, b_v blurred down the columns, from 5 pixels before the first value.
-SPLAT_INLINE void gradient_row(const LossJob& job, const float* const* maps, std::ptrdiff_t offset, const float* counts,
-                               int n) {
+SPLAT_INLINE void gradient_row(const LossJob& job, const float* const* maps, std::ptrdiff_t offset,
+                               const Factors& factors, int n) {
     const Window window = window_of(job.taps);
     for (int at = 0; at < n; at += kLanes) {
         const int j = least(at, n - kLanes);
         const Floats x = load(job.render + offset + j), y = load(job.photo + offset + j);
         const Floats u = x + y - 1.0f, v = x - y;
         const Floats zero = fill(0.0f), one = fill(1.0f);
-        const Floats sign = only(less(zero, v), one) - only(less(v, zero), one);
+        Floats sign = only(less(zero, v), one) - only(less(v, zero), one);
+        if (factors.inside) sign *= load(factors.inside + j);
         const Floats a = blur_along(maps[0] + j, window);
         const Floats b_u = blur_along(maps[1] + j, window), b_v = blur_along(maps[2] + j, window);
         Floats gradient = job.l1_scale * sign + job.ssim_scale * (a + 2.0f * (u * b_u + v * b_v));
-        if (counts) gradient *= load(counts + j);
+        if (factors.counts) gradient *= load(factors.counts + j);
         store(job.gradient + offset + j, gradient);
     }
 }
@@ -254,6 +282,8 @@ void gradient_pixel(const LossJob& job, const Span& span, float* const* maps, in
     float own_taps[kTaps];
     transposed_taps(job.taps, col, job.width, own_taps);
     const std::ptrdiff_t pixel = std::ptrdiff_t(row) * job.width + col;
+    const Part part = inner_part(job.inner, row, col, 1);
+    const float l1_scale = part.from < part.to ? job.l1_scale : 0.0f;
     for (int c = 0; c < kChannels; ++c) {
         float blurred[3] = {};
         for (int k = 0; k < kTaps; ++k) {
@@ -266,7 +296,7 @@ void gradient_pixel(const LossJob& job, const Span& span, float* const* maps, in
         const float sign = v > 0.0f ? 1.0f : (v < 0.0f ? -1.0f : 0.0f);
         const float similarity = blurred[0] + 2.0f * (u * blurred[1] + v * blurred[2]);
         const bool counting = !job.mask || job.mask[pixel];
-        job.gradient[pixel * kChannels + c] = counting ? job.l1_scale * sign + job.ssim_scale * similarity : 0.0f;
+        job.gradient[pixel * kChannels + c] = counting ? l1_scale * sign + job.ssim_scale * similarity : 0.0f;
     }
 }
 
@@ -306,14 +336,16 @@ double gradient_band(const LossJob& job, const Span& span, const Scratch& s, int
         if (to > from) {
             const float* ahead[3];
             for (int p = 0; p < 3; ++p) ahead[p] = maps[p] + (from - kRadius - span.col0) * kChannels;
-            const float* counts = nullptr;
-            if (job.mask) counts = expand_mask(job.mask + start + from, to - from, s.counts);
-            gradient_row(job, ahead, (start + from) * kChannels, counts, (to - from) * kChannels);
+            Factors factors{};
+            if (job.mask) factors.counts = expand_mask(job.mask + start + from, to - from, s.counts);
+            factors.inside = confine(inner_part(job.inner, r, from, to - from), nullptr, to - from, s.inside);
+            gradient_row(job, ahead, (start + from) * kChannels, factors, (to - from) * kChannels);
         }
         for (int col = own.col0; col < from; ++col) gradient_pixel(job, span, maps, r, col);
         for (int col = to; col < own.col1; ++col) gradient_pixel(job, span, maps, r, col);
-        const std::ptrdiff_t first = (start + own.col0) * kChannels;
-        sum += sum_of_differences(job.render + first, job.photo + first, (own.col1 - own.col0) * kChannels);
+        const Part part = inner_part(job.inner, r, own.col0, own.col1 - own.col0);
+        const std::ptrdiff_t first = (start + own.col0 + part.from) * kChannels;
+        sum += sum_of_differences(job.render + first, job.photo + first, (part.to - part.from) * kChannels);
     }
     return sum;
 }

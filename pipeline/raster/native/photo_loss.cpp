@@ -20,6 +20,8 @@ float* thread_scratch() {
     return static_cast<float*>(std::align(kAlignment, kLossScratch * sizeof(float), start, space));
 }
 
+bool is_row_of(const LossTile& tile, std::int64_t row) { return row >= tile.row0 && row < tile.row1; }
+
 // The render with masked pixels replaced by the photo's; how many pixels count goes to *counting.
 std::unique_ptr<float[]> replace_masked(const LossJob& job, std::int64_t* counting) {
     const std::size_t width = static_cast<std::size_t>(job.width);
@@ -31,8 +33,10 @@ std::unique_ptr<float[]> replace_masked(const LossJob& job, std::int64_t* counti
         for (std::size_t pixel = start; pixel < start + width; ++pixel) {
             const float* source = (job.mask[pixel] ? job.render : job.photo) + pixel * 3;
             for (int c = 0; c < 3; ++c) replaced[pixel * 3 + c] = source[c];
-            count += job.mask[pixel] != 0;
         }
+        if (is_row_of(job.inner, row))
+            for (int col = job.inner.col0; col < job.inner.col1; ++col)
+                count += job.mask[start + static_cast<std::size_t>(col)] != 0;
         counts[static_cast<std::size_t>(row)] = count;
     });
     *counting = 0;
@@ -67,7 +71,9 @@ double photo_loss(const LossImages& images, double ssim_weight) {
     job.render = images.render, job.photo = images.photo, job.mask = images.mask, job.gradient = images.gradient;
     job.height = images.height, job.width = images.width;
     set_loss_taps(job.taps);
-    std::int64_t counting = std::int64_t{job.height} * job.width;
+    const LossRectangle& inner = images.inner;
+    job.inner = {inner.top, inner.bottom, inner.left, inner.right};
+    std::int64_t counting = std::int64_t{inner.bottom - inner.top} * (inner.right - inner.left);
     std::unique_ptr<float[]> replaced;
     if (job.mask) {
         replaced = replace_masked(job, &counting);

@@ -13,6 +13,9 @@ constexpr int kMaxShCount = (kMaxShDegree + 1) * (kMaxShDegree + 1);
 // Null, or the name of what makes no sense.
 inline const char* find_view(const SplatShot& shot, View* view) {
     if (shot.width < 1 || shot.height < 1 || shot.width > kMaxPixels || shot.height > kMaxPixels) return "size";
+    if (shot.left < 0 || shot.top < 0 || shot.whole_width - shot.left < shot.width ||
+        shot.whole_height - shot.top < shot.height)
+        return "window";
     const int degree = shot.sh_degree;
     if (degree < 0 || degree > kMaxShDegree || shot.sh_count > kMaxShCount ||
         (degree + 1) * (degree + 1) > shot.sh_count)
@@ -31,11 +34,14 @@ inline const char* find_view(const SplatShot& shot, View* view) {
         view->translation[row] = static_cast<float>(pose[4 * row + 3]);
         view->centre[row] = static_cast<float>(centre);
     }
-    const double margin_x = kFrustumMargin * 0.5 * shot.width, margin_y = kFrustumMargin * 0.5 * shot.height;
-    view->ratio_min[0] = static_cast<float>(-(shot.cx + margin_x) / shot.fx);
-    view->ratio_max[0] = static_cast<float>((shot.width - shot.cx + margin_x) / shot.fx);
-    view->ratio_min[1] = static_cast<float>(-(shot.cy + margin_y) / shot.fy);
-    view->ratio_max[1] = static_cast<float>((shot.height - shot.cy + margin_y) / shot.fy);
+    // Of the whole picture, so that a part of it shows what the whole shows there.
+    const double cx = shot.cx + shot.left, cy = shot.cy + shot.top;
+    const double margin_x = kFrustumMargin * 0.5 * shot.whole_width,
+                 margin_y = kFrustumMargin * 0.5 * shot.whole_height;
+    view->ratio_min[0] = static_cast<float>(-(cx + margin_x) / shot.fx);
+    view->ratio_max[0] = static_cast<float>((shot.whole_width - cx + margin_x) / shot.fx);
+    view->ratio_min[1] = static_cast<float>(-(cy + margin_y) / shot.fy);
+    view->ratio_max[1] = static_cast<float>((shot.whole_height - cy + margin_y) / shot.fy);
     view->near_z = static_cast<float>(shot.near_z), view->depth_origin = static_cast<float>(shot.depth_origin);
     for (int c = 0; c < 3; ++c) view->background[c] = static_cast<float>(shot.background[c]);
     view->sh_degree = degree, view->sh_count = shot.sh_count;

@@ -15,7 +15,7 @@
 extern "C" {
 #endif
 
-#define SPLAT_CUDA_ABI 2 /* raised with every change of this file; the caller refuses another */
+#define SPLAT_CUDA_ABI 3 /* raised with every change of this file; the caller refuses another */
 #define SPLAT_API __attribute__((visibility("default")))
 
 enum {
@@ -44,6 +44,8 @@ typedef struct {
     double near_z, depth_origin;
     double background[3];
     int32_t width, height;
+    int32_t left, top; /* of this in the whole picture that it is a part of; 0 where it is that itself */
+    int32_t whole_width, whole_height;
     int32_t sh_degree; /* that counts */
     int32_t sh_count;  /* coefficients a channel that are stored */
     int32_t antialias;
@@ -66,6 +68,11 @@ typedef struct {
 typedef struct {
     const float *colour, *alpha, *depth_sum, *depth_square_sum;
 } SplatPictureGradients;
+
+/* Columns left to right - 1 of rows top to bottom - 1. */
+typedef struct {
+    int32_t left, top, right, bottom;
+} SplatRectangle;
 
 /* A frame's memory, the caller's. */
 typedef struct {
@@ -153,12 +160,13 @@ SPLAT_API int32_t splat_project_backward(const SplatShot* shot, const SplatRows*
 SPLAT_API int32_t splat_step(const SplatShot* shot, const SplatFrame* frame, const SplatStep* step, float* means2d,
                              SplatStream stream);
 
-/* Loss: (1 - w) L1 + w (1 - SSIM) of (h, w, 3) pictures, masked where `mask` (h, w) uint8 is zero, null for nowhere.
- * Its gradient by the render, and its value to one double. */
+/* Loss: (1 - w) L1 + w (1 - SSIM) of (h, w, 3) pictures, masked where `mask` (h, w) uint8 is zero, null for nowhere. Of
+ * what is not masked the pixels of `inner` count, null for all; windows look at everything. Its gradient by the render,
+ * and its value to one double. */
 SPLAT_API int64_t splat_loss_bytes(int32_t width, int32_t height);
 SPLAT_API int32_t splat_photo_loss(const float* render, const float* photo, const uint8_t* mask, int32_t width,
-                                   int32_t height, double ssim_weight, float* gradient, double* value, void* memory,
-                                   int64_t bytes, SplatStream stream);
+                                   int32_t height, const SplatRectangle* inner, double ssim_weight, float* gradient,
+                                   double* value, void* memory, int64_t bytes, SplatStream stream);
 
 /* Colours of `pixels` pixels through a (3, 4) affine map, and back: by the picture and, to map_gradient (3, 4), by it.
  */

@@ -36,6 +36,7 @@ struct LossJob {
     const float *render, *photo;
     const uint8_t* mask;  // null: every pixel counts
     int width, height;
+    SplatRectangle inner;  // what counts; windows look at everything
     int tiles_x, tiles;
     float taps[kRadius + 1];
     float* maps;  // a, b_u, b_v: (3, height, width, 3)
@@ -58,6 +59,8 @@ struct Blurred {
     float of[kPlanes][kTileRows][kReach];
 };
 
+__device__ inline bool is_masked(const LossJob& job, int64_t pixel) { return job.mask && !job.mask[pixel]; }
+
 // Pixel's value of a channel in both pictures; where the pixel does not count, the render has the photo's.
 struct Pair {
     float render, photo;
@@ -66,7 +69,11 @@ struct Pair {
 __device__ inline Pair pair_at(const LossJob& job, int row, int col, int channel) {
     const int64_t pixel = static_cast<int64_t>(row) * job.width + col, at = pixel * kChannels + channel;
     const float photo = job.photo[at];
-    return {job.mask && !job.mask[pixel] ? photo : job.render[at], photo};
+    return {is_masked(job, pixel) ? photo : job.render[at], photo};
+}
+
+__device__ inline bool is_inner(const LossJob& job, int row, int col) {
+    return col >= job.inner.left && col < job.inner.right && row >= job.inner.top && row < job.inner.bottom;
 }
 
 // Windowed sums down the columns of u, u^2, v, v^2; the image is mirrored at its border.
@@ -130,7 +137,7 @@ __global__ void __launch_bounds__(kThreads, 3) make_maps(const LossJob job) {
                                                      blur_along(&shared.means.of[2][r][j], job.taps),
                                                      blur_along(&shared.means.of[3][r][j], job.taps), &a, &b_u, &b_v);
         const int64_t pixel = static_cast<int64_t>(row) * job.width + col;
-        const bool counts_here = !job.mask || job.mask[pixel];
+        const bool counts_here = is_inner(job, row, col) && !is_masked(job, pixel);
         if (counts_here) {
             const Pair x = pair_at(job, row, col, channel);
             part.l1 += fabsf(x.render - x.photo);
@@ -240,9 +247,15 @@ __global__ void __launch_bounds__(kThreads, 4) make_gradient(const LossJob job) 
         const float a = blur_back_along(job, shared.taps, &shared.maps.of[0][r][j], col);
         const float b_u = blur_back_along(job, shared.taps, &shared.maps.of[1][r][j], col);
         const float b_v = blur_back_along(job, shared.taps, &shared.maps.of[2][r][j], col);
-        const float gradient = scales.l1 * sign + scales.ssim * (a + 2.0f * (u * b_u + v * b_v));
-        job.gradient[pixel * kChannels + channel] = !job.mask || job.mask[pixel] ? gradient : 0.0f;
+        const float l1 = is_inner(job, row, col) ? scales.l1 : 0.0f;
+        const float gradient = l1 * sign + scales.ssim * (a + 2.0f * (u * b_u + v * b_v));
+        job.gradient[pixel * kChannels + channel] = is_masked(job, pixel) ? 0.0f : gradient;
     }
+}
+
+bool is_part(const SplatRectangle& part, int width, int height) {
+    return part.left >= 0 && part.left < part.right && part.right <= width && part.top >= 0 && part.top < part.bottom &&
+           part.bottom <= height;
 }
 
 int64_t lay_out_loss(void* memory, int width, int height, LossJob* job) {
@@ -267,14 +280,16 @@ int64_t splat_loss_bytes(int32_t width, int32_t height) {
 }
 
 int32_t splat_photo_loss(const float* render, const float* photo, const uint8_t* mask, int32_t width, int32_t height,
-                         double ssim_weight, float* gradient, double* value, void* memory, int64_t bytes,
-                         SplatStream stream) {
+                         const SplatRectangle* inner, double ssim_weight, float* gradient, double* value, void* memory,
+                         int64_t bytes, SplatStream stream) {
     using namespace splat::cuda;
     if (width < splat::kLossMinSide || height < splat::kLossMinSide) return SPLAT_BAD_ARGUMENT;
     LossJob job{};
     if (bytes < lay_out_loss(memory, width, height, &job)) return SPLAT_TOO_LITTLE;
     job.render = render, job.photo = photo, job.mask = mask, job.gradient = gradient;
     job.width = width, job.height = height;
+    job.inner = inner ? *inner : SplatRectangle{0, 0, width, height};
+    if (!is_part(job.inner, width, height)) return SPLAT_BAD_ARGUMENT;
     splat::set_loss_taps(job.taps);
     SPLAT_LAUNCH(make_maps, job.tiles, stream, job);
     SPLAT_LAUNCH(add_parts, 1, stream, job, ssim_weight, value);
