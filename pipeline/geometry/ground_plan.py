@@ -1,0 +1,89 @@
+"""The ground seen from above in any frame: gravity's plane with two axes of its own, and lines drawn on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+PlanPoints = Float64[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPlan:
+    """Plan coordinates and heights of points.
+
+    Attributes:
+        axes: Unit vectors of the plan's two axes in the points' frame; with ``up`` they are right-handed.
+        up: Against gravity, a unit vector.
+    """
+
+    axes: Float64[np.ndarray, "2 3"]
+    up: Float64[np.ndarray, " 3"]
+
+    @staticmethod
+    def across(up: Float64[np.ndarray, " 3"]) -> GroundPlan:
+        """The plan of a direction; its axes are as near to the frame's own as they can be.
+
+        Args:
+            up: Of any length but zero.
+        """
+        z = np.asarray(up, np.float64) / np.linalg.norm(up)
+        least = int(np.argmin(np.abs(z)))  # the frame's axis that lies flattest
+        x = np.eye(3)[least] - z[least] * z
+        x /= np.linalg.norm(x)
+        return GroundPlan(np.stack([x, np.cross(z, x)]), z)
+
+    def places(self, points: Float64[np.ndarray, "n 3"]) -> PlanPoints:
+        """Plan coordinates, in the points' units; the same bits of a point among any others, on any threads."""
+        x, y, z = points.T
+        return np.stack([a * x + b * y + c * z for a, b, c in self.axes.tolist()], axis=1)
+
+    def heights(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """How high points lie, in their units."""
+        x, y, z = points.T
+        a, b, c = self.up.tolist()
+        return np.asarray(a * x + b * y + c * z)
+
+    def points(self, places: PlanPoints, heights: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 3"]:
+        """The inverse of ``places`` and ``heights``."""
+        return np.asarray(places @ self.axes + heights[:, None] * self.up)
+
+
+@dataclass(frozen=True)
+class PlanLine:
+    """A straight line between two places of a plan, and the wall of all points above and below it.
+
+    Attributes:
+        start: Plan coordinates.
+        end: Plan coordinates; another place.
+    """
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    @property
+    def length(self) -> float:
+        """Plan units."""
+        return math.dist(self.start, self.end)
+
+    @property
+    def direction(self) -> Float64[np.ndarray, " 2"]:
+        """From start to end, a unit vector."""
+        return (np.array(self.end) - self.start) / self.length
+
+    def along(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
+        """How far along the line each place lies, 0 at the start, its length at the end."""
+        return np.asarray((places - self.start) @ self.direction)
+
+    def beside(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
+        """How far beside the line each place lies, positive on its left."""
+        x, y = self.direction
+        return np.asarray((places - self.start) @ np.array([-y, x]))
+
+    def place(self, along: float, beside: float = 0.0) -> Float64[np.ndarray, " 2"]:
+        """The inverse of ``along`` and ``beside``."""
+        x, y = self.direction
+        return np.asarray(self.start + along * np.array([x, y]) + beside * np.array([-y, x]))

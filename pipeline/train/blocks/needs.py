@@ -1,0 +1,124 @@
+"""How many blocks a memory limit asks for, and what one of them takes: plain arithmetic, light to import.
+
+A block holds, besides what every training holds, the Gaussians of its cell and margin with all that their training
+needs, and the frozen ones around it, which need their parameters and room for what a frame says of them. The number of
+photos is in none of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from splatpipe.pipeline.train.limits import (
+    FIXED_BYTES,
+    FLOAT_BYTES,
+    PIXEL_BYTES,
+    bytes_per_gaussian,
+    numbers_of,
+)
+
+MARGIN_GROWTH = 1.44  # (1 + 2 × 0.1)²: a square cell with its margin, over the cell
+FROZEN_SHARE = 1.0  # of those that a block trains: a coarse model that fits one block's memory is drawn unthinned
+FROZEN_COPIES = 2  # of a frozen Gaussian's parameters: a frame's gradients are written for all that it draws
+FRAME_BYTES = 201  # of any Gaussian in a frame (`limits.py`)
+MOST_BLOCKS = 4096  # beyond it a block is no larger than its margin
+
+
+@dataclass(frozen=True)
+class BlockNeed:
+    """What a block takes.
+
+    Attributes:
+        trained: Gaussians of its cell and margin, at most.
+        frozen: Gaussians around it, at most.
+        memory_bytes: While it trains.
+    """
+
+    trained: int
+    frozen: int
+    memory_bytes: int
+
+
+def frozen_bytes(sh_degree: int) -> int:
+    """Most that a frozen Gaussian takes."""
+    return FROZEN_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + FRAME_BYTES
+
+
+def block_need(trained: int, frozen: int, window_pixels: int, sh_degree: int) -> BlockNeed:
+    """What a block of that size takes on the CPU.
+
+    Args:
+        trained: Gaussians that it trains, at most.
+        frozen: Gaussians that it draws besides, at most.
+        window_pixels: Of the largest window.
+        sh_degree: Of the model.
+    """
+    of_gaussians = trained * bytes_per_gaussian(sh_degree) + frozen * frozen_bytes(sh_degree)
+    return BlockNeed(trained, frozen, FIXED_BYTES + PIXEL_BYTES * window_pixels + of_gaussians)
+
+
+def need_of_blocks(blocks: int, cap: int, window_pixels: int, sh_degree: int) -> BlockNeed:
+    """What each of so many equal blocks takes; one block is the whole, without margin and surroundings.
+
+    Args:
+        blocks: At least 1.
+        cap: Gaussians of the whole scene.
+        window_pixels: Of the largest window.
+        sh_degree: Of the model.
+    """
+    if blocks == 1:
+        return block_need(cap, 0, window_pixels, sh_degree)
+    trained = min(cap, int(-(-cap // blocks) * MARGIN_GROWTH))
+    return block_need(trained, int(FROZEN_SHARE * trained), window_pixels, sh_degree)
+
+
+def fewest_blocks(cap: int, room_bytes: int, window_pixels: int, sh_degree: int) -> int | None:
+    """The fewest equal blocks of a scene, each of which keeps to a limit; None where no number of them does.
+
+    Args:
+        cap: Gaussians of the whole scene.
+        room_bytes: Of the limit, what the process has not taken already.
+        window_pixels: Of the largest window.
+        sh_degree: Of the model.
+    """
+    for blocks in range(1, MOST_BLOCKS + 1):
+        if need_of_blocks(blocks, cap, window_pixels, sh_degree).memory_bytes <= room_bytes:
+            return blocks
+    return None
+
+
+def shared_cap(cap: int, weights: Sequence[float], least: int = 0) -> list[int]:
+    """A cap on Gaussians shared among blocks; the shares add up to it.
+
+    By the largest remainders (Hamilton's method), the first of equal ones before the others.
+
+    Args:
+        cap: Of all together.
+        weights: Of each block, not negative; equal shares where all are 0.
+        least: What each gets before the rest is shared by weight.
+
+    Raises:
+        ValueError: if there is no block, a weight is negative, or the cap does not hold the least of each.
+    """
+    if not weights or min(weights) < 0.0 or cap < least * len(weights):
+        raise ValueError(f"{cap} Gaussians cannot be shared among {len(weights)} blocks")
+    total = float(sum(weights))
+    parts = [weight / total if total > 0.0 else 1.0 / len(weights) for weight in weights]
+    rest = cap - least * len(weights)
+    shares = [int(rest * part) for part in parts]
+    order = sorted(range(len(parts)), key=lambda k: (shares[k] - rest * parts[k], k))
+    for k in order[: rest - sum(shares)]:
+        shares[k] += 1
+    return [least + share for share in shares]
+
+
+def with_margin(own: int, in_cell: int, in_block: int) -> int:
+    """How many Gaussians a block may train, so that those of its cell can be as many as its share.
+
+    Args:
+        own: Its share of the cap.
+        in_cell: The coarse model's Gaussians in its cell.
+        in_block: Those in cell and margin.
+    """
+    return own if in_cell == 0 else max(own, -(-own * in_block // in_cell))

@@ -1,0 +1,150 @@
+"""The ground plan cut into cells, one a block: who owns a place, and who trains it.
+
+Cells are rectangles of the plan, each with its lower and without its upper edges, so that a place has one owner and two
+neighbours share no Gaussian. What lies outside of all of them is backdrop. Heights do not count: a wall and the ground
+before it belong together, and photos of a flight see all heights of a place from alike distances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine, PlanPoints
+
+BACKDROP = -1  # the owner of what lies in no cell
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A rectangle of the plan, plan units.
+
+    Attributes:
+        low: Its lower edges, which belong to it.
+        high: Its upper edges, which do not.
+    """
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    @property
+    def area(self) -> float:
+        """Square units."""
+        return (self.high[0] - self.low[0]) * (self.high[1] - self.low[1])
+
+    def grown(self, margin: float) -> Cell:
+        """The cell with a margin around it."""
+        return Cell(
+            (self.low[0] - margin, self.low[1] - margin),
+            (self.high[0] + margin, self.high[1] + margin),
+        )
+
+    def contains(self, places: PlanPoints) -> Bool[np.ndarray, " n"]:
+        """Which places lie inside; one that is not finite does not."""
+        return np.asarray(((places >= self.low) & (places < self.high)).all(axis=1))
+
+    def distance(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
+        """How far outside each place lies; 0 inside."""
+        outside = np.maximum(np.maximum(np.array(self.low) - places, places - np.array(self.high)), 0.0)
+        return np.asarray(np.hypot(outside[:, 0], outside[:, 1]))
+
+
+@dataclass(frozen=True)
+class Border:
+    """Where two blocks meet.
+
+    Attributes:
+        blocks: Their numbers, the smaller first, or a block's and `BACKDROP`.
+        line: Between them.
+    """
+
+    blocks: tuple[int, int]
+    line: PlanLine
+
+
+@dataclass(frozen=True, eq=False)
+class Partition:
+    """The cells, numbered from 0 in an order that follows from the cuts alone.
+
+    Attributes:
+        plan: The ground's, in the model's frame.
+        cells: They touch, and do not overlap.
+        margin: Around each, what its block trains besides, plan units.
+    """
+
+    plan: GroundPlan
+    cells: tuple[Cell, ...]
+    margin: float
+
+    def owners(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+        """The cell that each point lies in, `BACKDROP` for none.
+
+        Args:
+            points: In the model's frame; one that is not finite is backdrop.
+        """
+        places = self.plan.places(points)
+        owners = np.full(len(points), BACKDROP, np.int64)
+        for number, cell in enumerate(self.cells):
+            owners[cell.contains(places)] = number
+        return owners
+
+    def trained_by(self, block: int, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Which points lie in a block's cell or its margin."""
+        return self.cells[block].grown(self.margin).contains(self.plan.places(points))
+
+    def borders(self) -> list[Border]:
+        """All lines where two blocks meet, and those where a block meets the backdrop."""
+        found = []
+        for number, cell in enumerate(self.cells):
+            for axis in (0, 1):
+                for at, others in ((cell.low[axis], "high"), (cell.high[axis], "low")):
+                    found += list(self._edge(number, axis, at, others))
+        return found
+
+    def _edge(self, number: int, axis: int, at: float, side: str) -> Iterator[Border]:
+        """One edge of a cell: a border with each neighbour whose number is greater, and with what nobody owns."""
+        cell, free = self.cells[number], [(self.cells[number].low[1 - axis], self.cells[number].high[1 - axis])]
+        for other, neighbour in enumerate(self.cells):
+            if other == number or getattr(neighbour, side)[axis] != at:
+                continue
+            low = max(cell.low[1 - axis], neighbour.low[1 - axis])
+            high = min(cell.high[1 - axis], neighbour.high[1 - axis])
+            if low >= high:
+                continue
+            if other > number:
+                yield Border((number, other), _line(axis, at, low, high))
+            free = [part for a, b in free for part in ((a, min(b, low)), (max(a, high), b)) if part[0] < part[1]]
+        for low, high in free:
+            yield Border((number, BACKDROP), _line(axis, at, low, high))
+
+    def facts(self) -> dict[str, Any]:
+        """As JSON, whose numbers read back as the same float64."""
+        return {
+            "axes": self.plan.axes.tolist(),
+            "up": self.plan.up.tolist(),
+            "cells": [[*cell.low, *cell.high] for cell in self.cells],
+            "margin": self.margin,
+        }
+
+    @staticmethod
+    def of_facts(facts: Any) -> Partition:
+        """The inverse of ``facts``.
+
+        Raises:
+            KeyError, TypeError, ValueError: if it is something else.
+        """
+        plan = GroundPlan(np.array(facts["axes"], np.float64).reshape(2, 3), np.array(facts["up"], np.float64))
+        rows = np.array(facts["cells"], np.float64).reshape(-1, 4).tolist()
+        margin = float(facts["margin"])
+        if plan.up.shape != (3,) or not rows or not math.isfinite(margin) or margin < 0.0:
+            raise ValueError("no partition")
+        return Partition(plan, tuple(Cell((a, b), (c, d)) for a, b, c, d in rows), margin)
+
+
+def _line(axis: int, at: float, low: float, high: float) -> PlanLine:
+    return PlanLine((at, low), (at, high)) if axis == 0 else PlanLine((low, at), (high, at))

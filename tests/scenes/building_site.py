@@ -1,0 +1,106 @@
+"""A made building site from above: ground with two buildings, as Gaussians, flown over by nadir and oblique photos."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
+from splatpipe.pipeline.render.rendering import render_depth
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.train.blocks.sight import Sight, sights
+from splatpipe.pipeline.train.blocks.visibility import Windows
+
+LENGTH, WIDTH = 48.0, 24.0  # of the ground, metres, its corner at the origin, up is +z
+SPACING = 0.25  # of the Gaussians
+BUILDINGS = ((6.0, 6.0, 14.0, 16.0, 6.0), (30.0, 8.0, 42.0, 14.0, 4.0))  # two corners in plan, and a height
+HEIGHT = 20.0  # of the flight
+PHOTO = (160, 120)
+FOCAL = 130.0
+OPTIONS = RenderOptions(sh_degree=0, near=0.1)
+
+
+def surface() -> Float64[np.ndarray, "n 3"]:
+    """Points on ground, roofs and walls, evenly."""
+    x, y = np.meshgrid(np.arange(SPACING / 2, LENGTH, SPACING), np.arange(SPACING / 2, WIDTH, SPACING))
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    parts = []
+    for x0, y0, x1, y1, top in BUILDINGS:
+        under = (points[:, 0] > x0) & (points[:, 0] < x1) & (points[:, 1] > y0) & (points[:, 1] < y1)
+        points[under, 2] = top
+        heights = np.arange(SPACING / 2, top, SPACING)
+        for start, end in (((x0, y0), (x1, y0)), ((x1, y0), (x1, y1)), ((x1, y1), (x0, y1)), ((x0, y1), (x0, y0))):
+            steps = np.arange(SPACING / 2, math.dist(start, end), SPACING) / math.dist(start, end)
+            along = np.array(start) + steps[:, None] * (np.array(end) - start)
+            parts.append(np.column_stack([np.repeat(along, len(heights), 0), np.tile(heights, len(along))]))
+    return np.concatenate([points, *parts])
+
+
+def model(xyz: Float64[np.ndarray, "n 3"]) -> Gaussians:
+    """Opaque round Gaussians at points, grey, with a texture of their places."""
+    found = Gaussians.empty(len(xyz), 0)
+    found.means = torch.from_numpy(xyz).float()
+    found.log_scales = torch.full((len(xyz), 3), math.log(0.6 * SPACING))
+    found.opacity_logits = torch.full((len(xyz),), 4.0)
+    texture = 0.5 + 0.1 * np.sin(xyz @ [2.1, 1.3, 1.7]) + 0.1 * np.sin(xyz @ [-0.9, 2.7, 0.8])
+    found.sh[:, 0] = rgb_to_dc(torch.from_numpy(texture).float()[:, None].expand(-1, 3))
+    return found
+
+
+def camera(name: str, centre: Float64[np.ndarray, " 3"], forward: Float64[np.ndarray, " 3"]) -> Camera:
+    """A camera whose horizontal edges are level; one that looks straight down has its top to the north."""
+    forward = forward / np.linalg.norm(forward)
+    aside = np.array([0.0, 1.0, 0.0]) if abs(forward[2]) > 0.999 else np.array([0.0, 0.0, 1.0])
+    right = np.cross(forward, aside)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return Camera(name, *PHOTO, FOCAL, FOCAL, PHOTO[0] / 2, PHOTO[1] / 2, pose)
+
+
+def flight() -> list[Camera]:
+    """Straight down in strips, and obliquely from the south and the north."""
+    found = []
+    for x in np.arange(4.0, LENGTH, 8.0):
+        places = [np.array([x, y, HEIGHT]) for y in np.arange(4.0, WIDTH, 8.0)]
+        found += [camera(f"nadir_{x:.0f}_{place[1]:.0f}", place, np.array([0.0, 0.0, -1.0])) for place in places]
+        for side, y in ((1.0, -12.0), (-1.0, WIDTH + 12.0)):
+            found.append(camera(f"oblique_{x:.0f}_{side:.0f}", np.array([x, y, HEIGHT]), np.array([0.0, side, -1.0])))
+    return found
+
+
+def observed(
+    xyz: Float64[np.ndarray, "n 3"], cameras: list[Camera], coarse: Gaussians
+) -> list[Int64[np.ndarray, " _"]]:
+    """Which points each camera sees: those at most half a metre behind the rendered depth."""
+    found = []
+    for view in cameras:
+        rows, pixels, depths = view.in_view(xyz)
+        columns, lines = pixels.astype(int).T
+        shown = render_depth(coarse, view, OPTIONS)[lines, columns]
+        found.append(rows[depths < shown + 0.5])
+    return found
+
+
+def depth_of(coarse: Gaussians, grid: Camera) -> Float32[np.ndarray, "h w"]:
+    """The coarse model's."""
+    return render_depth(coarse, grid, OPTIONS)
+
+
+def quarters(view: Camera) -> Windows:
+    """A photo cut into two rows and two columns."""
+    x, y = (0, view.width // 2, view.width), (0, view.height // 2, view.height)
+    return np.array([[x[i], y[j], x[i + 1], y[j + 1]] for j in (0, 1) for i in (0, 1)])
+
+
+def site_sights(coarse: Gaussians, points: Float64[np.ndarray, "p 3"], by_depth: bool = True) -> list[Sight]:
+    """What the flight sees, by the coarse model's depth or by points alone."""
+    cameras = flight()
+    rows = observed(points, cameras, coarse)
+    return sights(cameras, rows, (lambda grid: depth_of(coarse, grid)) if by_depth else None)
