@@ -137,8 +137,8 @@ def test_the_last_gaussian_is_never_pruned() -> None:
 def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
     statistics = DensityStatistics(3)
     gradient = torch.tensor([[3e-3, 4e-3], [1.0, 1.0], [math.nan, 0.0]])
-    statistics.observe(gradient, torch.tensor([True, False, True]), 200, 200)
-    statistics.observe(torch.zeros(3, 2), torch.tensor([True, False, True]), 200, 200)
+    statistics.observe(gradient, torch.tensor([True, False, True]), 200.0, 200.0)
+    statistics.observe(torch.zeros(3, 2), torch.tensor([True, False, True]), 200.0, 200.0)
     torch.testing.assert_close(statistics.score(), torch.tensor([0.25, 0.0, 0.0]))
     statistics.observe_radii(torch.tensor([1.0, 2.0, 0.0]))
     statistics.observe_radii(torch.tensor([2.0, 1.0, 0.0]))

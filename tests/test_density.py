@@ -15,6 +15,7 @@ from splatpipe.pipeline.splat.sh import rgb_to_dc
 from splatpipe.pipeline.train.density import Density, DensityStep
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.schedule import resolve_schedule
+from splatpipe.pipeline.train.stream import TrainingPhoto
 
 WIDTH, HEIGHT = 40, 30
 CAMERA = Camera("photo.png", WIDTH, HEIGHT, 35.0, 36.0, 20.5, 14.5, np.eye(4))
@@ -47,7 +48,7 @@ def observed(magnitudes: bool, gaussians: Gaussians, weights: Tensor) -> Tensor:
     (render.colour * weights).sum().backward()
     assert probe.grad is not None
     with torch.no_grad():
-        density.observe(render, probe.grad, SCHEDULE)
+        density.observe(render, probe.grad, SCHEDULE, TrainingPhoto(CAMERA, weights, None))
     return density.statistics.score()
 
 

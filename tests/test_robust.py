@@ -141,7 +141,8 @@ def test_masked_pixels_stay_masked_and_are_not_judged(robust: Robust) -> None:
     assert photo.mask is not None and not bool((photo.mask & ~mask).any())
     assert bool((mask & ~photo.mask).any())
     rendered = true_render(camera)
-    nothing = cell_residuals(rendered.colour, true_photo(camera), torch.zeros_like(mask))
+    nothing, judged = cell_residuals(rendered.colour, true_photo(camera), torch.zeros_like(mask), camera)
+    assert judged is None
     assert bool((nothing == UNKNOWN).all())
 
 
@@ -149,9 +150,9 @@ def test_exposure_and_detail_out_of_place_are_no_motion_but_a_block_is() -> None
     camera = cameras()[3]
     model, everywhere = true_photo(camera), torch.ones(camera.height, camera.width, dtype=torch.bool)
     for other in (model, model + 0.2, model.roll((1, 1), (0, 1)), model.roll(-1, 1)):
-        residual = cell_residuals(model, other, everywhere)[4:-4, 4:-4]  # rolled in at the rim
+        residual = cell_residuals(model, other, everywhere, camera)[0][4:-4, 4:-4]  # rolled in at the rim
         assert float((residual > LEAST_RESIDUAL).float().mean()) < 0.01
-    residual = cell_residuals(model, painted(model, CARS[2]), everywhere)
+    residual, _ = cell_residuals(model, painted(model, CARS[2]), everywhere, camera)
     assert float((residual > LEAST_RESIDUAL).float().mean()) > 0.02
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -48,7 +49,7 @@ def load_colour(view: View) -> Pixels:
     Raises:
         StageError: if it cannot be read or is not of its camera's size.
     """
-    pixels = np.ascontiguousarray(read_image(view.image_path, cv2.IMREAD_COLOR)[:, :, ::-1])
+    pixels = read_image(view.image_path, cv2.IMREAD_COLOR_RGB)
     _check_size(view, pixels, view.image_path)
     return pixels
 
@@ -95,13 +96,27 @@ def reduced_view(view: View, max_megapixels: float | None, level: int = 0) -> tu
     Raises:
         StageError: if the photo or its mask cannot be read or is not of its camera's size.
     """
+    (reduced,) = reduced_views(view, max_megapixels, [level])
+    return reduced
+
+
+def reduced_views(
+    view: View, max_megapixels: float | None, levels: Sequence[int]
+) -> Iterator[tuple[Camera, Pixels, Mask | None]]:
+    """``reduced_view`` at some levels, one after the other, from one decode.
+
+    Raises:
+        StageError: as ``reduced_view``.
+    """
     colour, mask = load_colour(view), load_mask(view)
-    camera = reduced_camera(view.camera, max_megapixels, level)
-    if camera is view.camera:
-        return camera, colour, mask
-    size = (camera.width, camera.height)
-    colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return camera, colour, None if mask is None else _reduced(mask, size)
+    for level in levels:
+        camera = reduced_camera(view.camera, max_megapixels, level)
+        if camera is view.camera:
+            yield camera, colour, mask
+            continue
+        size = (camera.width, camera.height)
+        smaller = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
+        yield camera, smaller, None if mask is None else _reduced(mask, size)
 
 
 def _load_mask(view: View, path: Path) -> Mask:

@@ -157,14 +157,16 @@ class DensityStatistics:
         self.seen = torch.zeros(count, device=device)
         self.max_radius_px = torch.zeros(count, device=device)
 
-    def observe(self, gradient_px: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"], width: int, height: int) -> None:
+    def observe(
+        self, gradient_px: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"], width: float, height: float
+    ) -> None:
         """Add an iteration's image-plane gradients, by their norm in NDC.
 
         Args:
             gradient_px: dL/d(mean2D) summed over the pixels, or its magnitudes, x and y apart.
             visible: Which Gaussians the photo saw.
-            width: Of the render, pixels.
-            height: Of the render, pixels.
+            width: Of the whole picture, pixels, times the part in its loss that the render has.
+            height: The same.
         """
         self.add(torch.hypot(gradient_px[:, 0] * (0.5 * width), gradient_px[:, 1] * (0.5 * height)), visible)
 

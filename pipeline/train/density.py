@@ -21,6 +21,7 @@ from torch import Tensor
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import DensitySchedule, DensityStatistics, Growth, grow, prune_mask
+from splatpipe.pipeline.train.stream import TrainingPhoto
 
 
 @dataclass(frozen=True)
@@ -60,16 +61,26 @@ class Density:
         self.magnitudes = magnitudes
         self.statistics = DensityStatistics(count, device)
 
-    def observe(self, rendered: Render, gradient_px: Float[Tensor, "n 2"], schedule: DensitySchedule) -> None:
+    def observe(
+        self,
+        rendered: Render,
+        gradient_px: Float[Tensor, "n 2"],
+        schedule: DensitySchedule,
+        photo: TrainingPhoto,
+    ) -> None:
         """Add an iteration after its step, which leaves the gradient on the image plane.
+
+        A window's gradients count as its part in those of the whole photo: what is ranked and its threshold mean the
+        same however a photo is divided.
 
         Args:
             rendered: What was compared with the photo.
             gradient_px: By the means on the image plane, pixels; with ``magnitudes`` the sums of those.
             schedule: Of density control.
+            photo: What was trained on.
         """
-        height, width = rendered.alpha.shape
-        self.statistics.observe(gradient_px, rendered.visible, width, height)
+        whole = photo.camera.whole()
+        self.statistics.observe(gradient_px, rendered.visible, photo.share * whole.width, photo.share * whole.height)
         if schedule.prune_screen_px > 0.0:
             self.statistics.observe_radii(rendered.radii)
 

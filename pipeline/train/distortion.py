@@ -21,6 +21,7 @@ from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.stream import EVERYWHERE
 
 FIRST_SHARE = 0.2  # of the run, without it: the surface has to be found first
 LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth
@@ -74,7 +75,8 @@ class Distortion(Technique):
         """The spread of the photo's rays, weighted."""
         if not self.is_counted(shot.now.place):
             return None
-        return self._weight * spread_loss(shot.rendered, shot.settings.depth_origin, shot.photo.camera)
+        photo = shot.photo
+        return self._weight * spread_loss(shot.rendered, shot.settings.depth_origin, photo.camera, photo.inside)
 
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:
@@ -89,13 +91,16 @@ def depth_along(point: Float64[Tensor, " 3"], camera: Camera) -> float:
     return float(pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3])
 
 
-def spread_loss(rendered: Render, origin: float, camera: Camera) -> Float[Tensor, ""]:
+def spread_loss(
+    rendered: Render, origin: float, camera: Camera, inside: tuple[slice, slice] = EVERYWHERE
+) -> Float[Tensor, ""]:
     """How far the depths along each ray are apart, 0 to 1, mean over the pixels that show a surface.
 
     Args:
         rendered: With depths, squared from ``origin``.
         origin: World units along the view axis.
         camera: The photo's.
+        inside: Rows and columns that count.
     """
     seen = rendered.alpha.detach() >= LEAST_ALPHA
     alpha = torch.where(seen, rendered.alpha, 1.0)
@@ -103,4 +108,4 @@ def spread_loss(rendered: Render, origin: float, camera: Camera) -> Float[Tensor
     variance = torch.where(seen, rendered.depth_square_sum, 0.0) / alpha - torch.where(seen, mean, 0.0).square()
     pixel = torch.where(seen, (mean.detach() + origin) / camera.fx, 1.0)  # on the ground, world units
     excess = torch.relu(variance / pixel.square() - FREE_PX**2)
-    return torch.where(seen, excess / (excess + HALF_PX**2), 0.0).mean()
+    return torch.where(seen, excess / (excess + HALF_PX**2), 0.0)[inside].mean()

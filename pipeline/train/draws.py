@@ -24,6 +24,7 @@ SPLIT_POSITION = 2
 BACKGROUND = 3
 DROPOUT = 12
 ELSEWHERE = 13
+WINDOW_ORDER = 14
 
 
 def _mix(bits: Bits) -> Bits:

@@ -23,7 +23,8 @@ class History:
     Losses are read from the device in bunches, when somebody asks what they come to: an iteration waits for none.
 
     Attributes:
-        curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and width of the photo.
+        curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and width of the
+            whole photo.
         density: Steps of density control.
         resets: Iterations after which opacities were reset.
         growth_ended: Iteration from which memory allowed no more Gaussians; 0 where it did.

@@ -63,7 +63,7 @@ def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
     # Loss.
     counted = techniques.counted(picture, shot)
     measure = photo_loss if plan.options.loss == "native" else photo_loss_reference
-    photometric = measure(picture, counted.colour, SSIM_WEIGHT, counted.mask)
+    photometric = measure(picture, counted.colour, SSIM_WEIGHT, counted.mask, counted.inner)
     loss = techniques.with_penalties(photometric, shot)
     # Backward.
     loss.backward()  # type: ignore[no-untyped-call]
@@ -71,7 +71,7 @@ def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
     with torch.no_grad():
         state.step(rendered.visible, now, plan)
         if probe is not None and probe.grad is not None:
-            state.density.observe(rendered, probe.grad, plan.schedule.density)
+            state.density.observe(rendered, probe.grad, plan.schedule.density, photo)
         techniques.after_step(shot)
     state.history.add_loss(photometric.detach())
 
@@ -109,5 +109,5 @@ def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str
     return {
         "gaussians": len(state.gaussians),
         "sh_degree": plan.schedule.sh_degree_at(state.iteration),
-        "width": photo.camera.width,
+        "width": photo.camera.whole().width,
     }

@@ -78,14 +78,18 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             return make_techniques(plan, sky, trained_on, dataset, device.tensors, area)
 
         state = resume(out / CHECKPOINT, plan, techniques, device, report)
-        if state is None:
-            begun = start.within(plan.options.max_gaussians)
-            state = TrainState.begin(begun.to(device.tensors), plan, techniques())
-        looks = plan.schedule.looks_to(ends_at(plan, state.history.flat_at))
-        first, size = state.iteration + 1, plan.megapixels
-        with PhotoStream(trained_on, looks, plan.options.seed, first, out, size).to(device.tensors) as photos:
+        first, flat_at, seconds = 1, 0, 0.0
+        if state is not None:
+            first, flat_at, seconds = state.iteration + 1, state.history.flat_at, state.seconds
+        clock, looks = Clock(seconds), plan.schedule.looks_to(ends_at(plan, flat_at))
+        stream = PhotoStream(trained_on, looks, plan.options.seed, first, out, plan.megapixels)
+        with stream.to(device.tensors) as photos:
             photos.tell(report)
-            optimise(Training(state, plan, device, out / CHECKPOINT), photos, report)
+            photos.fill(report)  # before there is a model, if it is not there already: both want memory
+            if state is None:
+                begun = start.within(plan.options.max_gaussians)
+                state = TrainState.begin(begun.to(device.tensors), plan, techniques())
+            optimise(Training(state, plan, device, out / CHECKPOINT, clock), photos, report)
         if (flat_at := state.history.flat_at) > 0:
             report.note(
                 f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.options.iterations:,}"
@@ -127,6 +131,39 @@ def budgeted(plan: Plan) -> bool:
     return bool(plan.options.time_budget_s or plan.options.max_memory_bytes)
 
 
+class Clock:
+    """Seconds of a training over all its runs, and when a checkpoint is due.
+
+    Args:
+        before: Seconds of the runs before.
+    """
+
+    def __init__(self, before: float = 0.0) -> None:
+        self._began = time.monotonic() - before
+        self._last = time.monotonic()
+        self._cost = 0.0
+
+    def seconds(self) -> float:
+        """Spent so far."""
+        return time.monotonic() - self._began
+
+    def is_up(self, plan: Plan) -> bool:
+        """Whether a time budget is spent."""
+        return 0.0 < plan.train_seconds <= self.seconds()
+
+    def checkpoint_due(self) -> bool:
+        """Whether the last checkpoint is old enough."""
+        return time.monotonic() - self._last >= max(CHECKPOINT_SECONDS, self._cost / CHECKPOINT_SHARE)
+
+    @contextmanager
+    def checkpointing(self) -> Iterator[None]:
+        """Take what a checkpoint costs."""
+        started = time.monotonic()
+        yield
+        self._last = time.monotonic()
+        self._cost = self._last - started
+
+
 @dataclass(frozen=True)
 class Training:
     """One that runs.
@@ -136,12 +173,14 @@ class Training:
         plan: What it does.
         device: What it is computed on.
         path: Of its checkpoint.
+        clock: Its time.
     """
 
     state: TrainState
     plan: Plan
     device: Device
     path: Path
+    clock: Clock
 
     def save(self) -> None:
         """Leave a checkpoint."""
@@ -194,8 +233,7 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
         KeyboardInterrupt: when asked to end, after a checkpoint.
         MachineError: if a device's memory is too small for it.
     """
-    state, plan = training.state, training.plan
-    clock = _Clock(state.seconds)
+    state, plan, clock = training.state, training.plan, training.clock
     with deferred_interrupts() as interrupt:
         for photo in photos:
             iterate_within_memory(iterate, state, plan, photo, report)
@@ -248,28 +286,3 @@ def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
     if (loss := state.history.recent_loss()) is not None:
         report.metric("loss", loss, state.iteration)
     report.metric("gaussians", len(state.gaussians), state.iteration)
-
-
-class _Clock:
-    """Seconds of a training over all its runs, and when a checkpoint is due."""
-
-    def __init__(self, before: float) -> None:
-        self._began = time.monotonic() - before
-        self._last = time.monotonic()
-        self._cost = 0.0
-
-    def seconds(self) -> float:
-        return time.monotonic() - self._began
-
-    def is_up(self, plan: Plan) -> bool:
-        return 0.0 < plan.train_seconds <= self.seconds()
-
-    def checkpoint_due(self) -> bool:
-        return time.monotonic() - self._last >= max(CHECKPOINT_SECONDS, self._cost / CHECKPOINT_SHARE)
-
-    @contextmanager
-    def checkpointing(self) -> Iterator[None]:
-        started = time.monotonic()
-        yield
-        self._last = time.monotonic()
-        self._cost = self._last - started

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
+from splatpipe.pipeline.train.looks import Frame
 
 SHARE_OF_FREE = 0.5  # of the disk's free space at most: checkpoints and the model need room too
 
@@ -25,6 +27,7 @@ class _Slot:
     offset: int
     camera: Camera
     has_mask: bool
+    counted: int
 
 
 def stored_bytes(camera: Camera, has_mask: bool) -> int:
@@ -73,37 +76,60 @@ class PhotoCache:
         Raises:
             MachineError: if the disk is full nevertheless, or fails.
         """
-        slot = _Slot(self._end, camera, mask is not None)
-        end = slot.offset + stored_bytes(camera, slot.has_mask)
-        if end > self.room_bytes:
+        counted = camera.width * camera.height if mask is None else int(np.count_nonzero(mask))
+        slot = _Slot(self._end, camera, mask is not None, counted)
+        if not self.has_room(camera, slot.has_mask):
             return
         with self._explained():
             self._write(colour, slot.offset)
             if mask is not None:
                 self._write(mask, slot.offset + colour.nbytes)
         self._slots[key] = slot
-        self._end = end
+        self._end = slot.offset + stored_bytes(camera, slot.has_mask)
 
-    def get(self, key: tuple[int, int]) -> tuple[Camera, Pixels, Mask | None] | None:
-        """A stored photo, or None where there is none of that key.
+    def has_room(self, camera: Camera, has_mask: bool) -> bool:
+        """Whether a photo would still be stored."""
+        return self._end + stored_bytes(camera, has_mask) <= self.room_bytes
 
-        The arrays are the file itself, not to be written to; with the last of them goes the mapping.
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        """Whether a photo is stored."""
+        return key in self._slots
+
+    def counted(self, key: tuple[int, int]) -> int:
+        """How many pixels of a stored photo count."""
+        return self._slots[key].counted
+
+    def get(self, key: tuple[int, int], frame: Frame) -> tuple[Pixels, Mask | None]:
+        """A window of a stored photo.
+
+        The arrays are the file itself, of which its rows alone are mapped, not to be written to; with the last of them
+        goes the mapping.
+
+        Args:
+            key: Of a photo that is stored.
+            frame: The window, in the photo's pixels.
 
         Raises:
             MachineError: if the file cannot be mapped.
         """
-        slot = self._slots.get(key)
-        if slot is None:
-            return None
+        slot = self._slots[key]
         height, width = slot.camera.height, slot.camera.width
-        pixels = width * height
-        length = pixels * (4 if slot.has_mask else 3)
-        with self._explained():
-            window = mmap.mmap(self._file.fileno(), length, mmap.MAP_SHARED, mmap.PROT_READ, offset=slot.offset)
-        colour = np.frombuffer(window, np.uint8, 3 * pixels).reshape(height, width, 3)
+        columns = slice(frame.left, frame.right)
+        colour = self._rows(slot.offset, frame, 3 * width).reshape(frame.height, width, 3)[:, columns]
         if not slot.has_mask:
-            return slot.camera, colour, None
-        return slot.camera, colour, np.frombuffer(window, np.bool_, pixels, 3 * pixels).reshape(height, width)
+            return colour, None
+        return colour, self._rows(slot.offset + 3 * width * height, frame, width).view(np.bool_)[:, columns]
+
+    def _rows(self, offset: int, frame: Frame, row_bytes: int) -> npt.NDArray[np.uint8]:
+        """A frame's rows of the plane that begins at a place in the file."""
+        begin = offset + frame.top * row_bytes
+        before = begin % mmap.ALLOCATIONGRANULARITY
+        length = frame.height * row_bytes
+        with self._explained():
+            mapped = mmap.mmap(
+                self._file.fileno(), before + length, mmap.MAP_SHARED, mmap.PROT_READ, offset=begin - before
+            )
+        return np.frombuffer(mapped, np.uint8, length, before).reshape(frame.height, row_bytes)
 
     def _write(self, data: Pixels | Mask, offset: int) -> None:
         rest = data.data.cast("B")

@@ -28,6 +28,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.photo_cells import PhotoCells
 from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.witnesses import Witnesses
@@ -131,42 +132,48 @@ class Robust(Technique):
             self._before = row, self.scores[row].clone(), self.left_out[row].clone()
             opaque = rendered.alpha >= LEAST_ALPHA
             counts = opaque if photo.mask is None else photo.mask & opaque
-            before, now = self.scores[row], cell_residuals(shown, photo.colour, counts)
-            mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
-            faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: nothing held against it
-            self.scores[row] = torch.where(now < 0.0, faded, mixed)
-            cells = self._left_out_cells(row, rendered)
-            size = shown.shape[:2]
-            out = functional.interpolate(cells[None, None].float(), size=size, mode="nearest")[0, 0] > 0.0
+            self._remember(row, *cell_residuals(shown, photo.colour, counts, photo.camera))
+            cells = PhotoCells(photo.camera, GRID, GRID)
+            out = cells.spread(self._left_out_cells(row, rendered, cells))
             self.left_out[row] = out.float().mean()
         if out.device.type == "cpu" and not bool(out.any()):  # on a device, to ask is to wait
             return photo
         return replace(photo, mask=~out if photo.mask is None else photo.mask & ~out)
 
-    def _left_out_cells(self, row: int, rendered: Render) -> Bool[Tensor, "g g"]:
+    def _remember(self, row: int, now: Float[Tensor, "g g"], judged: Bool[Tensor, "g g"] | None) -> None:
+        """Mix a visit's residuals with what is known; what its window does not show stays as it is."""
+        before = self.scores[row]
+        mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
+        faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: nothing held against it
+        after = torch.where(now < 0.0, faded, mixed)
+        self.scores[row] = after if judged is None else torch.where(judged, after, before)
+
+    def _left_out_cells(self, row: int, rendered: Render, cells: PhotoCells) -> Bool[Tensor, "g g"]:
         scores, threshold = self.scores[row], self.threshold
         most = torch.quantile(scores, 1.0 - MOST_OF_A_PHOTO)
         high, low = torch.maximum(threshold, most), torch.maximum(RIM * threshold, most)
         core = _voted(scores > high)
-        core &= self._contradicted(row, core, rendered)
+        core &= self._contradicted(row, core, rendered, cells)
         return (_near(core) & (scores > low)) | core
 
-    def _contradicted(self, row: int, cells: Bool[Tensor, "g g"], rendered: Render) -> Bool[Tensor, "g g"]:
+    def _contradicted(
+        self, row: int, core: Bool[Tensor, "g g"], rendered: Render, cells: PhotoCells
+    ) -> Bool[Tensor, "g g"]:
         """Of some cells, those where more of the other photos that see the place agree with the model than not."""
         if self.witnesses is None:
-            return torch.zeros_like(cells)
-        alpha, depth_sum = _pooled(torch.stack((rendered.alpha, rendered.depth_sum)), (GRID, GRID)).double()
-        asked = (cells & (alpha >= SURFACE_ALPHA)).flatten()
+            return torch.zeros_like(core)
+        alpha, depth_sum = cells.means(torch.stack((rendered.alpha, rendered.depth_sum))).double()
+        asked = (core & (alpha >= SURFACE_ALPHA)).flatten()
         numbers = _worth_asking(asked)
         middles = (torch.stack((numbers % GRID, numbers // GRID), dim=1) + 0.5) / GRID
         depths = (depth_sum / alpha).flatten()[numbers]
         places = self.witnesses.places(row, middles.double(), depths)
         found = self.witnesses.agree(row, places, self.scores, self.threshold)
         if len(found) == len(asked):
-            return torch.logical_and(asked, found).view_as(cells)
+            return torch.logical_and(asked, found).view_as(core)
         result = torch.zeros_like(asked)
         result[numbers] = found
-        return result.view_as(cells)
+        return result.view_as(core)
 
     def end_epoch(self, share: float) -> None:
         """Take the threshold from all photos' cells.
@@ -202,30 +209,37 @@ class Robust(Technique):
 
 
 def cell_residuals(
-    shown: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"]
-) -> Float[Tensor, "g g"]:
+    shown: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"], camera: Camera
+) -> tuple[Float[Tensor, "g g"], Bool[Tensor, "g g"] | None]:
     """How far each cell's mean colour is from the nearest of the model's there and nearby, averaged over the channels.
 
     Args:
         shown: The model's picture.
         colour: The photo's.
         counts: The pixels to compare.
+        camera: The photo's, or its window's.
 
     Returns:
-        ``UNKNOWN`` where less than half of a cell counts.
+        ``UNKNOWN`` where less than half of a cell counts; and the cells that the window judges, None for all.
     """
-    height, width = counts.shape
-    size = (min(GRID, max(1, height // LEAST_CELL_PX)), min(GRID, max(1, width // LEAST_CELL_PX)))
-    weight = _pooled(counts[None].float(), size)
-    known = weight[0] >= 0.5
+    whole = camera.whole()
+    size = (min(GRID, max(1, whole.height // LEAST_CELL_PX)), min(GRID, max(1, whole.width // LEAST_CELL_PX)))
+    cells = PhotoCells(camera, *size)
+    weight, judged = cells.means(counts[None].float()), cells.judged(shown)
+    known = weight[0] >= 0.5  # of what is shown: the rim of a cell beside says something, too
+    chosen = known if judged is None else known & judged
     model, picture = (
-        _pooled(picture.permute(2, 0, 1) * counts, size) / weight.clamp(min=1e-6) for picture in (shown, colour)
+        cells.means(picture.permute(2, 0, 1) * counts) / weight.clamp(min=1e-6) for picture in (shown, colour)
     )
-    model = model - _medians(model - picture, known)[:, None, None]
+    model = model - _medians(model - picture, chosen)[:, None, None]
     usable = _nearby(known[None].float())[0] > 0.0
     apart = torch.where(usable, (_nearby(model) - picture[:, None]).abs().mean(dim=0), torch.inf)
-    residual = torch.where(known, apart.amin(dim=0), UNKNOWN)
-    return functional.interpolate(residual[None, None], size=(GRID, GRID), mode="nearest")[0, 0]
+    residual = torch.where(chosen, apart.amin(dim=0), UNKNOWN)
+    return _over_grid(residual), None if judged is None else _over_grid(judged.float()) > 0.0
+
+
+def _over_grid(cells: Float[Tensor, "gh gw"]) -> Float[Tensor, "g g"]:
+    return functional.interpolate(cells[None, None], size=(GRID, GRID), mode="nearest")[0, 0]
 
 
 def _medians(planes: Float[Tensor, "c gh gw"], known: Bool[Tensor, "gh gw"]) -> Float[Tensor, " c"]:
@@ -246,10 +260,6 @@ def _nearby(planes: Float[Tensor, "c gh gw"]) -> Float[Tensor, "c k gh gw"]:
     """What lies up to ``NEARBY`` cells from each; zeros beyond the rim."""
     side = 2 * NEARBY + 1
     return functional.unfold(planes[None], side, padding=NEARBY).view(len(planes), side * side, *planes.shape[1:])
-
-
-def _pooled(planes: Float[Tensor, "c h w"], size: tuple[int, int]) -> Float[Tensor, "c gh gw"]:
-    return functional.adaptive_avg_pool2d(planes[None], size)[0]
 
 
 def _voted(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:

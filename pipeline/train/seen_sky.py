@@ -64,7 +64,7 @@ class PhotoSkies:
 
 
 def seen_by_cpu(found: SkyMask, camera: Camera) -> SeenSky:
-    """A photo's sky at the size of ``camera``."""
+    """A photo's sky at the size of ``camera``, or in its window."""
     share = found.unpacked().astype(np.float32)
     wider = np.asarray(cv2.dilate(share, np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)))
     return SeenSky(_surely(share, camera), _surely(wider, camera))
@@ -82,24 +82,45 @@ def seen_by_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camera: Ca
     flat = torch.bitwise_and(torch.bitwise_right_shift(bits[:, None], places), 1).flatten()
     share = flat[: shape[0] * shape[1]].reshape(1, *shape).float()
     wider = functional.max_pool2d(share, 2 * RIM_PX + 1, stride=1, padding=RIM_PX)
-    down, right = (_resizing(*sides, share) for sides in zip(shape, (camera.height, camera.width), strict=True))
+    down, right = (_resizing(old, *side, share) for old, side in zip(shape, _sides(camera), strict=True))
     mask, around = down @ torch.cat((share, wider)) @ right.T > SURE
     return SeenSky(mask, around)
 
 
+def _sides(camera: Camera) -> tuple[tuple[int, slice], tuple[int, slice]]:
+    """The whole picture's height, and the rows that the camera has of it; its width, and the columns."""
+    whole, part = camera.whole(), camera.window
+    top, left = (0, 0) if part is None else (part.top, part.left)
+    return (whole.height, slice(top, top + camera.height)), (whole.width, slice(left, left + camera.width))
+
+
 def _surely(share: Float32[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
-    if share.shape != (camera.height, camera.width):
-        shrinks = camera.height < share.shape[0]
-        way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        share = np.asarray(cv2.resize(share, (camera.width, camera.height), interpolation=way), np.float32)
-    return torch.from_numpy(share > SURE)
+    (height, rows), (width, columns) = _sides(camera)
+    if share.shape == (height, width):
+        return torch.from_numpy(share[rows, columns] > SURE)
+    if height < share.shape[0]:
+        share = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+        return torch.from_numpy(share[rows, columns] > SURE)
+    if camera.window is None:
+        share = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        return torch.from_numpy(share > SURE)
+    return torch.from_numpy(_enlarged(_enlarged(share, height, rows).T, width, columns).T > SURE)
 
 
-def _resizing(old: int, new: int, like: Tensor) -> Float[Tensor, "new old"]:
-    """Weights of the old pixels for each new one along a side: their overlap where it shrinks, else bilinear."""
+def _enlarged(share: Float32[np.ndarray, "old _"], size: int, rows: slice) -> Float32[np.ndarray, "new _"]:
+    """Some rows of what OpenCV's bilinear filter makes of a picture; all of them would be those of a whole photo."""
+    old = share.shape[0]
+    place = np.clip((np.arange(rows.start, rows.stop) + 0.5) * (old / size) - 0.5, 0.0, old - 1.0)
+    before = np.minimum(place.astype(np.int64), max(0, old - 2))
+    weight = (place - before).astype(np.float32)[:, None]
+    return np.asarray((1.0 - weight) * share[before] + weight * share[np.minimum(before + 1, old - 1)])
+
+
+def _resizing(old: int, new: int, rows: slice, like: Tensor) -> Float[Tensor, "rows old"]:
+    """Weights of the old pixels for some new ones along a side: their overlap where it shrinks, else bilinear."""
     step = old / new
     before = torch.arange(old, dtype=like.dtype, device=like.device)
-    after = torch.arange(new, dtype=like.dtype, device=like.device)[:, None] * step
+    after = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)[:, None] * step
     if step > 1.0:
         overlap = torch.minimum(after + step, before + 1.0) - torch.maximum(after, before)
         return overlap.clamp(min=0.0) / step

@@ -32,6 +32,7 @@ from splatpipe.pipeline.train.draws import ELSEWHERE
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.seen_sky import PhotoSkies, SeenSky
 from splatpipe.pipeline.train.side import SideModel
+from splatpipe.pipeline.train.stream import EVERYWHERE
 
 LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
 MOST_ERROR_PX = 2.0
@@ -123,7 +124,7 @@ class SkyModel(SideModel, Technique):
 
     def penalty(self, shot: Shot) -> Float[Tensor, ""]:
         """Opacity before the sky, and the sky's roughness."""
-        return self.loss(shot.rendered.alpha, self._seen)
+        return self.loss(shot.rendered.alpha, self._seen, shot.photo.inside)
 
     def after_step(self, shot: Shot) -> None:
         """Step the colours."""
@@ -163,10 +164,20 @@ class SkyModel(SideModel, Technique):
         behind = torch.where(seen.around[:, :, None], behind, between_nodes(flat, camera))
         return laid_over(rendered.colour, rendered.alpha, background, behind)
 
-    def loss(self, alpha: Float[Tensor, "h w"], seen: SeenSky | None) -> Float[Tensor, ""]:
-        """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness."""
+    def loss(
+        self, alpha: Float[Tensor, "h w"], seen: SeenSky | None, inside: tuple[slice, slice] = EVERYWHERE
+    ) -> Float[Tensor, ""]:
+        """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness.
+
+        Args:
+            alpha: The render's.
+            seen: The photo's sky, from ``seen``.
+            inside: Rows and columns that count.
+        """
         loss = SMOOTHNESS * roughness(self.panorama.colours)
-        return loss if seen is None else loss + OPACITY_WEIGHT * torch.where(seen.mask, alpha, 0.0).mean()
+        if seen is None:
+            return loss
+        return loss + OPACITY_WEIGHT * torch.where(seen.mask, alpha, 0.0)[inside].mean()
 
     def seen(self, camera: Camera) -> SeenSky | None:
         """The sky of a training photo at the size of ``camera``; None where it shows none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,40 +16,67 @@ from torch import Tensor
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
-from splatpipe.pipeline.train.draws import permutation
-from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_view, reduced_views
+from splatpipe.pipeline.train.looks import Frame, Look
 from splatpipe.pipeline.train.photo_cache import PhotoCache, stored_bytes
 from splatpipe.pipeline.train.upload import Upload, Uploader
+from splatpipe.pipeline.train.visits import Visit, Visits
 
+EVERYWHERE = (slice(None), slice(None))  # rows and columns
 READ_AHEAD = 3  # photos in flight: hides a slow decode behind an iteration
 
 
 @dataclass(frozen=True)
 class TrainingPhoto:
-    """A photo as the loss wants it.
+    """A photo, or a window of one, as the loss wants it.
 
     Attributes:
-        camera: Its camera, at the size of ``colour``.
+        camera: Its camera, at the size of ``colour``; a window's knows the whole photo.
         colour: In [0, 1].
         mask: True where the photo counts; None where all of it does.
         is_empty: Nothing of it counts; known without asking the device.
+        inner: Left, top, right and bottom of what counts, in the pixels of ``colour``: around it is what SSIM looks at
+            beside; None where all is inside.
+        share: Of the pixels of the whole photo that count, how many are inside: a window's part in the photo's loss.
     """
 
     camera: Camera
     colour: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None
     is_empty: bool = False
+    inner: tuple[int, int, int, int] | None = None
+    share: float = 1.0
+
+    @property
+    def inside(self) -> tuple[slice, slice]:
+        """Rows and columns of what counts."""
+        if self.inner is None:
+            return EVERYWHERE
+        left, top, right, bottom = self.inner
+        return slice(top, bottom), slice(left, right)
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """A photo on its way, and what it will be."""
+
+    camera: Camera
+    upload: Upload
+    is_empty: bool
+    inner: tuple[int, int, int, int] | None
+    share: float
 
 
 class PhotoStream:
     """Iterates over the photos of training, from one iteration to the last.
 
-    The photo of an iteration depends on the views, the seed and the iteration alone. A thread of its own decodes each
-    photo once a size, when it is first wanted, into a file without a name that is gone with the stream or its process;
-    memory holds the photos in flight and no more. A photo that is wanted only once is not stored. Where the disk has no
-    room for all, those that fit are stored and the others decoded each time: slower, with the same result, and
-    ``tell`` says so.
+    The photo of an iteration, and its window where it does not fit in one, depend on the views, the looks, the seed and
+    the iteration alone. Windows go by rounds: each once, in an order of the round's own.
+
+    Photos are decoded once, for all the levels that are wanted of them, into a file without a name that is gone with
+    the stream or its process; memory holds the windows in flight and no more. A photo that is wanted only once is not
+    stored. Where the disk has no room for all, those that fit are stored and the others decoded each time: slower, with
+    the same result, and ``tell`` says so. What ``fill`` has not stored is decoded when it is first wanted.
 
     Args:
         views: The photos to train on.
@@ -74,15 +101,12 @@ class PhotoStream:
         max_megapixels: float | None = None,
     ) -> None:
         self._views = views
-        self._looks = looks
-        self._seed = seed
         self._next = first
         self._max_megapixels = max_megapixels
         self._uploader = Uploader(torch.device("cpu"))
-        self._pending: deque[Future[tuple[Camera, Upload, bool]]] = deque()
-        self._epoch = (-1, np.zeros(0, np.int64))
-        wanted = Counter(self._key(iteration) for iteration in range(first, len(looks) + 1))
-        self._wanted_again = {key for key, times in wanted.items() if times > 1}
+        self._pending: deque[Future[_Sent]] = deque()
+        self._visits = Visits([view.camera for view in views], looks, seed, max_megapixels)
+        self._unread = self._visits.levels_wanted(first)
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
 
@@ -102,29 +126,33 @@ class PhotoStream:
         return self
 
     def __next__(self) -> TrainingPhoto:
-        while len(self._pending) < READ_AHEAD and self._next <= len(self._looks):
+        while len(self._pending) < READ_AHEAD and self._next <= len(self._visits):
             self._pending.append(self._reader.submit(self._photo, self._next))
             self._next += 1
         if not self._pending:
             raise StopIteration
-        camera, upload, is_empty = self._pending.popleft().result()
-        return TrainingPhoto(camera, *self._uploader.end(upload), is_empty)
+        sent = self._pending.popleft().result()
+        return TrainingPhoto(sent.camera, *self._uploader.end(sent.upload), sent.is_empty, sent.inner, sent.share)
 
-    def view_index(self, iteration: int) -> int:
-        """Which view an iteration (from 1) is trained on."""
-        epoch, place = divmod(iteration - 1, len(self._views))
-        if self._epoch[0] != epoch:
-            self._epoch = (epoch, permutation(self._seed, epoch, len(self._views)))
-        return int(self._epoch[1][place])
+    def fill(self, report: Reporter) -> None:
+        """Decode all photos before the first iteration: one at full size beside the model would take more memory.
+
+        Raises:
+            MachineError: if the disk is full.
+            StageError: if a photo is missing or broken.
+        """
+        views = list(self._unread)
+        for done, view in enumerate(views, 1):
+            self._store(view)
+            report.progress(done, len(views), "decoding photos", "photos")
 
     def wanted_bytes(self) -> int:
-        """What all photos that are wanted more than once take on the disk."""
-        wanted = 0
-        for index, level in self._wanted_again:
-            view = self._views[index]
-            camera = reduced_camera(view.camera, self._max_megapixels, level)
-            wanted += stored_bytes(camera, view.mask_path is not None)
-        return wanted
+        """What all photos that are wanted more than once, and are not stored yet, take on the disk."""
+        return sum(
+            stored_bytes(self._visits.camera(view, level), self._views[view].mask_path is not None)
+            for view, levels in self._unread.items()
+            for level in levels
+        )
 
     def tell(self, report: Reporter) -> None:
         """Warn where the disk has no room for all decoded photos."""
@@ -136,18 +164,40 @@ class PhotoStream:
                 hint="Make room on the disk of OUT, or lower undistort.max_megapixels.",
             )
 
-    def _key(self, iteration: int) -> tuple[int, int]:
-        return self.view_index(iteration), self._looks[iteration - 1].level
+    def _store(self, index: int) -> None:
+        """Store a photo at all the levels that are wanted and have room."""
+        view, levels = self._views[index], self._unread.pop(index, [])
+        has_mask = view.mask_path is not None
+        fitting = [level for level in levels if self._cache.has_room(self._visits.camera(index, level), has_mask)]
+        if not fitting:
+            return
+        for level, decoded in zip(fitting, reduced_views(view, self._max_megapixels, fitting), strict=True):
+            self._cache.put((index, level), *decoded)
 
-    def _photo(self, iteration: int) -> tuple[Camera, Upload, bool]:
-        camera, pixels, mask = self._decoded(self._key(iteration))
-        return camera, self._uploader.begin(pixels, mask), mask is not None and not mask.any()
+    def _photo(self, iteration: int) -> _Sent:
+        visit = self._visits.at(iteration)
+        window, whole = visit.window, visit.camera
+        cut = window.grown(whole.width, whole.height)
+        pixels, mask, of_whole = self._decoded(visit, cut)
+        left, top, right, bottom = inner = window.within(cut)
+        here = window.pixels if mask is None else int(np.count_nonzero(mask[top:bottom, left:right]))
+        return _Sent(
+            whole.cut(cut.left, cut.top, cut.width, cut.height),
+            self._uploader.begin(pixels, mask),
+            here == 0,
+            None if cut == window else inner,
+            here / max(1, of_whole),
+        )
 
-    def _decoded(self, key: tuple[int, int]) -> tuple[Camera, Pixels, Mask | None]:
-        stored = self._cache.get(key)
-        if stored is not None:
-            return stored
-        decoded = reduced_view(self._views[key[0]], self._max_megapixels, key[1])
-        if key in self._wanted_again:
-            self._cache.put(key, *decoded)
-        return decoded
+    def _decoded(self, visit: Visit, cut: Frame) -> tuple[Pixels, Mask | None, int]:
+        """A part of a photo, and how many of the whole photo's pixels count."""
+        if visit.view in self._unread:
+            self._store(visit.view)
+        key = (visit.view, visit.level)
+        if key in self._cache:
+            return *self._cache.get(key, cut), self._cache.counted(key)
+        _, pixels, mask = reduced_view(self._views[visit.view], self._max_megapixels, visit.level)
+        part = (slice(cut.top, cut.bottom), slice(cut.left, cut.right))
+        if mask is None:
+            return pixels[part], None, pixels.shape[0] * pixels.shape[1]
+        return pixels[part], mask[part], int(np.count_nonzero(mask))

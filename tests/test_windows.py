@@ -1,0 +1,144 @@
+"""Windows of photos: parts of the whole photo, each as often as the others, and what they say adds up to it."""
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.splat.metrics import SSIM_WINDOW
+from splatpipe.pipeline.splat.panorama import STEP_PX
+from splatpipe.pipeline.train import looks
+from splatpipe.pipeline.train.looks import Frame, Look, windows_of
+from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
+from splatpipe.pipeline.train.visits import Visits
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+MASKED = "flight 1/photo_5.png"
+PIXELS = 800  # of a window: six in a tiny photo
+SIZES = [(5472, 3648, 500_000), (5472, 3648, 1_000_000), (2300, 1740, 500_000), (3000, 4000, 700_000), (72, 54, 800)]
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> list[View]:
+    return load_views(tiny_scene.write_dataset(tmp_path / "dataset", masked=MASKED))
+
+
+def streamed(
+    views: list[View], cache: Path, looks: list[Look], first: int = 1, fill: bool = False
+) -> list[TrainingPhoto]:
+    with PhotoStream(views, looks, 0, first, cache) as photos:
+        if fill:
+            photos.fill(tiny_scene.Recorder())
+        return list(photos)
+
+
+def same(one: torch.Tensor | None, other: torch.Tensor | None) -> bool:
+    return one is other is None or (one is not None and other is not None and torch.equal(one, other))
+
+
+@pytest.mark.parametrize(("width", "height", "pixels"), SIZES)
+def test_windows_are_nearly_equal_cells_that_cover_the_picture_once(width: int, height: int, pixels: int) -> None:
+    found = windows_of(width, height, pixels)
+    covered = np.zeros((height, width), np.uint8)
+    for window in found:
+        covered[window.top : window.bottom, window.left : window.right] += 1
+    assert (covered == 1).all()
+    sizes = [window.pixels for window in found]
+    assert max(sizes) <= pixels and len(found) <= np.ceil(1.35 * width * height / pixels)
+    slack = 2 * looks.NODES_PX  # borders are moved to nodes
+    for sides in ([window.width for window in found], [window.height for window in found]):
+        assert max(sides) - min(sides) <= slack
+    window = found[0]
+    assert max(window.width / window.height, window.height / window.width) < looks.MOST_OBLONG + 0.2
+
+
+def test_a_window_begins_on_a_node_of_the_sky_once_it_is_grown_by_what_ssim_sees() -> None:
+    assert SSIM_WINDOW // 2 == looks.REACH_PX and looks.NODES_PX == STEP_PX
+    for window in windows_of(1000, 700, 90_000):
+        cut = window.grown(1000, 700)
+        assert cut.left % STEP_PX == 0 == cut.top % STEP_PX
+        assert (window.left - cut.left, cut.right - window.right) == (5 * (window.left > 0), 5 * (window.right < 1000))
+        assert (window.top - cut.top, cut.bottom - window.bottom) == (5 * (window.top > 0), 5 * (window.bottom < 700))
+
+
+def test_what_fits_is_whole_and_what_can_not_be_divided_so_far_is_divided_as_far_as_it_goes() -> None:
+    assert windows_of(100, 50, 5000) == windows_of(100, 50, 0) == [Frame(0, 0, 100, 50)]
+    assert all(min(window.width, window.height) >= looks.NODES_PX for window in windows_of(100, 50, 10))
+
+
+def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own() -> None:
+    cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
+    rounds, windows = 6, len(windows_of(720, 540, 70_000))
+    visits = Visits(cameras, [Look(1)] * 9 + [Look(0, 70_000)] * (9 * windows * rounds), 0)
+    seen: dict[int, list[Frame]] = {view: [] for view in range(9)}
+    for iteration in range(10, len(visits) + 1):
+        visit = visits.at(iteration)
+        seen[visit.view].append(visit.window)
+    orders = set()
+    for frames in seen.values():
+        for begin in range(0, len(frames), windows):
+            assert sorted(map(str, frames[begin : begin + windows])) == sorted(map(str, windows_of(720, 540, 70_000)))
+            orders.add(tuple(map(str, frames[begin : begin + windows])))
+    assert len(orders) > 0.9 * 9 * rounds
+    other = Visits(cameras, [Look(0, 70_000)] * 90, 1)
+    assert [visits.at(number + 9).window for number in range(1, 91)] != [other.at(n).window for n in range(1, 91)]
+
+
+@pytest.mark.parametrize("fill", [False, True])
+def test_windows_of_the_stream_are_parts_of_the_whole_photo_to_the_bit(
+    views: list[View], tmp_path: Path, fill: bool
+) -> None:
+    photos = {photo.camera.name: photo for photo in streamed(views, tmp_path, [Look()] * len(views))}
+    counts: Counter[tuple[object, ...]] = Counter()
+    shares: Counter[str] = Counter()
+    for photo in streamed(views, tmp_path, [Look(0, PIXELS)] * 6 * len(views), fill=fill):
+        whole, part = photos[photo.camera.name], photo.camera.window
+        assert part is not None and photo.inner is not None
+        rows = slice(part.top, part.top + photo.camera.height)
+        columns = slice(part.left, part.left + photo.camera.width)
+        assert torch.equal(photo.colour, whole.colour[rows, columns])
+        assert same(photo.mask, None if whole.mask is None else whole.mask[rows, columns])
+        left, top, right, bottom = photo.inner
+        assert photo.is_empty == (photo.mask is not None and not photo.mask[top:bottom, left:right].any())
+        counts[(photo.camera.name, part.left + left, part.top + top, part.left + right, part.top + bottom)] += 1
+        shares[photo.camera.name] += photo.share  # type: ignore[assignment]
+    expected = [window.within(Frame(0, 0, 0, 0)) for window in windows_of(72, 54, PIXELS)]
+    assert counts == Counter((view.camera.name, *frame) for view in views for frame in expected)
+    assert all(share == pytest.approx(1.0) for share in shares.values()) and len(shares) == len(views)
+
+
+def test_window_of_an_iteration_does_not_depend_on_where_the_stream_began(views: list[View], tmp_path: Path) -> None:
+    asked = [Look(1, 300)] * 20 + [Look(0, PIXELS)] * 20
+    whole = streamed(views, tmp_path, asked)
+    for first, fill in ((2, True), (17, False), (33, True)):
+        later = streamed(views, tmp_path, asked, first, fill)
+        for one, other in zip(later, whole[first - 1 :], strict=True):
+            assert one.camera.name == other.camera.name and one.camera.window == other.camera.window
+            assert torch.equal(one.colour, other.colour) and one.inner == other.inner and one.share == other.share
+
+
+def test_one_decode_fills_all_levels_and_is_told(views: list[View], tmp_path: Path) -> None:
+    asked = [Look(2)] * 9 + [Look(1, 400)] * 18 + [Look(0, PIXELS)] * 18
+    usual = streamed(views, tmp_path, asked)
+    recorder = tiny_scene.Recorder()
+    with PhotoStream(views, asked, 0, 1, tmp_path) as photos:
+        photos.fill(recorder)
+        assert recorder.steps == [(done, 9) for done in range(1, 10)]
+        for view in views:
+            view.image_path.unlink()
+        for one, other in zip(photos, usual, strict=True):
+            assert torch.equal(one.colour, other.colour)
+
+
+def test_windows_are_refused_where_a_photo_is_resampled(views: list[View], tmp_path: Path) -> None:
+    photo = streamed(views, tmp_path, [Look(0, PIXELS)])[0]
+    assert isinstance(photo.camera, Camera) and photo.camera.whole().window is None
+    with pytest.raises(ValueError, match="scale the whole"):
+        photo.camera.scaled(10, 10)
