@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import read_model_area
 from splatpipe.pipeline.photos.dataset import load_split, load_views
-from splatpipe.pipeline.photos.images import reduced_camera, reduced_view
+from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.floaters import measure_floaters
-from splatpipe.pipeline.render.options import EvaluateConfig
+from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS, EvaluateConfig
 from splatpipe.pipeline.render.rendering import as_trained, placed, render_depth, render_pixels
 from splatpipe.pipeline.render.splat_accuracy import measure_accuracy
-from splatpipe.pipeline.render.view_measures import evaluate_view, flat_stems, mean_measures, shows_inside
+from splatpipe.pipeline.render.view_measures import (
+    evaluate_view,
+    flat_stems,
+    mean_measures,
+    mean_megapixels,
+    shows_inside,
+)
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
+
+Pictures = tuple[tuple[Camera, Pixels, Mask | None], Pixels, Path, Mask | None]  # a view, its render, stem and inside
+
+MEASURED_AT_ONCE = 4  # views, each with 0.3 GB of pictures in double precision
 
 
 def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write `metrics.json` and `views/`: photo, render, error and mask of every held-out view.
 
+    All of them at `JUDGED_MEGAPIXELS`, or as large as the dataset has them, whatever size was trained.
     With a boundary, figures are those of what lies inside: pixels by the model's own depth, points by their place.
     The pictures stay in the stored grid, not turned by EXIF's orientation: every figure comes out of them again.
     """
@@ -32,7 +46,7 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     held_out = load_split(inputs["split.views"]).held_out
     chosen = [view for view in views if view.camera.name in set(held_out)]
     gaussians = read_splat(inputs["train.model"])
-    options, megapixels = as_trained(inputs["train.rendering"], gaussians)
+    options, _ = as_trained(inputs["train.rendering"], gaussians)
     device = choose_device(inputs.machine.device)
     gaussians, sky = placed((gaussians, read_panorama(inputs["train.sky"])), device)
     area = read_model_area(inputs.parts.get("georef.boundary"))
@@ -43,29 +57,37 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
             "No photo was held out, so no likeness is measured; floaters are looked for in training photos.",
             hint="Set split.every or split.views to hold some out.",
         )
-    stems = flat_stems([view.camera.name for view in chosen])
-    per_view = []
-    for done, (view, stem) in enumerate(zip(chosen, stems, strict=True), start=1):
-        reduced = reduced_view(view, megapixels)
-        inside = None
-        with same_bits(inputs.machine.threads):
-            render = render_pixels((gaussians, sky), reduced[0], options)
+
+    def pictures() -> Iterator[Pictures]:
+        stems = flat_stems([view.camera.name for view in chosen])
+        for view, stem in zip(chosen, stems, strict=True):
+            reduced = reduced_view(view, JUDGED_MEGAPIXELS)
+            render, inside = render_pixels((gaussians, sky), reduced[0], options), None
             if area is not None:
                 inside = shows_inside(area, reduced[0], render_depth(gaussians, reduced[0], options))
-        per_view.append(evaluate_view(reduced, render, folder / stem, inside))
-        report.progress(done, len(chosen), "measuring held-out photos", "photos")
-    means = mean_measures(per_view)
-    cameras = [reduced_camera(view.camera, megapixels) for view in views]
+            yield reduced, render, folder / stem, inside
+
+    per_view: list[dict[str, Any]] = []
+    cameras = [reduced_camera(view.camera, JUDGED_MEGAPIXELS) for view in views]
     with same_bits(inputs.machine.threads):
+        for found in ordered_map(_measured, pictures(), min(inputs.machine.threads, MEASURED_AT_ONCE)):
+            per_view.append(found)
+            report.progress(len(per_view), len(chosen), "measuring held-out photos", "photos")
         floaters = measure_floaters(gaussians, cameras, set(held_out), inputs["undistort.dataset"], options, area)
         accuracy = measure_accuracy(inputs.parts, cameras, held_out, partial(render_depth, gaussians, options=options))
-    result: dict[str, Any] = {"test_views": len(per_view), "mean": means, "floaters": floaters, "accuracy": accuracy}
+    means, judged = mean_measures(per_view), mean_megapixels(per_view)
+    result: dict[str, Any] = {"test_views": len(per_view), "judged_megapixels": judged, "mean": means}
+    result |= {"floaters": floaters, "accuracy": accuracy}
     if area is not None:
         result["whole"] = mean_measures([view["whole"] for view in per_view])
     result["per_view"] = per_view
     write_json(out / "metrics.json", result)
     summary: dict[str, Any] = {"test_views": len(per_view)}
-    summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")}
+    summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")} | {"judged_megapixels": judged}
     if area is not None:
         summary["whole_psnr"] = result["whole"]["psnr"]
     return summary | {"veil": floaters["veil"]["mean"], "device": device.name}
+
+
+def _measured(pictures: Pictures) -> dict[str, Any]:
+    return evaluate_view(*pictures)

@@ -135,6 +135,7 @@ def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: 
         "train_seconds": train.get("train_seconds"),
         "train_megapixels": train.get("train_megapixels"),
         "peak_memory_bytes": train.get("peak_memory_bytes"),
+        "judged_megapixels": measured["judged_megapixels"],
         "test_views": measured["test_views"],
         **measured["mean"],
         **({"whole": measured["whole"]} if "whole" in measured else {}),  # with a boundary: the rest is of the inside

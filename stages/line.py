@@ -152,7 +152,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=8,
+    version=9,
     config=EvaluateConfig,
     reads=(
         "train.model",
@@ -170,7 +170,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=4,
+    version=5,
     config=ExportConfig,
     reads=(
         "train.model",

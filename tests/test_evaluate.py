@@ -106,6 +106,31 @@ def test_photos_are_kept_as_they_are(left: Path, inputs: Inputs) -> None:
     np.testing.assert_array_equal(read(left / "views/flight 1_photo_0.photo.png"), original)
 
 
+def test_photos_are_judged_at_their_own_size_whatever_was_trained(inputs: Inputs, left: Path, tmp_path: Path) -> None:
+    rendering = json.loads(inputs["train.rendering"].read_text()) | {"megapixels": 0.001}
+    (tmp_path / "rendering.json").write_text(json.dumps(rendering))
+    smaller = replace(inputs, parts={**inputs.parts, "train.rendering": tmp_path / "rendering.json"})
+    summary = evaluate.run(EvaluateConfig(), smaller, tmp_path, tiny_scene.Recorder())
+    assert (tmp_path / "metrics.json").read_bytes() == (left / "metrics.json").read_bytes()
+    size = tiny_scene.WIDTH * tiny_scene.HEIGHT / 1e6
+    assert summary["judged_megapixels"] == json.loads((left / "metrics.json").read_text())["judged_megapixels"]
+    assert summary["judged_megapixels"] == pytest.approx(size, abs=5e-4)
+
+
+def test_larger_photos_are_judged_at_one_size(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate, "JUDGED_MEGAPIXELS", 0.002)
+    assert evaluate.run(EvaluateConfig(), inputs, tmp_path, tiny_scene.Recorder())["judged_megapixels"] == 0.002
+    for view in json.loads((tmp_path / "metrics.json").read_text())["per_view"]:
+        assert (view["width"], view["height"]) == (51, 38)
+        assert read(tmp_path / "views" / f"{view['file']}.photo.png").shape == (38, 51, 3)
+
+
+def test_figures_are_the_same_for_any_number_of_threads(inputs: Inputs, left: Path, tmp_path: Path) -> None:
+    several = replace(inputs, machine=replace(inputs.machine, threads=3))
+    evaluate.run(EvaluateConfig(), several, tmp_path, tiny_scene.Recorder())
+    assert (tmp_path / "metrics.json").read_bytes() == (left / "metrics.json").read_bytes()
+
+
 def test_error_picture_has_a_fixed_scale_and_greys_what_is_masked() -> None:
     photo = np.full((2, 3, 3), 100, np.uint8)
     render = photo.copy()

@@ -82,21 +82,68 @@ def test_psnr_after_colour_fit_forgives_exactly_an_affine_colour_change():
     assert psnr_cc(render, spoilt, mask) > 200
 
 
-def test_psnr_after_colour_fit_is_the_least_squares_residual():
-    photo = 0.2 + 0.5 * image(15, 18)
+def chessboard(height: int, width: int) -> np.ndarray:
+    """Fields of a 32nd of the longer side, the first one True."""
+    side = -(-max(height, width) // 32)
+    rows, columns = np.mgrid[:height, :width] // side
+    return (rows + columns) % 2 == 0
+
+
+def numpy_psnr_cc(render: np.ndarray, photo: np.ndarray, counts: np.ndarray) -> float:
+    """Fitted on the fields of one colour, scored on the other's, and swapped."""
+    a = np.concatenate([render, np.ones((*render.shape[:2], 1))], axis=2)
+    board, errors = chessboard(*photo.shape[:2]), []
+    for scored in (board & counts, ~board & counts):
+        fitted = counts & ~scored
+        colour = np.linalg.lstsq(a[fitted], photo[fitted], rcond=None)[0]
+        errors.append(np.clip(a[scored] @ colour, 0, 1) - photo[scored])
+    return float(-10 * np.log10(np.mean(np.concatenate(errors) ** 2)))
+
+
+@pytest.mark.parametrize("size", [(15, 18), (70, 101)])
+def test_psnr_after_colour_fit_is_what_each_half_makes_of_the_other(size):
+    photo, mask = 0.2 + 0.5 * image(*size), half_mask(*size)
     render = noisy(0.9 * photo, 0.02)
-    a = np.concatenate([render.reshape(-1, 3).numpy(), np.ones((15 * 18, 1))], axis=1)
+    everything = np.ones(size, bool)
+    assert psnr_cc(render, photo) == pytest.approx(numpy_psnr_cc(render.numpy(), photo.numpy(), everything), abs=1e-8)
+    expected = numpy_psnr_cc(render.numpy(), photo.numpy(), mask.numpy())
+    assert psnr_cc(render, photo, mask) == pytest.approx(expected, abs=1e-8)
+
+
+def test_colour_fit_gains_nothing_from_what_it_is_scored_on():
+    """A map fitted on all pixels matches noise to noise a little; halves that share nothing cannot."""
+    generator = torch.Generator().manual_seed(3)
+    render, photo = (torch.rand(32, 32, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    spread = photo.reshape(-1, 3).std(dim=0, correction=0).square().mean()
+    assert psnr_cc(render, photo) < -10 * math.log10(float(spread))  # worse than the photo's mean colour
+
+
+def test_vignettes_do_not_decide_the_colour_fit():
+    """Both halves have as much of the corners: the fit is as good as one on everything."""
+    y, x = np.mgrid[:300, :400]
+    fall = 1 - 0.5 * ((x - 200) ** 2 + (y - 150) ** 2) / 250**2
+    photo = image(300, 400) * torch.from_numpy(fall)[..., None]
+    render = 0.8 * image(300, 400) + 0.05
+    a = np.concatenate([render.reshape(-1, 3).numpy(), np.ones((300 * 400, 1))], axis=1)
     fit = a @ np.linalg.lstsq(a, photo.reshape(-1, 3).numpy(), rcond=None)[0]
-    expected = -10 * np.log10(np.mean((fit - photo.reshape(-1, 3).numpy()) ** 2))
-    assert psnr_cc(render, photo) == pytest.approx(expected, abs=1e-8)
-    assert psnr_cc(render, photo) >= psnr(render, photo)
+    on_everything = -10 * np.log10(np.mean((fit - photo.reshape(-1, 3).numpy()) ** 2))
+    assert psnr_cc(render, photo) == pytest.approx(on_everything, abs=0.01)
+
+
+def test_colour_fit_needs_pixels_in_both_halves():
+    photo = image(64, 64)
+    one_field = torch.zeros(64, 64, dtype=torch.bool)
+    one_field[:2, :2] = True
+    with pytest.raises(ValueError, match="no pixel"):
+        psnr_cc(photo, photo, one_field)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.7])
-def test_colour_fit_of_a_flat_render_gives_the_mean_colour(value):
-    photo = image(8, 8)
+def test_colour_fit_of_a_flat_render_gives_the_other_halfs_mean_colour(value):
+    photo, board = image(8, 8), torch.from_numpy(chessboard(8, 8))
     flat = torch.full_like(photo, value)
-    expected = -10 * math.log10(float((photo - photo.mean(dim=(0, 1))).square().mean()))
+    means = torch.where(board[..., None], photo[~board].mean(dim=0), photo[board].mean(dim=0))
+    expected = -10 * math.log10(float((photo - means).square().mean()))
     assert psnr_cc(flat, photo) == pytest.approx(expected, abs=1e-8)
 
 

@@ -32,7 +32,7 @@ def evaluate_view(
     """Measure one view, and keep its pictures.
 
     Args:
-        view: The held-out photo at the size of training: camera, photo and mask.
+        view: The held-out photo at the size that it is judged at: camera, photo and mask.
         render: What the model shows instead.
         stem: Path of the pictures without their endings.
         inside: Pixels that show what lies inside the boundary, which alone count then; None without one.
@@ -101,6 +101,12 @@ def mean_measures(per_view: Sequence[dict[str, Any]]) -> dict[str, float | None]
         values = [view[name] for view in per_view if view[name] is not None]
         means[name] = round(math.fsum(values) / len(values), 6) if values else None
     return means
+
+
+def mean_megapixels(per_view: Sequence[dict[str, Any]]) -> float | None:
+    """Mean size at which the views were measured; None without any."""
+    sizes = [view["width"] * view["height"] / 1e6 for view in per_view]
+    return round(math.fsum(sizes) / len(sizes), 3) if sizes else None
 
 
 def error_picture(render: Pixels, photo: Pixels, mask: Mask | None) -> Pixels:

@@ -30,6 +30,8 @@ _GMSD_C = 170.0 / 255.0**2
 _LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601 luma from gamma-coded RGB, as the authors' rgb2gray."""
 _EDGE_SHARE = 0.1
+_FIELDS = 32  # of the chessboard along a picture's longer side: 51 pixels each at 2 megapixels, 19 at 0.27
+_STRIP_ROWS = 64  # rows whose windows are compared at a time: they stay in a core's cache
 _SHARPNESS_FLOOR = 1.0 / 255.0
 """A gradient of one grey level a pixel, below which a photo shows nothing to be sharp about."""
 
@@ -49,23 +51,54 @@ def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
 
 
 def psnr_cc(render: Image, photo: Image, mask: Mask | None = None) -> float:
-    """PSNR after the affine colour map (3 × 4) of the render that fits the photo best, by least squares.
+    """PSNR after an affine colour map (3 × 4) of the render, fitted by least squares on the other half of the picture.
 
-    It forgives exposure and white balance that differ between photos. The corrected render is clamped to [0, 1].
+    It forgives exposure and white balance that differ between photos. A map is fitted on each half and scored on the
+    other, so that no pixel is judged by colours that were fitted to it; all pixels' errors are one mean. Halves of one
+    edge would be lit differently, and shaded differently by the lens: what a map of one side misses on the other would
+    be their difference. So they are the fields of a chessboard, `_FIELDS` along the longer side: of any brightness,
+    colour or distance from the centre, both have as much, and a field is far larger than what neighbouring pixels share
+    by blur. The corrected render is clamped to [0, 1].
 
-    Returns:
-        Decibels, never less than those of ``psnr`` for images in [0, 1].
+    Raises:
+        ValueError: also if the mask leaves one half no pixel.
     """
     x, y, counts = _prepare(render, photo, mask)
-    source = torch.cat([x, torch.ones_like(x[:1])])  # (4, h, w)
-    normal = torch.tensor([[_sum(a * b, counts) for b in source] for a in source], dtype=torch.float64)
-    right = torch.tensor([[_sum(a * b, counts) for b in y] for a in source], dtype=torch.float64)
-    # gelsd takes the smallest of many solutions: a render of one colour leaves the map undetermined
-    colour = torch.linalg.lstsq(normal, right, driver="gelsd").solution  # (4, 3)
-    corrected = sum(source[i] * colour[i, :, None, None] for i in range(4))
-    assert isinstance(corrected, Tensor)
-    error = _mean((corrected.clamp(0.0, 1.0) - y).square(), counts)
+    board = _chessboard(counts.shape[0], counts.shape[1])
+    halves = (counts & board, counts & ~board)
+    maps = _colour_maps(x, y, halves)
+    errors = []
+    for colour, scored in zip(reversed(maps), halves, strict=True):
+        for channel, into in zip(y, colour.T.tolist(), strict=True):
+            corrected = into[0] * x[0] + into[1] * x[1] + into[2] * x[2] + into[3]
+            errors.append(_sum((corrected.clamp_(0.0, 1.0) - channel).square_(), scored))
+    error = math.fsum(errors) / (3 * int(counts.sum()))
     return 10.0 * math.log10(1.0 / error) if error > 0.0 else math.inf
+
+
+def _chessboard(height: int, width: int) -> Bool[Tensor, "h w"]:
+    side = math.ceil(max(height, width) / _FIELDS)
+    rows, columns = (torch.arange(size) // side for size in (height, width))
+    return (rows[:, None] + columns[None]) % 2 == 0
+
+
+def _colour_maps(x: Tensor, y: Tensor, halves: tuple[Tensor, Tensor]) -> list[Float[Tensor, "4 3"]]:
+    """The map from ``x`` to ``y`` that fits each half best; the last row is added."""
+    for half in halves:
+        _require_pixels(half)
+    source = [*x, torch.ones_like(x[0])]
+    normal, right = torch.zeros(2, 4, 4, dtype=torch.float64), torch.zeros(2, 4, 3, dtype=torch.float64)
+    for i, one in enumerate(source):
+        for j, other in enumerate((*source[: i + 1], *y)):
+            product = one * other
+            for k, half in enumerate(halves):
+                value = _sum(product, half)
+                if j <= i:
+                    normal[k, i, j] = normal[k, j, i] = value
+                else:
+                    right[k, i, j - i - 1] = value
+    # gelsd takes the smallest of many solutions: a render of one colour leaves the map undetermined
+    return [torch.linalg.lstsq(normal[k], right[k], driver="gelsd").solution for k in range(2)]
 
 
 def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
@@ -81,9 +114,11 @@ def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
     radius = SSIM_WINDOW // 2
     if min(x.shape[1:]) <= radius:
         raise ValueError(f"SSIM needs images of {radius + 1} pixels a side, got {tuple(x.shape[1:])}")
-    around = [radius] * 4
-    similarity, _ = _similarity(pad(x, around, mode="reflect"), pad(y, around, mode="reflect"))
-    return _mean(similarity, counts)
+    sums = []
+    for channel in zip(x, y, strict=True):
+        around_x, around_y = (pad(image[None], [radius] * 4, mode="reflect")[0] for image in channel)
+        sums.append(_window_sums(around_x, around_y, counts)[0])
+    return math.fsum(sums) / (3 * int(counts.sum()))
 
 
 def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
@@ -104,8 +139,8 @@ def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
         inner = counts[radius:-radius, radius:-radius]
         if min(x.shape[1:]) < SSIM_WINDOW or not bool(inner.any()):
             break
-        maps = _similarity(x, y)
-        similarity, structure = ([_mean(channel[None], inner) for channel in m] for m in maps)
+        sums = [_window_sums(*channel, inner) for channel in zip(x, y, strict=True)]
+        similarity, structure = ([total[k] / int(inner.sum()) for total in sums] for k in (0, 1))
         scales.append((similarity, structure))
         x, y = avg_pool2d(x, 2), avg_pool2d(y, 2)
         counts = _halved(counts)
@@ -204,9 +239,22 @@ def _mean(values: Float[Tensor, "c h w"], counts: Bool[Tensor, "h w"]) -> float:
     return math.fsum(_sum(channel, counts) for channel in values) / (values.shape[0] * int(counts.sum()))
 
 
-def _blur(image: Float[Tensor, "c h w"]) -> Tensor:
-    """Windowed means of whole windows (c, h - 10, w - 10), tap by tap: elementwise, so the same in any thread."""
-    for dim in (2, 1):
+def _window_sums(
+    x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counts: Bool[Tensor, "h-10 w-10"]
+) -> tuple[float, float]:
+    """Sums, over the counting ones of all whole windows, of SSIM and of its contrast · structure factor."""
+    rows: tuple[list[float], list[float]] = ([], [])
+    for top in range(0, counts.shape[0], _STRIP_ROWS):
+        strip = slice(top, top + _STRIP_ROWS + SSIM_WINDOW - 1)
+        here = counts[top : top + _STRIP_ROWS]
+        for found, values in zip(rows, _similarity(x[strip], y[strip]), strict=True):
+            found += torch.where(here, values, 0.0).sum(dim=1).tolist()
+    return math.fsum(rows[0]), math.fsum(rows[1])
+
+
+def _blur(image: Float[Tensor, "h w"]) -> Tensor:
+    """Windowed means of whole windows (h - 10, w - 10), tap by tap: elementwise, so the same in any thread."""
+    for dim in (1, 0):
         length = image.shape[dim] - SSIM_WINDOW + 1
         parts = (tap * image.narrow(dim, i, length) for i, tap in enumerate(ssim_window().tolist()))
         total = next(parts)
@@ -216,8 +264,8 @@ def _blur(image: Float[Tensor, "c h w"]) -> Tensor:
     return image
 
 
-def _similarity(x: Float[Tensor, "c h w"], y: Float[Tensor, "c h w"]) -> tuple[Tensor, Tensor]:
-    """SSIM of every whole window, and its contrast · structure factor: (c, h - 10, w - 10) each."""
+def _similarity(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
+    """SSIM of every whole window, and its contrast · structure factor: (h - 10, w - 10) each."""
     mx, my = _blur(x), _blur(y)
     sxx, syy, sxy = _blur(x * x) - mx * mx, _blur(y * y) - my * my, _blur(x * y) - mx * my
     up, down = 2.0 * sxy + SSIM_C2, sxx + syy + SSIM_C2

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from splatpipe.pipeline.app.report.holdings import Holdings
-from splatpipe.pipeline.app.report.wording import count, duration, number, share, size
+from splatpipe.pipeline.app.report.wording import count, duration, judged_size, number, share, size
 
 Chapter = dict[str, Any]
 MEASURES = {  # of a held-out photo: title, digits, which way is better
@@ -80,6 +80,7 @@ def views_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
         "mean": [number(metrics["mean"].get(name), digits) for name, _, digits in measures],
         "count": len(views),
         "bounded": "whole" in metrics,
+        "judged": judged_size(metrics),
         "floaters": _floaters(metrics.get("floaters") or {}),
         "shown": [],
         "charts": [],

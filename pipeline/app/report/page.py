@@ -15,7 +15,7 @@ from splatpipe.pipeline.app.report.learning import training_chapter, views_chapt
 from splatpipe.pipeline.app.report.making import files_chapter, making_chapter, said_chapter
 from splatpipe.pipeline.app.report.placing import placing_chapter
 from splatpipe.pipeline.app.report.verdict import judge
-from splatpipe.pipeline.app.report.wording import count, duration, length, moment, number
+from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number
 from splatpipe.pipeline.engine.errors import SplatpipeError
 
 if TYPE_CHECKING:
@@ -127,7 +127,8 @@ def _cards(holdings: Holdings) -> list[tuple[str, str, str]]:
     if evaluate.get("psnr") is not None:
         text = f"SSIM {number(evaluate.get('ssim'), 2)}, {count(evaluate.get('test_views'))} held-out photos"
         inside = ", inside the boundary" if evaluate.get("whole_psnr") is not None else ""
-        cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text + inside))
+        at = f", at {size} megapixels" if (size := judged_size(evaluate)) else ""
+        cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text + at + inside))
     if train:
         cards.append(("Gaussians", count(train.get("gaussians")), ""))
     seconds = [float(artifact.manifest["seconds"]) for artifact in holdings.artifacts.values()]

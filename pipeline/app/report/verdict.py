@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from splatpipe.pipeline.app.report.holdings import Holdings
-from splatpipe.pipeline.app.report.wording import count, duration, length, moment, number, plural, share
+from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number, plural, share
 from splatpipe.stages.line import LINE
 
 Level = Literal["good", "doubt", "bad"]
@@ -246,7 +246,8 @@ def _views(holdings: Holdings) -> Finding | None:
     value, worst = _likeness(mean), _likeness(worst_of)
     level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
     told = {"good": "a good likeness", "doubt": "a fair likeness", "bad": "a poor likeness"}[level]
-    text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded} "
+    at = f", at {size} megapixels" if (size := judged_size(metrics)) else ""
+    text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded}{at} "
     text += f"({value:.1f} without what exposure did), SSIM {number(mean['ssim'], 2)}: {told}"
     if level == "good" and worst < PSNR_DOUBT_DB:
         return Finding(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 NONE = "–"
 
@@ -91,6 +92,12 @@ def interval(bounds: object) -> str:
 def plural(amount: int, one: str, more: str = "") -> str:
     """``1 photo``, ``2 photos``."""
     return f"{amount:,} {one if amount == 1 else more or one + 's'}"
+
+
+def judged_size(metrics: Mapping[str, Any]) -> str:
+    """Megapixels at which held-out photos were measured; empty where that is not known: in runs of earlier versions."""
+    judged = metrics.get("judged_megapixels")
+    return "" if judged is None else number(judged, 1 if judged >= 1.0 else 2)
 
 
 def _finite(value: object) -> TypeGuard[float]:
