@@ -1,5 +1,6 @@
 """benchmarks: they run on any dataset, count what they say they count, and train what the line trains."""
 
+import argparse
 import json
 import math
 import subprocess
@@ -28,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import measure
 import tiny_scene
+import window_speed
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 MEGAPIXELS = 1e-6 * tiny_scene.WIDTH * tiny_scene.HEIGHT
@@ -102,6 +104,20 @@ def test_train_speed_times_every_point_set_in_every_size(dataset: Path, tmp_path
         assert row["pairs"] == pytest.approx(1e6 * row["megapixels"] * row["pairs_per_pixel"], rel=0.05)
         assert row["gpairs_per_s_per_core"] > 0.0 and row["wall_min_s"] <= row["wall_s"]
         assert all(row[f"{part}_{clock}_s"] > 0.0 for part in (*measure.PARTS, "rest") for clock in ("wall", "cpu"))
+
+
+def test_window_speed_compares_windows_with_whole_photos_of_their_size(dataset: Path, tmp_path: Path) -> None:
+    given = argparse.Namespace(data=dataset, points="sparse", photos=2, repeats=8, threads=1)
+    given.window, given.megapixels = MEGAPIXELS, [4 * MEGAPIXELS]
+    whole, parts = window_speed.measure(given, tmp_path)
+    assert (whole["seen"], parts["seen"]) == ("whole", "in windows")
+    assert whole["iterations"] == parts["iterations"] == 8 and whole["gaussians"] == parts["gaussians"]
+    assert whole["counted_megapixels"] == whole["rendered_megapixels"] == pytest.approx(MEGAPIXELS)
+    assert 0.5 * MEGAPIXELS < parts["counted_megapixels"] <= window_speed.ROUNDING * MEGAPIXELS
+    assert parts["counted_megapixels"] < parts["rendered_megapixels"]
+    assert parts["pairs_per_pixel"] == pytest.approx(whole["pairs_per_pixel"], rel=0.35)  # the same scene, nearer
+    assert whole["ratio"] == whole["mean_ratio"] == whole["ratio_per_counted"] == 1.0
+    assert math.isclose(parts["mean_ratio"], parts["cpu_mean_s"] / whole["cpu_mean_s"])
 
 
 def test_scaling_keeps_the_pairs_of_a_pixel_while_gaussians_grow(dataset: Path, tmp_path: Path) -> None:
