@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import cuda, cuda_library, rasterizer
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.pipeline.raster.loss import photo_loss
+from splatpipe.pipeline.raster.loss import SSIM_REACH_PX, Rectangle, photo_loss
 from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions
 from splatpipe.pipeline.splat import metrics
@@ -31,6 +31,7 @@ pytestmark = [
 CPU = torch.device("cpu")
 COUNT = 20_000
 WIDTH, HEIGHT = 403, 299  # no whole tiles
+WHOLE = (0, 0, WIDTH, HEIGHT)
 LEAST_DB = 60.0  # between renders: single pixels lie on a threshold of alpha
 MOST_RELATIVE = 1e-3  # of a gradient's norm: the same, and other orders of sums
 SSIM_WEIGHT = 0.2
@@ -65,15 +66,19 @@ def photo(width: int = WIDTH, height: int = HEIGHT) -> Tensor:
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(3))
 
 
-def everything(model: Gaussians, where: torch.device, depth: bool) -> dict[str, Tensor]:
-    """Pictures, loss and gradients of a view, brought to the CPU."""
+def everything(model: Gaussians, where: torch.device, depth: bool, part: Rectangle = WHOLE) -> dict[str, Tensor]:
+    """Pictures, loss and gradients of a view or of a part of it, whose rim does not count; brought to the CPU."""
+    left, top, right, bottom = part
+    here, view = (slice(top, bottom), slice(left, right)), camera().cut(left, top, right - left, bottom - top)
+    inner = None if part == WHOLE else (SSIM_REACH_PX, SSIM_REACH_PX, view.width - 2, view.height - 2)
     leaves = model.clone().to(where).requires_grad_()
     probe = torch.zeros(len(model), 2, device=where, requires_grad=True)
     affine = (torch.eye(3, 4) + 0.05).to(where).requires_grad_()
     options = RenderOptions(3, (0.1, 0.5, 0.9), antialias=not depth, depth=depth, magnitudes=not depth)
-    render = rasterizer.render(leaves, camera(), options, means2d_probe=probe)
+    render = rasterizer.render(leaves, view, options, means2d_probe=probe)
     mask = (torch.arange(HEIGHT)[:, None] + torch.arange(WIDTH) > 100).to(where)
-    loss = photo_loss(affine_colour(render.colour, affine), photo().to(where), SSIM_WEIGHT, mask)
+    shown = affine_colour(render.colour, affine)
+    loss = photo_loss(shown, photo()[here].to(where), SSIM_WEIGHT, mask[here], inner)
     if depth:
         loss = loss + 0.01 * (render.depth_sum.mean() + render.depth_square_sum.mean())
     loss.backward()
@@ -104,9 +109,10 @@ def stepped(where: torch.device, steps: int = 3) -> dict[str, Tensor]:
     return {name: tensor.detach().cpu() for name, tensor in model.tensors().items()}
 
 
+@pytest.mark.parametrize("part", [WHOLE, (150, 80, 290, 211)])
 @pytest.mark.parametrize("depth", [False, True])
-def test_pictures_losses_and_gradients_are_the_cpus(device: torch.device, depth: bool) -> None:
-    here, there = everything(scene(), CPU, depth), everything(scene(), device, depth)
+def test_pictures_losses_and_gradients_are_the_cpus(device: torch.device, depth: bool, part: Rectangle) -> None:
+    here, there = everything(scene(), CPU, depth, part), everything(scene(), device, depth, part)
     assert metrics.psnr(there.pop("colour"), here.pop("colour")) > LEAST_DB
     assert (there.pop("alpha") - here.pop("alpha")).square().mean() < 10 ** (-LEAST_DB / 10)
     seen_by_one = here.pop("visible") != there.pop("visible")

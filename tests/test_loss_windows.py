@@ -100,7 +100,7 @@ def check_parts(function: Callable[..., Tensor], dtype: torch.dtype, cut: tuple,
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("cut", CUTS, ids=str)
+@pytest.mark.parametrize("cut", CUTS[:3], ids=str)
 def test_references_parts_add_up_to_the_whole(cut, masked):
     check_parts(photo_loss_reference, torch.float64, cut, masked)
 
