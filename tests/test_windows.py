@@ -1,9 +1,11 @@
 """Windows of photos: parts of the whole photo, each as often as the others, and what they say adds up to it."""
 
+import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -135,6 +137,20 @@ def test_one_decode_fills_all_levels_and_is_told(views: list[View], tmp_path: Pa
             view.image_path.unlink()
         for one, other in zip(photos, usual, strict=True):
             assert torch.equal(one.colour, other.colour)
+
+
+@pytest.mark.parametrize(("window_pixels", "fits"), [(250_000, True), (0, False)])
+def test_windows_want_no_more_memory_of_a_large_photo(tmp_path: Path, window_pixels: int, fits: bool) -> None:
+    width, height = 4000, 3000
+    picture = tmp_path / "photo.png"
+    cv2.imwrite(str(picture), np.full((height, width, 3), 128, np.uint8))
+    more_bytes = 28_000_000
+    assert more_bytes < 3 * width * height  # a photo in 8 bits would not fit, let alone in float32
+    program = Path(__file__).with_name("windowed_memory.py")
+    command = [sys.executable, str(program), str(picture), str(tmp_path), str(window_pixels), str(more_bytes)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0 and done.stdout.split() == ["33"]) == fits, done.stderr[-500:]
+    assert fits or "memory" in done.stderr.lower()
 
 
 def test_windows_are_refused_where_a_photo_is_resampled(views: list[View], tmp_path: Path) -> None:

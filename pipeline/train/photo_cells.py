@@ -32,20 +32,22 @@ class PhotoCells:
         """Each cell's means over what is shown of it; zero where nothing is."""
         if self.camera.window is None:
             return functional.adaptive_avg_pool2d(planes[None], (self.rows, self.columns))[0]
-        down, across = self._members(planes)
+        (rows, down), (columns, across) = self._sides(planes)
+        found = planes.new_zeros(len(planes), self.rows, self.columns)
         number = down.sum(dim=1)[:, None] * across.sum(dim=1)
-        return (down @ planes @ across.T) / number.clamp(min=1.0)
+        found[:, rows, columns] = (down @ planes @ across.T) / number.clamp(min=1.0)
+        return found
 
     def judged(self, like: Tensor) -> Bool[Tensor, "rows columns"] | None:
         """The cells of which enough is shown; None where that is all of them."""
         if self.camera.window is None:
             return None
-        down, across = self._members(like)
-        whole = self.camera.whole()
-        tall = _belongs(0, whole.height, whole.height, self.rows, like).sum(dim=1)
-        wide = _belongs(0, whole.width, whole.width, self.columns, like).sum(dim=1)
-        shown = (down.sum(dim=1) / tall)[:, None] * (across.sum(dim=1) / wide)
-        return shown >= LEAST_SHOWN
+        whole, found = self.camera.whole(), like.new_zeros(self.rows, self.columns)
+        (rows, down), (columns, across) = self._sides(like)
+        tall = _belongs(range(whole.height), whole.height, self.rows, like).sum(dim=1)[rows]
+        wide = _belongs(range(whole.width), whole.width, self.columns, like).sum(dim=1)[columns]
+        found[rows, columns] = (down.sum(dim=1) / tall)[:, None] * (across.sum(dim=1) / wide)
+        return found >= LEAST_SHOWN
 
     def spread(self, cells: Bool[Tensor, "rows columns"]) -> Bool[Tensor, "h w"]:
         """For each pixel what its cell has."""
@@ -57,22 +59,29 @@ class PhotoCells:
         columns = _nearest(part.left, camera.width, part.whole_width, self.columns, cells.device)
         return cells[rows][:, columns]
 
-    def _members(self, like: Tensor) -> tuple[Float[Tensor, "rows h"], Float[Tensor, "columns w"]]:
-        """1 where a row or a column of the window belongs to a row or a column of cells."""
-        part = self.camera.window
+    def _sides(self, like: Tensor) -> tuple[tuple[slice, Tensor], tuple[slice, Tensor]]:
+        """The rows of cells that the window touches, and which of its rows belong to each; the same of columns."""
+        camera, part = self.camera, self.camera.window
         assert part is not None
         return (
-            _belongs(part.top, self.camera.height, part.whole_height, self.rows, like),
-            _belongs(part.left, self.camera.width, part.whole_width, self.columns, like),
+            _touched(range(part.top, part.top + camera.height), part.whole_height, self.rows, like),
+            _touched(range(part.left, part.left + camera.width), part.whole_width, self.columns, like),
         )
 
 
-def _belongs(first: int, count: int, size: int, cells: int, like: Tensor) -> Float[Tensor, "cells count"]:
+def _touched(pixels: range, size: int, cells: int, like: Tensor) -> tuple[slice, Float[Tensor, "touched count"]]:
+    """The cells that some pixels along a side belong to, and which belong to each; one more, empty, does no harm."""
+    first, last = pixels.start * cells // size, (pixels.stop - 1) * cells // size
+    numbers = slice(max(0, first - 1), min(cells, last + 2))
+    return numbers, _belongs(pixels, size, cells, like)[numbers]
+
+
+def _belongs(pixels: range, size: int, cells: int, like: Tensor) -> Float[Tensor, "cells count"]:
     """1 where a pixel along a side belongs to a cell: as torch's adaptive pooling divides it, overlaps and all."""
     number = torch.arange(cells, device=like.device)[:, None]
     begin = number * size // cells
     end = -(-(number + 1) * size // cells)
-    pixel = torch.arange(first, first + count, device=like.device)
+    pixel = torch.arange(pixels.start, pixels.stop, device=like.device)
     return ((pixel >= begin) & (pixel < end)).to(like.dtype)
 
 
