@@ -10,8 +10,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from forecast_fit import Outcome, Run, compared, fit, left_out, read_run
 from tables import print_table
@@ -61,16 +62,15 @@ def told(costs: Costs) -> str:
     return "\n".join(lines)
 
 
-def configured(preset: str) -> LineConfig:
-    """A preset's options."""
-    return resolve(LineConfig, [load_preset(preset)])
+def configured(preset: str, differing: Mapping[str, Any] | None = None) -> LineConfig:
+    """A preset's options as they were when it was run: but for those that it has otherwise by now."""
+    return resolve(LineConfig, [load_preset(preset), differing or {}])
 
 
-def runs_of(rows: Sequence[dict[str, object]]) -> tuple[list[Run], list[Run]]:
+def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[Run], list[Run]]:
     """The runs of the preset that is fitted to, and the others."""
-    fitted_to = [Run.of_row(row, configured(FITTED_TO)) for row in rows if row["preset"] == FITTED_TO]
-    others = [Run.of_row(row, configured(str(row["preset"]))) for row in rows if row["preset"] != FITTED_TO]
-    return fitted_to, others
+    runs = [(row["preset"], Run.of_row(row, configured(row["preset"], row.get("set")))) for row in rows]
+    return [run for preset, run in runs if preset == FITTED_TO], [run for preset, run in runs if preset != FITTED_TO]
 
 
 def holds(outcome: Outcome) -> tuple[bool, bool]:

@@ -148,8 +148,8 @@ def scene_of(run: Run, base: Costs) -> Costs:
         base,
         keypoints=keypoints,
         pairs=counts["pairs"] / run.size.photos * NEIGHBOURS / options.matches.neighbours,
-        gaussians=counts["gaussians"] / bare.grown(options.train.iterations),
-        flat=counts["iterations"] / options.train.iterations,
+        gaussians=counts["gaussians"] / bare.grown,
+        flat=counts["iterations"] / bare.iterations,
     )
 
 

@@ -47,9 +47,10 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train import plan as planned
+from splatpipe.pipeline.train.lengths import Footage
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
-from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
+from splatpipe.pipeline.train.schedule import UNKNOWN, Schedule, resolve_schedule
 from splatpipe.stages import train
 
 COLUMNS = {
@@ -111,9 +112,10 @@ def write_start(dataset: Path, count: int, wanted: float, threads: int) -> Path:
     return path
 
 
-def grown_in_the_middle(config: TrainConfig, photos: int) -> Schedule:
+def grown_in_the_middle(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedule:
     """A schedule with one step of density control, in which everything that was seen grows: the cap decides."""
-    schedule, middle = resolve_schedule(config, photos), config.iterations // 2
+    schedule = resolve_schedule(config, footage)
+    middle = schedule.iterations // 2
     density = replace(schedule.density, first=middle, last=middle, every=middle, gradient=1e-12)
     return replace(schedule, sh_every=1, density=density)
 

@@ -105,7 +105,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     options = decided_exposure(config.train, trained_on, dataset, arguments.threads, SilentReporter())
     room = start.within(options.max_gaussians)
     plan = make_plan(options, views, split, len(room))
-    looks = plan.schedule.looks_to(plan.options.iterations)
+    looks = plan.schedule.looks_to(plan.schedule.iterations)
     with same_bits(arguments.threads):
         clocks.start()
         sky = begin_sky(options, trained_on, dataset, arguments.threads, SilentReporter())

@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from splatpipe.pipeline.engine.needs import Need
-from splatpipe.pipeline.train.limits import FIXED_BYTES, PIXEL_BYTES, bytes_per_gaussian, worthwhile_iterations
+from splatpipe.pipeline.train.lengths import (
+    WINDOW_PIXELS,
+    Footage,
+    Length,
+    growth_until,
+    lengths,
+    lengths_of,
+    stretches,
+)
+from splatpipe.pipeline.train.limits import (
+    FIXED_BYTES,
+    PIXEL_BYTES,
+    bytes_per_gaussian,
+    window_within,
+    worthwhile_iterations,
+)
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
 from splatpipe.stages.costs import Costs
 from splatpipe.stages.options import LineConfig
@@ -18,13 +34,14 @@ MOST_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times the keypoints asked
 NEIGHBOURS = 20  # of the costs' pairs a photo
 PHOTOS_OF_ONE_COST = 50  # a photo of a mapping of so many costs what the constant says, of a larger one more
 MAPPING_GROWTH = 0.5  # power of the photos that a photo's mapping costs
-UNTIL = 0.5  # of the run there is density control
-GROWTH_MEAN = 5.0 / 6.0  # of the growth is there on average: x (2 - x) until half of the run, all of it from there on
 PREVIEW_STEPS = 5  # of density control, which the costs' Gaussians were counted after
 STEPS_POWER = 1.3  # of the steps, that Gaussians grow with: 1.5 on brighton (946,000 at `standard`), 0.9 on the demo
 SIZE_POWER = 0.5  # of the photos' size, the same: from 0.1 to 0.3 megapixels on the demo
 PREVIEW_MEGAPIXELS = 0.3  # at which the costs' Gaussians were counted
 GAUSSIAN_MEGAPIXELS = 1.7e-6  # of a photo that cost as much in an iteration: 1.2 on seneca, 2.3 on brighton (894,000)
+UNSEEN_SHARE = 0.3  # of a Gaussian's cost is there where a window does not show it; judgement
+GROWTH_SAMPLES = 32  # of the growth of Gaussians in a stretch of the training
+PYRAMID = 4.0 / 3.0  # times a photo's pixels: with all its halves
 TARGETS_TILE = 2.4  # megapixels, that targets are looked for in at once
 START_SHARE = 0.2  # of the final Gaussians, at the start
 LEAST_SHARE = 0.1  # of a time budget for the training, even where nothing is left
@@ -88,7 +105,7 @@ class Work:
         config: The options, resolved.
         costs: What a unit costs.
         threads: Of the run.
-        iterations: Of the training.
+        lengths: Of the training: levels and their iterations.
         gaussians: At its end.
     """
 
@@ -96,24 +113,24 @@ class Work:
     config: LineConfig
     costs: Costs
     threads: int
-    iterations: int
+    lengths: tuple[Length, ...]
     gaussians: float
 
     @staticmethod
     def of(size: CaptureSize, config: LineConfig, costs: Costs, threads: int) -> Work:
         """The work without a time budget."""
-        iterations = config.train.iterations
-        work = Work(size, config, costs, threads, iterations, 0.0)
-        return replace(work, gaussians=min(work.most_gaussians, work.grown(iterations)))
+        work = Work(size, config, costs, threads, (), 0.0)
+        work = replace(work, lengths=tuple(lengths_of(config.train, work.footage)))
+        return replace(work, gaussians=min(work.most_gaussians, work.grown))
 
     def filling(self, seconds: float, speed: float) -> Work:
         """The same with a training of so many seconds: iterations by their root, and the Gaussians that then fit in."""
-        iterations = worthwhile_iterations(seconds)
+        longer = replace(self, lengths=tuple(lengths(self.footage, worthwhile_iterations(seconds))))
         cpu = seconds / Need(0, 1.0, 0, parallel=PARALLEL["train"]).seconds(self.threads)
-        room = cpu * speed / (self.costs.stages["train"].cpu * iterations) - self.trained_at
-        fitting = max(FEWEST_GAUSSIANS, room / (GAUSSIAN_MEGAPIXELS * _mean_share()))
-        gaussians = min(self.most_gaussians, self.grown(iterations), fitting)
-        return replace(self, iterations=iterations, gaussians=gaussians)
+        bare = replace(longer, gaussians=0.0).training
+        room = cpu * speed / self.costs.stages["train"].cpu - bare
+        fitting = max(FEWEST_GAUSSIANS, room / (replace(longer, gaussians=1.0).training - bare))
+        return replace(longer, gaussians=min(self.most_gaussians, longer.grown, fitting))
 
     @property
     def looked_at(self) -> float:
@@ -139,8 +156,52 @@ class Work:
 
     @property
     def trained_at(self) -> float:
-        """Megapixels of a training photo."""
+        """Megapixels of a training photo at its finest."""
+        return min(self.kept_at, self.config.train.max_megapixels or self.kept_at)
+
+    @property
+    def kept_at(self) -> float:
+        """Megapixels of a photo in the dataset."""
         return min(self.size.megapixels, self.config.undistort.max_megapixels)
+
+    @property
+    def footage(self) -> Footage:
+        """The photos as they are trained on, those for which memory has room windows included."""
+        height = math.sqrt(MEGA * self.trained_at * self.size.shape)
+        window, limit = WINDOW_PIXELS["cpu"], self.config.train.max_memory_bytes
+        if limit:
+            window = window_within(int(limit - self.costs.stages["train"].resident) - FIXED_BYTES, window)
+        return Footage(((max(1, round(height / self.size.shape)), max(1, round(height)), self.size.photos),), window)
+
+    @property
+    def window(self) -> float:
+        """Most megapixels that an iteration looks at."""
+        footage = self.footage
+        return max(footage.pixels(each.look) for each in stretches(footage, self.lengths)) / MEGA
+
+    @property
+    def iterations(self) -> int:
+        """Of the training."""
+        return sum(count for _level, count in self.lengths)
+
+    @property
+    def training(self) -> float:
+        """Of all iterations: megapixels, and Gaussians as megapixels that cost as much."""
+        footage, done, total = self.footage, 0, 0.0
+        for stretch in stretches(footage, self.lengths):
+            count, share = stretch.until - done, footage.share(stretch.look)
+            cost = GAUSSIAN_MEGAPIXELS * (UNSEEN_SHARE + (1.0 - UNSEEN_SHARE) * share)
+            there = self.gaussians * self._mean_growth(done, stretch.until)
+            total += count * (footage.pixels(stretch.look) / MEGA + cost * there)
+            done = stretch.until
+        return total
+
+    def _mean_growth(self, start: int, end: int) -> float:
+        """Share of the final Gaussians that iterations have on average: x (2 - x) of the growth, all of it later on."""
+        last = max(1, growth_until(self.lengths))
+        middles = (start + (step + 0.5) * (end - start) / GROWTH_SAMPLES for step in range(GROWTH_SAMPLES))
+        shares = [min(1.0, middle / last) for middle in middles]
+        return START_SHARE + (1.0 - START_SHARE) * sum(x * (2.0 - x) for x in shares) / GROWTH_SAMPLES
 
     @property
     def most_gaussians(self) -> float:
@@ -148,14 +209,17 @@ class Work:
         options = self.config.train
         if not options.max_memory_bytes:
             return float(options.max_gaussians)
-        taken = self.costs.stages["train"].resident + FIXED_BYTES + PIXEL_BYTES * MEGA * self.trained_at
+        taken = self.costs.stages["train"].resident + FIXED_BYTES + PIXEL_BYTES * MEGA * self.window
         room = max(0.0, options.max_memory_bytes - taken)
         return min(float(options.max_gaussians), room / bytes_per_gaussian(options.sh_degree))
 
-    def grown(self, iterations: int) -> float:
+    @property
+    def grown(self) -> float:
         """Gaussians after density control, as the photos' detail asks for."""
-        first, every = max(1, min(500, iterations // 5)), max(1, min(100, iterations // 10))
-        steps = max(1.0, 1.0 + (UNTIL * iterations - first) // every)
+        auto, photos = self.config.train.iterations == "auto", self.size.photos
+        pace, turn = (self.config.train.least_iterations, photos) if auto else (self.iterations, 1)
+        first, every = max(1, min(500, pace // 5), turn), max(1, min(100, pace // 10), turn)
+        steps = max(1.0, 1.0 + (growth_until(self.lengths) - first) // every)
         longer, larger = steps / PREVIEW_STEPS, self.trained_at / PREVIEW_MEGAPIXELS
         return float(self.costs.gaussians * self.size.photos * longer**STEPS_POWER * larger**SIZE_POWER)
 
@@ -176,9 +240,8 @@ class Work:
         keypoints, trained, gaussians = photos * self.keypoints, photos * self.trained_at, float(self.gaussians)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
-        done = self.iterations * (self.costs.flat if train.stop_when_flat and not train.time_budget_s else 1.0)
-        iteration = self.trained_at + GAUSSIAN_MEGAPIXELS * gaussians * _mean_share()
-        state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.trained_at
+        done = self.costs.flat if train.stop_when_flat and not train.time_budget_s else 1.0
+        state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.window
         looked = photos * self.looked_at * SIFT_WORK[extractor]
         looked_at_once = self.threads * self.looked_at * SIFT_MEMORY[extractor]
         controlled = float(size.control)
@@ -191,10 +254,10 @@ class Work:
             "sparse": Units(keypoints * mapping, keypoints, keypoints),
             "targets": Units(controlled * pixels, controlled * targets_at_once, controlled * photos),
             "georef": Units(photos, keypoints, keypoints),
-            "undistort": Units(pixels, at_once, trained),
+            "undistort": Units(pixels, at_once, photos * self.kept_at),
             "split": Units(photos, 0.0, photos),
             "initialize": Units(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
-            "train": Units(done * iteration, state, gaussians),
+            "train": Units(done * self.training, state, gaussians),
             "evaluate": Units(trained, gaussians, trained),
             "export": Units(gaussians, gaussians, gaussians),
             "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
@@ -222,10 +285,5 @@ class Work:
         if stage in ("matches", "sparse"):
             return int(self.costs.stages["features"].disk * units.disk)
         if stage == "train":
-            return int(PHOTO_BYTES * MEGA * self.size.photos * self.trained_at + units.memory)
+            return int(PYRAMID * PHOTO_BYTES * MEGA * self.size.photos * self.trained_at + units.memory)
         return 0
-
-
-def _mean_share() -> float:
-    """Of the final Gaussians, that an iteration has on average."""
-    return START_SHARE + (1.0 - START_SHARE) * GROWTH_MEAN

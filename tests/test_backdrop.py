@@ -123,7 +123,7 @@ def test_outside_density_control_keeps_to_the_backdrops_share(monkeypatch: pytes
     monkeypatch.setattr(scheduled, "GRADIENT", 1e-12)
     config = tiny_scene.plain(iterations=40, max_gaussians=400)
     views = tiny_scene.cameras()
-    schedule = scheduled.resolve_schedule(config, len(views))
+    schedule = scheduled.resolve_schedule(config)
     start = tiny_scene.true_model()
     plan = Plan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, len(start), 40)
     state = TrainState.begin(start, plan, make_techniques(plan, area=AREA))
@@ -144,7 +144,7 @@ def test_outside_density_control_keeps_to_the_backdrops_share(monkeypatch: pytes
 def test_without_a_boundary_nothing_ranks_or_removes() -> None:
     config = tiny_scene.plain(iterations=40)
     views = tiny_scene.cameras()
-    schedule = scheduled.resolve_schedule(config, len(views))
+    schedule = scheduled.resolve_schedule(config)
     plan = Plan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, 150, 40)
     techniques, score = make_techniques(plan), torch.rand(150)
     assert techniques.find(Backdrop) is None

@@ -25,7 +25,6 @@ from splatpipe.pipeline.train.budget import (
     FEWEST_GAUSSIANS,
     SCHEDULE_SHARE,
     SMALLEST_MEGAPIXELS,
-    VISITS,
     Choice,
     Speed,
     Task,
@@ -35,7 +34,8 @@ from splatpipe.pipeline.train.budget import (
     forecast,
 )
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.limits import FEWEST, FIXED_BYTES, LONGEST, bytes_per_gaussian
+from splatpipe.pipeline.train.lengths import WHOLE_VISITS, Footage
+from splatpipe.pipeline.train.limits import FEWEST, FIXED_BYTES, LONGEST, PIXEL_BYTES, bytes_per_gaussian
 from splatpipe.pipeline.train.measure import Measured
 from splatpipe.pipeline.train.memory import resident_bytes
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
@@ -137,13 +137,13 @@ def test_forecast_is_the_sum_over_the_iterations() -> None:
     schedule = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
     levels = [look.level for look in schedule.looks_to(2400)]
     each = [SPEED.seconds(room_at(schedule.density, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
-    assert forecast(SPEED, schedule, 8_000, 0.4) == pytest.approx(math.fsum(each), rel=0.01)
+    assert forecast(SPEED, schedule, 8_000, Footage(((800, 500, 32),))) == pytest.approx(math.fsum(each), rel=0.01)
 
 
 def task_of(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Task:
     """8,000 sparse points."""
     config = tiny_scene.plain(time_budget_s=seconds, max_gaussians=cap)
-    return Task(config, 8_000, 0, photos, size, SPEED, 0.0, lambda _size: seconds)
+    return Task(config, 8_000, 0, ((1000, round(1000 * size), photos),), 0, SPEED, 0.0, lambda _size: seconds)
 
 
 def plan_for(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Choice:
@@ -158,7 +158,7 @@ def test_plans_fill_their_time(seconds: float) -> None:
 
 def test_more_time_never_plans_less() -> None:
     plans = [plan_for(seconds) for seconds in (5.0, 15.0, 60.0, 240.0, 900.0, 3600.0, 14_400.0)]
-    sizes = [plan.megapixels or 0.5 for plan in plans]
+    sizes = [plan.options.max_megapixels or 0.5 for plan in plans]
     caps = [plan.options.max_gaussians for plan in plans]
     assert sizes == sorted(sizes) and sizes[0] < 0.5 == sizes[-1]
     assert caps == sorted(caps) and caps[0] < caps[-1]
@@ -167,27 +167,27 @@ def test_more_time_never_plans_less() -> None:
 
 def test_no_limit_is_passed_however_much_time_there_is() -> None:
     choice = plan_for(1e6, cap=20_000)
-    assert choice.options.max_gaussians == 20_000 and choice.options.iterations == choice.last_iteration == LONGEST
-    assert choice.megapixels is None
+    assert choice.options.max_gaussians == 20_000 and choice.iterations == choice.last_iteration == LONGEST
+    assert choice.options.max_megapixels == 0.0
 
 
 def test_too_little_time_plans_the_smallest_training_and_not_none() -> None:
     choice = choose(replace(task_of(0.01, size=2.0), sparse=500_000))
     assert choice.options.iterations == FEWEST and choice.options.max_gaussians == FEWEST_GAUSSIANS
-    assert choice.megapixels == SMALLEST_MEGAPIXELS
+    assert choice.options.max_megapixels == SMALLEST_MEGAPIXELS
 
 
 def test_every_photo_is_seen_often_enough_before_photos_grow() -> None:
-    many = plan_for(120.0, photos=1_000)
-    assert many.options.iterations >= 0.99 * VISITS * 1_000
-    assert (many.megapixels or 0.5) < (plan_for(120.0, photos=10).megapixels or 0.5)
+    many = plan_for(300.0, photos=1_000)
+    assert many.iterations >= 0.99 * WHOLE_VISITS * 1_000
+    assert 0.0 < many.options.max_megapixels < (plan_for(300.0, photos=10).options.max_megapixels or 0.5)
 
 
 @pytest.mark.parametrize("seconds", [5.0, 15.0, 60.0])
 def test_points_of_the_sweep_take_nothing_from_photos_and_iterations(seconds: float) -> None:
     """They are what a plan drops first, so it need not have room for them: only the forecast counts those that stay."""
     bare, swept = choose(task_of(seconds)), choose(replace(task_of(seconds), swept=50_000))
-    assert swept.megapixels == bare.megapixels
+    assert swept.options.max_megapixels == bare.options.max_megapixels
     assert swept.options.iterations >= 0.9 * bare.options.iterations
     assert swept.options.max_gaussians >= 0.8 * bare.options.max_gaussians
     assert swept.forecast_s <= SCHEDULE_SHARE * seconds
@@ -342,11 +342,12 @@ def test_memory_that_holds_the_sparse_points_takes_the_sweep_s_without_a_warning
     plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "resident_bytes", lambda: 0)
-    limit = FIXED_BYTES + 2000 * bytes_per_gaussian(plan.options.sh_degree)
+    pixels = tiny_scene.WIDTH * tiny_scene.HEIGHT
+    limit = FIXED_BYTES + PIXEL_BYTES * pixels + 2000 * bytes_per_gaussian(plan.options.sh_degree)
     limited = plan.of(plan.options.model_copy(update={"max_memory_bytes": limit}))
     for sparse, told in ((1500, 0), (2500, 1)):
         recorder = tiny_scene.Recorder()
-        capped = memory.within_memory(replace(limited, initial_gaussians=50_000), 0, sparse, recorder)
+        capped = memory.within_memory(replace(limited, initial_gaussians=50_000), sparse, recorder)
         assert capped.options.max_gaussians == 2000
         assert len(recorder.warnings) == told
     assert "2,000 Gaussians, fewer than the 2,500 sparse points" in recorder.warnings[0]
@@ -362,6 +363,7 @@ from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
 from splatpipe.pipeline.train import plan
 from splatpipe.pipeline.train.measure import Measured
+from splatpipe.pipeline.train.lengths import WHOLE_VISITS, Footage
 from splatpipe.pipeline.train.limits import FIXED_BYTES
 from splatpipe.pipeline.train.memory import resident_bytes
 

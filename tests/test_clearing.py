@@ -80,7 +80,7 @@ def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: 
     after = (plan.schedule.density.last // step + 1) * step
     clearing = Clearing(space, plan.schedule)
     assert clearing.is_due(after) and not clearing.is_due(after + 1)
-    assert not clearing.is_due(plan.options.iterations)
+    assert not clearing.is_due(plan.schedule.iterations)
     state = TrainState.begin(haze_and_wall(), plan, Techniques((Clearing(space, plan.schedule),)))
     before = state.gaussians.detach().select(torch.arange(4, 8))
     state.control_density(plan, after)

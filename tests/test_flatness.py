@@ -11,6 +11,7 @@ import pytest
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.train import flatness, loop
+from splatpipe.pipeline.train.lengths import Stretch
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.schedule import resolve_schedule
@@ -67,7 +68,7 @@ def test_nothing_is_judged_before_density_control_all_degrees_and_full_size() ->
     assert flatness.settled_from(longer) == 700
     unchanging = replace(schedule, sh_degree=1, density=replace(longer.density, on=False))
     assert flatness.settled_from(unchanging) == 200
-    assert flatness.settled_from(replace(schedule, coarse_levels=1, coarse_until=900)) == 900
+    assert flatness.settled_from(replace(schedule, stretches=(Stretch(1, 0, 900), Stretch(0, 0, 1000)))) == 900
 
 
 def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None:

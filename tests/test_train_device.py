@@ -164,9 +164,10 @@ def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.M
 
 def test_a_limit_of_memory_is_the_devices_where_that_trains() -> None:
     each, recorder = limits.device_bytes_per_gaussian(3), tiny_scene.Recorder()
-    limit = limits.FIXED_BYTES + 1_000_000 * limits.PIXEL_BYTES + 5000 * each
+    pixels = tiny_scene.WIDTH * tiny_scene.HEIGHT
+    limit = limits.FIXED_BYTES + pixels * limits.PIXEL_BYTES + 5000 * each
     plan = make_small_plan(ALL.model_copy(update={"max_memory_bytes": limit, "max_gaussians": 1_000_000}))
-    assert memory.within_memory(plan, 1_000_000, 150, recorder, on_cuda=True).options.max_gaussians == 5000
+    assert memory.within_memory(plan, 150, recorder, on_cuda=True).options.max_gaussians == 5000
     # 236 bytes of parameters and 472 of moments, 12 of statistics; a tenth of a million more fit than on the CPU.
     assert 708 + 12 < each < limits.bytes_per_gaussian(TrainConfig().sh_degree)
 

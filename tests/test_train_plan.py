@@ -179,7 +179,7 @@ def test_broken_plan_is_written_anew(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     fresh = make_plan(TrainConfig(), views(), tiny_scene.split_of(views(), 2), 9)
     assert load_or_write_plan(path, lambda: fresh) == fresh
-    assert json.loads(path.read_text())["format"] == 3
+    assert json.loads(path.read_text())["format"] == 4
 
 
 def test_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:

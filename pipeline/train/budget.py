@@ -15,8 +15,11 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from splatpipe.pipeline.train.densify import room_at
+from splatpipe.pipeline.train.lengths import Footage, lengths
 from splatpipe.pipeline.train.limits import FEWEST, LONGEST, worthwhile_iterations
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import footage_of
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 from splatpipe.pipeline.train.start import started
 
@@ -24,8 +27,6 @@ from splatpipe.pipeline.train.start import started
 SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
 SIZE_STEP = 1.5  # between the sizes tried: fine enough to use the time, coarse enough for a short list
 FULL_SHARE = 0.9  # of the dataset's size is as good as all of it, and spares the resampling
-
-VISITS = 10  # iterations a photo at least: one seen less often leaves floaters before its camera
 
 FIRST_GROWTH = 1.5  # times the Gaussians of sparse points that every plan has room for, before it takes larger photos
 FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer; the plan thins the initial ones down to it at most
@@ -44,13 +45,15 @@ class Timing:
 
     Attributes:
         gaussians: In the model.
-        pixels: Of the photo.
+        pixels: That were compared.
         seconds: Wall clock.
+        share: Of the photo that these pixels are.
     """
 
     gaussians: int
     pixels: int
     seconds: float
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -59,19 +62,22 @@ class Speed:
 
     Attributes:
         base_s: Whatever the size.
-        gaussian_s: A Gaussian: projection, optimiser.
+        gaussian_s: A Gaussian, seen or not.
         pixel_s: A pixel: loss, and the pairs that are there with few Gaussians already.
         pair_s: A Gaussian times a pixel.
+        seen_s: A Gaussian times the share of the photo that the window is: projection, optimiser.
     """
 
     base_s: float
     gaussian_s: float
     pixel_s: float
     pair_s: float
+    seen_s: float = 0.0
 
-    def seconds(self, gaussians: int, pixels: int | float) -> float:
+    def seconds(self, gaussians: int, pixels: int | float, share: float = 1.0) -> float:
         """Of an iteration."""
-        return self.base_s + self.gaussian_s * gaussians + self.pixel_s * pixels + self.pair_s * gaussians * pixels
+        alone = self.base_s + (self.gaussian_s + self.seen_s * share) * gaussians
+        return alone + self.pixel_s * pixels + self.pair_s * gaussians * pixels
 
 
 def fit_speed(timings: Sequence[Timing]) -> Speed:
@@ -82,7 +88,7 @@ def fit_speed(timings: Sequence[Timing]) -> Speed:
     """
     if not timings or min(timing.seconds for timing in timings) <= 0.0:
         raise ValueError("a speed needs timings of more than zero seconds")
-    table = np.array([_terms(timing.gaussians, timing.pixels) for timing in timings])
+    table = np.array([_terms(timing) for timing in timings])
     seconds = np.array([timing.seconds for timing in timings])
     scale = table.max(axis=0)  # brings the columns to one size
     weighted = table / scale / seconds[:, None]
@@ -90,26 +96,30 @@ def fit_speed(timings: Sequence[Timing]) -> Speed:
     return Speed(*costs.tolist())
 
 
-def _terms(gaussians: int, pixels: int) -> npt.NDArray[np.float64]:
-    return np.array([1.0, gaussians, pixels, gaussians * pixels])
+def _terms(timing: Timing) -> npt.NDArray[np.float64]:
+    gaussians, pixels = timing.gaussians, timing.pixels
+    return np.array([1.0, gaussians, pixels, gaussians * pixels, gaussians * timing.share])
 
 
-def forecast(speed: Speed, schedule: Schedule, initial: int, megapixels: float) -> float:
+def forecast(speed: Speed, schedule: Schedule, initial: int, footage: Footage) -> float:
     """Seconds that a training takes.
 
     Args:
         speed: Of this machine on this scene.
         schedule: Of the training.
         initial: Gaussians at the start.
-        megapixels: Of a photo at full size.
+        footage: The photos as they are trained on.
     """
-    steps = min(SAMPLES, schedule.iterations)
-    total = 0.0
-    for step in range(steps):
-        iteration = int((step + 0.5) * schedule.iterations / steps) + 1
-        pixels = 1e6 * megapixels / 4 ** schedule.coarse_level_at(iteration)
-        total += speed.seconds(room_at(schedule.density, initial, iteration), pixels)
-    return total * schedule.iterations / steps
+    total, start = 0.0, 0
+    for stretch in schedule.stretches:
+        count = stretch.until - start
+        steps = min(SAMPLES, count)
+        pixels, share = footage.pixels(stretch.look), footage.share(stretch.look)
+        middles = [start + int((step + 0.5) * count / steps) + 1 for step in range(steps)]
+        each = [speed.seconds(room_at(schedule.density, initial, middle), pixels, share) for middle in middles]
+        total += sum(each) * count / steps
+        start = stretch.until
+    return total
 
 
 @dataclass(frozen=True)
@@ -120,21 +130,32 @@ class Task:
         config: The options; its ``max_gaussians`` is the most that may be planned.
         sparse: Gaussians of sparse points at the start, which every plan keeps where it can.
         swept: Gaussians of the sweep, which only fill what room a cap leaves.
-        photos: To train on.
-        megapixels: Their mean size in the dataset.
+        sizes: Width and height of the photos in the dataset, and how many have them.
+        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
         speed: Of this machine on this scene.
-        prepare_s: Decoding every photo once.
+        prepare_s: Decoding every photo once, whatever sizes are made of it.
         seconds: What is left for the training when its photos have so many megapixels.
     """
 
     config: TrainConfig
     sparse: int
     swept: int
-    photos: int
-    megapixels: float
+    sizes: tuple[tuple[int, int, int], ...]
+    window_pixels: int
     speed: Speed
     prepare_s: float
     seconds: Callable[[float], float]
+
+    @property
+    def megapixels(self) -> float:
+        """Most that photos may be trained at: their mean size in the dataset, or what the options allow."""
+        whole = 1e-6 * footage_of(self.sizes, None, 0).pixels(Look())
+        return min(whole, self.config.max_megapixels or whole)
+
+    def footage(self, megapixels: float) -> Footage:
+        """The photos at a size; at the largest one as the options have them."""
+        most = self.config.max_megapixels or None
+        return footage_of(self.sizes, most if megapixels >= self.megapixels else megapixels, self.window_pixels)
 
     def left(self, megapixels: float, cap: int) -> float:
         """Seconds for the training when as many Gaussians as the cap allows are to be exported."""
@@ -142,9 +163,8 @@ class Task:
 
     def takes(self, options: TrainConfig, megapixels: float) -> float:
         """Forecast of a training, its photos' decoding (once a size) included, seconds."""
-        decoding = self.prepare_s * (1 + options.coarse_levels)
-        initial = started(self.sparse, self.swept, options.max_gaussians)
-        return decoding + AGEING * forecast(self.speed, resolve_schedule(options, self.photos), initial, megapixels)
+        initial, footage = started(self.sparse, self.swept, options.max_gaussians), self.footage(megapixels)
+        return self.prepare_s + AGEING * forecast(self.speed, resolve_schedule(options, footage), initial, footage)
 
 
 @dataclass(frozen=True)
@@ -152,29 +172,29 @@ class Choice:
     """What meets the time.
 
     Attributes:
-        options: With its iterations, cap and halvings at the start.
-        megapixels: Most of a photo; None for the dataset's size.
+        options: With its iterations, cap, size of the photos and halvings at the start.
+        iterations: The same as a number.
         seconds: When the training ends, done or not.
         forecast_s: When the schedule should be done.
     """
 
     options: TrainConfig
-    megapixels: float | None
+    iterations: int
     seconds: float
     forecast_s: float
 
     @property
     def last_iteration(self) -> int:
         """The most iterations: beyond the schedule until the time is up, unless that is as long as is of use."""
-        scheduled = self.options.iterations
-        return scheduled if scheduled >= LONGEST else int(POLISH * scheduled)
+        return self.iterations if self.iterations >= LONGEST else int(POLISH * self.iterations)
 
 
 def choose(task: Task) -> Choice:
     """Divide the time between the size of the photos, iterations and Gaussians.
 
-    Photos grow to the dataset's size first, as long as ``wanted_iterations`` and room for the first growth fit; then
-    the cap grows; what is over goes into iterations, up to ``LONGEST``.
+    Photos grow to the dataset's size first, as long as ``wanted_iterations`` and room for the first growth fit: a size
+    whose parts would be seen too seldom loses to the one before. Then the cap grows; what is over goes into iterations,
+    up to ``LONGEST``. Only where nothing more was to be had may a flat loss end the training before its time.
     """
     most = task.config.max_gaussians
     first = min(most, max(FEWEST_GAUSSIANS, int(FIRST_GROWTH * task.sparse)))
@@ -192,12 +212,13 @@ def choose(task: Task) -> Choice:
         cap = _largest(least, first, lambda gaussians: _fits(task, size, gaussians, FEWEST))
     iterations = _largest(FEWEST, max(LONGEST, iterations), lambda count: _fits(task, size, cap, count))
     options = planned_options(task, size, cap, iterations)
-    reduced_to = None if size >= task.megapixels else size
-    return Choice(options, reduced_to, task.left(size, cap), task.takes(options, size))
+    if size < task.megapixels or cap < most:
+        options = options.model_copy(update={"stop_when_flat": 0.0})
+    return Choice(options, iterations, task.left(size, cap), task.takes(options, size))
 
 
 def sizes(megapixels: float) -> list[float]:
-    """Sizes of photos to choose from, smallest first; the last one is the dataset's."""
+    """Sizes of photos to choose from, smallest first; the last one is the largest that there may be."""
     ladder = []
     size = SMALLEST_MEGAPIXELS
     while size < FULL_SHARE * megapixels:
@@ -207,16 +228,19 @@ def sizes(megapixels: float) -> list[float]:
 
 
 def wanted_iterations(task: Task, megapixels: float) -> int:
-    """Iterations that are worth more than larger photos or more Gaussians."""
-    return max(VISITS * task.photos, worthwhile_iterations(task.seconds(megapixels)))
+    """Iterations that are worth more than larger photos or more Gaussians: every part is seen often enough."""
+    least = worthwhile_iterations(task.seconds(megapixels))
+    return sum(count for _level, count in lengths(task.footage(megapixels), least))
 
 
 def planned_options(task: Task, megapixels: float, cap: int, iterations: int) -> TrainConfig:
     """The options of a planned training."""
-    config = task.config
-    halvings = int(max(0.0, math.log(megapixels / COARSEST_MEGAPIXELS, 4)))
+    config, first = task.config, megapixels / 4.0 ** task.footage(megapixels).first_level
+    halvings = int(max(0.0, math.log(first / COARSEST_MEGAPIXELS, 4)))
     planned = {
         "iterations": iterations,
+        "least_iterations": worthwhile_iterations(task.seconds(megapixels)),
+        "max_megapixels": config.max_megapixels if megapixels >= task.megapixels else megapixels,
         "max_gaussians": cap,
         "coarse_levels": max(config.coarse_levels, min(2, halvings)),
     }

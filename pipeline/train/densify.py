@@ -45,6 +45,7 @@ class DensitySchedule:
         every: Iterations between its steps.
         gradient: Score above which Gaussians are densified.
         reset_every: Iterations between opacity resets; 0 for none.
+        reset_until: None after this iteration: windows of finer sizes come back too seldom; 0 for no such limit.
         prune_screen_px: Radius on screen above which Gaussians are removed; 0 for never.
         prune_free_space: Gaussians before the surface for so many photos are removed; 0 for never.
         prune_opacity: Opacity below which Gaussians are removed.
@@ -59,6 +60,7 @@ class DensitySchedule:
     every: int
     gradient: float
     reset_every: int = 0
+    reset_until: int = 0
     prune_screen_px: float = 0.0
     prune_free_space: int = 0
     prune_opacity: float = PRUNE_OPACITY
@@ -70,7 +72,8 @@ class DensitySchedule:
 
     def is_reset(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration: never in the last step of density control or later."""
-        return self.on and self.reset_every > 0 and iteration % self.reset_every == 0 and iteration < self.last
+        is_one = self.on and self.reset_every > 0 and iteration % self.reset_every == 0
+        return is_one and iteration < min(self.last, self.reset_until or self.last)
 
 
 @dataclass(frozen=True)

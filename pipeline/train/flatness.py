@@ -23,14 +23,13 @@ STANDARD_ERRORS = 2.0  # the line is taken so much steeper: noise does not end a
 
 
 def settled_from(schedule: Schedule) -> int:
-    """Iteration after which only the rates change: all Gaussians, all degrees and the photos' full size are there.
+    """Iteration after which only the rates change: all Gaussians, all degrees and the photos' finest size are there.
 
     Args:
         schedule: The training's.
     """
     density = schedule.density.last if schedule.density.on else 0
-    coarse = schedule.coarse_until if schedule.coarse_levels else 0
-    return max(density, coarse, schedule.sh_degree * schedule.sh_every)
+    return max(density, schedule.finest_from, schedule.sh_degree * schedule.sh_every)
 
 
 def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
@@ -62,7 +61,7 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> 
         plan: The training's.
         iteration: Now, the last one of an epoch.
     """
-    scheduled = plan.options.iterations
+    scheduled = plan.schedule.iterations
     recent = [epoch for epoch in epochs if epoch[0] > (1.0 - WINDOW_SHARE) * iteration]
     recent = list(epochs[-max(FEWEST_EPOCHS, len(recent)) :])
     if len(recent) < FEWEST_EPOCHS or iteration + tail_of(iteration) >= scheduled:

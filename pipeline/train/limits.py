@@ -29,10 +29,13 @@ SHAPE_NUMBERS = 11  # of a Gaussian besides its colour: position, scales, rotati
 STATE_COPIES = 4  # a parameter has a gradient and two moments
 STATISTICS_BYTES = 12
 PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
-PIXEL_BYTES = 300  # of the largest photo: decoded thrice ahead, rendered, compared, each with its gradient
+PIXEL_BYTES = 300  # of what an iteration looks at: read thrice ahead, rendered, compared, each with its gradient
 DEVICE_COPIES = 3  # a parameter has two moments there
 DEVICE_PASSING_BYTES = 320  # the larger of what a frame and density control take
 FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
+
+SMALLEST_WINDOW = 60_000  # pixels: below it margins, 5 pixels a side, and the Gaussians' own cost are what is paid for
+WINDOW_SHARE = 0.25  # of the memory for pixels and Gaussians, that a window takes at most
 
 FIRST_ITERATIONS = 1500  # a training of FIRST_SECONDS shall have as many: below it the colours have not settled
 FIRST_SECONDS = 30.0
@@ -54,6 +57,19 @@ def bytes_per_gaussian(sh_degree: int) -> int:
 def device_bytes_per_gaussian(sh_degree: int) -> int:
     """The same on a CUDA device."""
     return DEVICE_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + STATISTICS_BYTES + DEVICE_PASSING_BYTES
+
+
+def window_within(room_bytes: int, window_pixels: int) -> int:
+    """Pixels of the windows that a training with so much memory for pixels and Gaussians looks through.
+
+    Smaller ones show as much in more iterations; Gaussians that have no room are never there.
+
+    Args:
+        room_bytes: For them.
+        window_pixels: Of a window where memory is no matter; 0: photos are looked at whole, whatever the room.
+    """
+    within = int(WINDOW_SHARE * max(0, room_bytes) / PIXEL_BYTES)
+    return min(window_pixels, max(SMALLEST_WINDOW, within))
 
 
 def worthwhile_iterations(seconds: float) -> int:

@@ -23,6 +23,7 @@ from splatpipe.pipeline.train.exposure import Exposure, exposures_json
 from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
 from splatpipe.pipeline.train.iteration import curve_facts, iterate
+from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
 from splatpipe.pipeline.train.planning import Scene, under_budgets
@@ -56,7 +57,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     split = load_split(inputs["split.views"])
     kept = set(split.train)
     trained_on = [view for view in views if view.camera.name in kept]
-    free = make_plan(config, views, split, len(start.gaussians))
+    free = make_plan(config, views, split, len(start.gaussians), WINDOW_PIXELS[device.name])
     scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine, device)
 
     def step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
@@ -71,7 +72,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
         plan = load_or_write_plan(out / "plan.json", make)
         write_durably(out / "rendering.json", plan.rendering().to_json())
-        if budgeted(plan):
+        if budgeted(plan) or plan.options.iterations == "auto":
             report.note(plan.described())
 
         def techniques() -> Techniques:
@@ -92,7 +93,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
             optimise(Training(state, plan, device, out / CHECKPOINT, clock), photos, report)
         if (flat_at := state.history.flat_at) > 0:
             report.note(
-                f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.options.iterations:,}"
+                f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.schedule.iterations:,}"
             )
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
@@ -112,7 +113,7 @@ def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
     """What the stage says of a training that is done."""
     found: dict[str, JSON] = {
         "iterations": state.iteration,
-        "planned_iterations": plan.options.iterations,
+        "planned_iterations": plan.schedule.iterations,
         "loss": state.history.last_loss(),
         "train_seconds": round(state.seconds, 1),
         "train_megapixels": plan.train_megapixels,
@@ -272,16 +273,16 @@ def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporte
     """Close the history of a training whose time is up, and say where that cut the schedule."""
     state.history.end_iteration(state.iteration, True, curve_facts(state, plan, photo))
     tell(state, plan, report)
-    if state.iteration < plan.options.iterations:
+    if state.iteration < plan.schedule.iterations:
         report.note(
-            f"its time is up after {state.iteration:,} of {plan.options.iterations:,} planned iterations; "
+            f"its time is up after {state.iteration:,} of {plan.schedule.iterations:,} planned iterations; "
             "the model is taken as it stands"
         )
 
 
 def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
     """Report how far the training is."""
-    planned = min(plan.options.iterations, ends_at(plan, state.history.flat_at))
+    planned = min(plan.schedule.iterations, ends_at(plan, state.history.flat_at))
     report.progress(state.iteration, max(state.iteration, planned), "training", "iterations")
     if (loss := state.history.recent_loss()) is not None:
         report.metric("loss", loss, state.iteration)

@@ -16,6 +16,7 @@ from splatpipe.pipeline.train.limits import (
     PIXEL_BYTES,
     bytes_per_gaussian,
     device_bytes_per_gaussian,
+    window_within,
 )
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
@@ -24,12 +25,11 @@ RESIDENT_STEP = 16_000_000  # what the process has is rounded up to it: a few pa
 GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
 
 
-def within_memory(plan: Plan, largest_pixels: int, sparse: int, report: Reporter, on_cuda: bool = False) -> Plan:
-    """The plan with a cap on Gaussians that keeps the process, or a device's tensors, within ``max_memory_bytes``.
+def within_memory(plan: Plan, sparse: int, report: Reporter, on_cuda: bool = False) -> Plan:
+    """The plan with windows and a cap on Gaussians that keep the process, or a device's tensors, within its limit.
 
     Args:
-        plan: Without it.
-        largest_pixels: Of a training photo.
+        plan: Without it; ``max_memory_bytes`` of its options is the limit.
         sparse: Gaussians of sparse points at the start; the sweep's go before they do, and nobody misses those.
         report: Is told where those of sparse points have to be thinned.
         on_cuda: The training's tensors are a CUDA device's.
@@ -42,14 +42,16 @@ def within_memory(plan: Plan, largest_pixels: int, sparse: int, report: Reporter
     of_one = bytes_per_gaussian(plan.options.sh_degree)
     if on_cuda:
         taken, of_one = 0, device_bytes_per_gaussian(plan.options.sh_degree)
-    room = limit - taken - FIXED_BYTES - PIXEL_BYTES * largest_pixels
-    most = room // of_one
+    room = limit - taken - FIXED_BYTES
+    plan = plan.within_windows(window_within(room, plan.window_pixels))
+    pixels = max(plan.footage.largest(stretch.look) for stretch in plan.schedule.stretches)
+    most = (room - PIXEL_BYTES * pixels) // of_one
     if most < min(FEWEST_GAUSSIANS, sparse):
-        least = limit - room + FEWEST_GAUSSIANS * of_one
+        least = limit - room + PIXEL_BYTES * pixels + FEWEST_GAUSSIANS * of_one
         raise MachineError(
             f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB of them already, "
-            f"and photos of {largest_pixels / 1e6:.1f} megapixels need room, too.",
-            hint=f"Give --max-memory at least {least / 1e6 + 1:.0f}M, or lower undistort.max_megapixels.",
+            f"and {pixels / 1e6:.2f} megapixels of a photo need room, too.",
+            hint=f"Give --max-memory at least {least / 1e6 + 1:.0f}M.",
         )
     if most < sparse:
         report.warning(

@@ -37,13 +37,18 @@ GONE = {
 
 
 class TrainConfig(StageConfig):
-    """3D Gaussian splatting; lengths and learning rates follow from `iterations` (see `schedule` in plan.json).
+    """3D Gaussian splatting; lengths and learning rates follow from the iterations (see `schedule` in plan.json).
 
     At 30,000 iterations and more the lengths are the published ones, a shorter run's are shorter.
     """
 
-    iterations: PositiveInt = 30_000
-    """Optimisation steps, one photo each; a time budget plans its own."""
+    iterations: Literal["auto"] | PositiveInt = "auto"
+    """Optimisation steps, one photo or a window of it each. Auto: as many as show every part of every photo often
+    enough at each size, at least `least_iterations`. A time budget plans its own."""
+    least_iterations: PositiveInt = 30_000
+    """Fewest that `iterations=auto` takes, however few the photos."""
+    max_megapixels: Annotated[float, Field(ge=0.0, le=200.0)] = 0.0
+    """Photos are trained on at this size at most, from smaller to larger; 0: at the dataset's."""
     time_budget_s: Annotated[float, Field(ge=0.0, le=LONGEST_BUDGET_S)] = 0.0
     """Seconds for the whole command: resolution, cap and iterations are planned to fill what is left. 0: none."""
     max_memory_bytes: Annotated[int, Field(ge=0, le=LARGEST_MEMORY)] = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,13 +15,15 @@ import numpy as np
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.camera import Camera, reduced_size
 from splatpipe.pipeline.photos.dataset import Split, View
 from splatpipe.pipeline.render.rendering import Rendering
+from splatpipe.pipeline.train.lengths import WINDOW_PIXELS, Footage, Stretch
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 
-PLAN_FORMAT = 3
+PLAN_FORMAT = 4
 EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
 NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones see nothing that near
 
@@ -36,13 +39,15 @@ class Plan:
         near: Near plane, world units.
         train_views: Names of the photos trained on, sorted.
         test_views: Names of those held out, sorted.
-        train_megapixels: Mean size of the training photos, as they are trained on.
+        train_megapixels: Mean size of the training photos, as they are trained on in the end.
         initial_gaussians: Gaussians at the start.
         megapixels: Photos are reduced to at most so many; None where they keep the dataset's size.
-        last_iteration: The training ends here at the latest. Iterations after ``options.iterations``, if any, fill a
-            time budget: they are computed with the schedule's last rates.
+        last_iteration: The training ends here at the latest. Iterations after the schedule's, if any, fill a time
+            budget: they are computed with its last rates.
         train_seconds: The training ends after so many, done or not; 0 for when it is done.
         forecast_seconds: When it should be done; 0 where nothing was measured.
+        sizes: Width and height of the dataset's training photos, and how many have them; none where they do not matter.
+        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
     """
 
     options: TrainConfig
@@ -57,6 +62,8 @@ class Plan:
     megapixels: float | None = None
     train_seconds: float = 0.0
     forecast_seconds: float = 0.0
+    sizes: tuple[tuple[int, int, int], ...] = ()
+    window_pixels: int = 0
 
     def to_json(self) -> str:
         """The plan as canonical JSON."""
@@ -72,24 +79,53 @@ class Plan:
         """Options and schedule as one flat table, for people."""
         schedule = asdict(self.schedule)
         parts = {f"{part}_{name}": value for part in ("rates", "density") for name, value in schedule.pop(part).items()}
-        found = schedule | parts | self.options.model_dump(mode="json")
-        return found | {"initial_gaussians": self.initial_gaussians}
+        found = parts | self.options.model_dump(mode="json") | schedule
+        looks = [f"{size} until {stretch.until:,}" for size, stretch in zip(*self._told_sizes(), strict=True)]
+        return found | {"initial_gaussians": self.initial_gaussians, "stretches": "; ".join(looks)}
 
     def digest(self) -> str:
         """sha256 of ``to_json``: names the plan in its checkpoints."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
     def of(self, options: TrainConfig) -> Plan:
-        """The same training with other options, and the schedule that follows from them."""
-        return replace(self, options=options, schedule=resolve_schedule(options, len(self.train_views)))
+        """The same training with other options, and what follows from them."""
+        sizes = self.sizes or ((1, 1, len(self.train_views)),)
+        limit = options.max_megapixels or None
+        largest = max(width * height for width, height, _count in sizes)
+        limit = None if limit is None or largest <= 1e6 * limit else limit
+        footage = footage_of(sizes, limit, self.window_pixels)
+        schedule = resolve_schedule(options, footage)
+        return replace(
+            self,
+            options=options,
+            schedule=schedule,
+            last_iteration=schedule.iterations,
+            megapixels=limit,
+            train_megapixels=round(1e-6 * footage.pixels(Look(schedule.finest.level)), 4),
+        )
+
+    def within_windows(self, pixels: int) -> Plan:
+        """The same training with windows of at most so many pixels."""
+        return replace(self, window_pixels=pixels).of(self.options)
+
+    @property
+    def footage(self) -> Footage:
+        """The photos as they are trained on."""
+        return footage_of(self.sizes or ((1, 1, len(self.train_views)),), self.megapixels, self.window_pixels)
+
+    def _told_sizes(self) -> tuple[list[str], tuple[Stretch, ...]]:
+        stretches, footage = self.schedule.stretches, self.footage
+        whole = [1e-6 * footage.pixels(Look(stretch.level)) for stretch in stretches]
+        windows = [" in windows" if stretch.window_pixels else "" for stretch in stretches]
+        return [f"{size:.2f} MP{window}" for size, window in zip(whole, windows, strict=True)], stretches
 
     def described(self) -> str:
         """The plan in a line for people."""
         options = self.options
         parts = [
-            f"{self.train_megapixels:.2f} MP",
+            self._told_size(),
             f"up to {options.max_gaussians:,} Gaussians",
-            f"{options.iterations:,} iterations",
+            f"{self.schedule.iterations:,} iterations",
         ]
         if options.time_budget_s:
             takes = min(self.forecast_seconds, self.train_seconds)
@@ -97,6 +133,17 @@ class Plan:
         if options.max_memory_bytes:
             parts.append(f"within {options.max_memory_bytes / 1e9:.1f} GB")
         return "plan: " + ", ".join(parts)
+
+    def _told_size(self) -> str:
+        """Of the photos, from the first size to the last, and of the windows on it."""
+        footage, finest = self.footage, self.schedule.finest
+        first = 1e-6 * footage.pixels(Look(self.schedule.stretches[0].level))
+        told = f"{self.train_megapixels:.2f} MP"
+        if len(self.schedule.stretches) > 1:
+            told = f"{first:.2f} to {told}"
+        if finest.window_pixels:
+            told += f" in windows of {1e-6 * footage.pixels(finest):.2f} MP"
+        return told
 
     @staticmethod
     def from_json(text: str) -> Plan:
@@ -111,6 +158,7 @@ class Plan:
         try:
             fields["options"] = TrainConfig.model_validate(fields["options"])
             fields["schedule"] = Schedule.from_json(fields["schedule"])
+            fields["sizes"] = tuple(tuple(size) for size in fields["sizes"])
             fields["train_views"] = tuple(fields["train_views"])
             fields["test_views"] = tuple(fields["test_views"])
             return Plan(**fields)
@@ -135,13 +183,23 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     return EXTENT_MARGIN * radius
 
 
-def mean_megapixels(cameras: Sequence[Camera], most: float | None = None) -> float:
-    """Mean size of photos when each is reduced to at most ``most`` megapixels."""
-    pixels = [camera.width * camera.height / 1e6 for camera in cameras]
-    return round(sum(min(size, most or size) for size in pixels) / len(pixels), 4)
+def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window_pixels: int) -> Footage:
+    """Photos as they are trained on.
+
+    Args:
+        sizes: Width and height in the dataset, and how many photos have it.
+        most: They are reduced to so many megapixels; None: they are as the dataset has them.
+        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
+    """
+    if most is None:
+        return Footage(tuple(sizes), window_pixels)
+    reduced = tuple((*reduced_size(width, height, most), count) for width, height, count in sizes)
+    return Footage(reduced, window_pixels)
 
 
-def make_plan(config: TrainConfig, views: Sequence[View], split: Split, gaussians: int) -> Plan:
+def make_plan(
+    config: TrainConfig, views: Sequence[View], split: Split, gaussians: int, window_pixels: int = WINDOW_PIXELS["cpu"]
+) -> Plan:
     """Resolve a training's plan.
 
     Args:
@@ -149,6 +207,7 @@ def make_plan(config: TrainConfig, views: Sequence[View], split: Split, gaussian
         views: All photos of the dataset.
         split: Which of them are trained on.
         gaussians: Gaussians at the start.
+        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
 
     Raises:
         SplatpipeError: if all cameras stand in one place.
@@ -161,17 +220,21 @@ def make_plan(config: TrainConfig, views: Sequence[View], split: Split, gaussian
             f"All {len(cameras)} cameras stand in one place, so the scene has no size.",
             hint="Take the photos from different places, and hold out fewer of them.",
         )
-    return Plan(
+    counted = Counter((camera.width, camera.height) for camera in cameras)
+    plan = Plan(
         options=config,
-        schedule=resolve_schedule(config, len(split.train)),
+        schedule=resolve_schedule(config),
         extent=extent,
         near=NEAR_PER_EXTENT * extent,
         train_views=split.train,
         test_views=split.held_out,
-        train_megapixels=mean_megapixels(cameras),
+        train_megapixels=0.0,
         initial_gaussians=gaussians,
-        last_iteration=config.iterations,
+        last_iteration=0,
+        sizes=tuple((*size, counted[size]) for size in sorted(counted)),
+        window_pixels=window_pixels,
     )
+    return plan.of(config)
 
 
 def load_or_write_plan(path: Path, make: Callable[[], Plan]) -> Plan:

@@ -17,7 +17,7 @@ from splatpipe.pipeline.train.limits import FIRST_ITERATIONS, device_bytes_per_g
 from splatpipe.pipeline.train.measure import Effort, Measured, Step, Subject, measure
 from splatpipe.pipeline.train.memory import within_memory
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan import Plan, mean_megapixels
+from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.shortage import HINT
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.start import Start, started
@@ -69,8 +69,7 @@ def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Pla
         MachineError: if the memory is too small for any training.
     """
     if plan.options.max_memory_bytes:
-        largest = max(view.camera.width * view.camera.height for view in scene.trained_on)
-        plan = within_memory(plan, largest, scene.start.sparse, report, scene.device.name == "cuda")
+        plan = within_memory(plan, scene.start.sparse, report, scene.device.name == "cuda")
     if plan.options.time_budget_s:
         plan = within_time(plan, scene, step, report)
     start = scene.start
@@ -104,12 +103,9 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
             f"The stages before training took {before:.0f} s of the {budget:.0f} s, so there is time for a look only.",
             hint="Run again with the same or a longer --time-budget: what is done is reused.",
         )
-    cameras = [view.camera for view in scene.trained_on]
     return replace(
         plan.of(choice.options),
         last_iteration=choice.last_iteration,
-        megapixels=choice.megapixels,
-        train_megapixels=mean_megapixels(cameras, choice.megapixels),
         train_seconds=max(0.01, round(choice.seconds, 2)),
         forecast_seconds=round(choice.forecast_s, 2),
     )
@@ -132,7 +128,6 @@ def pilot(plan: Plan, scene: Scene) -> Plan:
 
 
 def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
-    cameras = [view.camera for view in scene.trained_on]
     options = scene.config.model_copy(update={"max_gaussians": plan.options.max_gaussians})
     least = LEAST_SHARE * options.time_budget_s
 
@@ -146,9 +141,9 @@ def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
         config=options,
         sparse=scene.start.sparse,
         swept=scene.start.swept,
-        photos=len(cameras),
-        megapixels=mean_megapixels(cameras),
+        sizes=plan.sizes,
+        window_pixels=plan.window_pixels,
         speed=measured.speed,
-        prepare_s=measured.decode_s * len(cameras),
+        prepare_s=measured.decode_s * len(scene.trained_on),
         seconds=seconds,
     )

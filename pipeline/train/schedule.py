@@ -8,6 +8,7 @@ from typing import Any
 
 from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
 from splatpipe.pipeline.train.draws import BACKGROUND, uniform
+from splatpipe.pipeline.train.lengths import Footage, Length, Stretch, growth_until, lengths_of, stretches
 from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
@@ -16,11 +17,14 @@ FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on sin
 FEW_DROPOUT = 0.2
 SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings; the published method has it
 RESET_EVERY = 3000  # iterations, published: what is reset needs them to come back
-UNTIL = 0.5  # of the run there is density control: published
 GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified
 PUBLISHED_GRADIENT = 2e-4  # the same of the signed sum
 BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the forecast, but not into noise
+RESET_VISITS = 15  # of every photo between two resets at least: the same, on the captures of that method
 TAIL_SHARE = 0.1  # of the iterations done when the loss is flat: what the rest of the schedule is compressed into
+
+UNKNOWN = Footage(((1, 1, MANY_PHOTOS),))
+"""Photos that fit into a window and are neither few nor many."""
 
 RGB = tuple[float, float, float]
 BACKGROUNDS: dict[str, RGB | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
@@ -64,8 +68,7 @@ class Schedule:
         seed: Of everything random.
         sh_degree: Degree of the spherical harmonics at the end.
         sh_every: Iterations until one degree more is trained.
-        coarse_levels: How often photos are halved at the start.
-        coarse_until: Iteration from which they have their full size.
+        stretches: What iterations look at of their photos, in order; what comes after the last one is as it.
         dropout: Share of the Gaussians left out at the end.
         background: What is behind the Gaussians, red, green, blue; None for another colour each iteration.
         rates: Learning rates.
@@ -76,8 +79,7 @@ class Schedule:
     seed: int
     sh_degree: int
     sh_every: int
-    coarse_levels: int
-    coarse_until: int
+    stretches: tuple[Stretch, ...]
     dropout: float
     background: RGB | None
     rates: Rates
@@ -91,6 +93,7 @@ class Schedule:
             KeyError, TypeError: if they are no schedule's.
         """
         parts = {"rates": Rates(**fields["rates"]), "density": DensitySchedule(**fields["density"])}
+        parts |= {"stretches": tuple(Stretch(**each) for each in fields["stretches"])}
         behind = fields["background"]
         return Schedule(**{**fields, **parts, "background": None if behind is None else tuple(behind)})
 
@@ -124,19 +127,23 @@ class Schedule:
         """The degree trained at an iteration (from 1): one more every ``sh_every``."""
         return min(self.sh_degree, iteration // self.sh_every)
 
-    def coarse_level_at(self, iteration: int) -> int:
-        """How often an iteration's photo (from 1) is halved: equal shares of ``coarse_until``, coarsest first."""
-        if iteration > self.coarse_until:
-            return 0
-        return self.coarse_levels - (iteration - 1) * self.coarse_levels // self.coarse_until
-
     def look_at(self, iteration: int) -> Look:
         """What an iteration (from 1) looks at of its photo."""
-        return Look(self.coarse_level_at(iteration))
+        return next((each for each in self.stretches if iteration <= each.until), self.stretches[-1]).look
 
     def looks_to(self, last: int) -> list[Look]:
         """``look_at`` for every iteration up to the last."""
         return [self.look_at(iteration) for iteration in range(1, last + 1)]
+
+    @property
+    def finest(self) -> Look:
+        """What iterations look at in the end."""
+        return self.stretches[-1].look
+
+    @property
+    def finest_from(self) -> int:
+        """The last iteration before those of the finest size."""
+        return self.stretches[-2].until if len(self.stretches) > 1 else 0
 
 
 def tail_of(flat_at: int) -> int:
@@ -155,40 +162,69 @@ def share_of_few(photos: int) -> float:
     return min(1.0, max(0.0, (MANY_PHOTOS - photos) / (MANY_PHOTOS - FEW_PHOTOS)))
 
 
-def resolve_schedule(config: TrainConfig, photos: int = MANY_PHOTOS) -> Schedule:
-    """The published schedule, changed for short runs and few photos.
+def resolve_schedule(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedule:
+    """The published schedule, changed for short runs, few photos and many.
 
     Args:
         config: The options.
-        photos: That are trained on.
+        footage: The photos that are trained on.
     """
-    run = config.iterations
+    each, pace = lengths_of(config, footage), Pace.of(config, footage)
+    few = FEW_DROPOUT * share_of_few(footage.photos)
     return Schedule(
-        iterations=run,
+        iterations=sum(count for _level, count in each),
         seed=config.seed,
         sh_degree=config.sh_degree,
-        sh_every=max(1, min(1000, run // 5)),
-        coarse_levels=config.coarse_levels,
-        coarse_until=int(run * UNTIL),
-        dropout=round(FEW_DROPOUT * share_of_few(photos), 4) if config.dropout == "auto" else config.dropout,
+        sh_every=pace.lasting(1000, 5),
+        stretches=stretches(footage, each, config.coarse_levels),
+        dropout=round(few, 4) if config.dropout == "auto" else config.dropout,
         background=BACKGROUNDS[config.background],
-        rates=PUBLISHED if config.density == "published" else rates_of(run),
-        density=_density(config),
+        rates=PUBLISHED if config.density == "published" else rates_of(pace.iterations),
+        density=_density(config, each, pace),
     )
 
 
-def _density(config: TrainConfig) -> DensitySchedule:
-    run, published = config.iterations, config.density == "published"
+@dataclass(frozen=True)
+class Pace:
+    """How fast a model is made.
+
+    A site of more photos takes more iterations, but a Gaussian is seen no more often: what is made in so many steps
+    keeps its pace, only that all photos have their turn first.
+
+    Attributes:
+        iterations: That the learning rates are for.
+        photos: That have their turn in every phase at least.
+    """
+
+    iterations: int
+    photos: int
+
+    @staticmethod
+    def of(config: TrainConfig, footage: Footage) -> Pace:
+        """That of a training; one whose length was given keeps the published lengths, whatever the photos."""
+        if config.iterations == "auto":
+            return Pace(config.least_iterations, footage.photos)
+        return Pace(config.iterations, 1)
+
+    def lasting(self, published: int, shares: int) -> int:
+        """How long a phase is: as published, in a short run one of so many shares."""
+        return max(1, min(published, self.iterations // shares), self.photos)
+
+
+def _density(config: TrainConfig, each: list[Length], pace: Pace) -> DensitySchedule:
+    published = config.density == "published"
     gradient = PUBLISHED_GRADIENT if published else GRADIENT
+    resets = published or pace.iterations >= SHORT_RUN
     return DensitySchedule(
         on=config.densify,
         seed=config.seed,
         cap=config.max_gaussians,
-        first=max(1, min(500, run // 5)),
-        last=max(1, int(run * UNTIL)),
-        every=max(1, min(100, run // 10)),
+        first=pace.lasting(500, 5),
+        last=max(1, growth_until(each)),
+        every=pace.lasting(100, 10),
         gradient=gradient * (BUDGET_SHARE if config.time_budget_s else 1.0),
-        reset_every=RESET_EVERY if published or run >= SHORT_RUN else 0,
+        reset_every=max(RESET_EVERY, RESET_VISITS * pace.photos) if resets else 0,
+        reset_until=each[0][1] if len(each) > 1 else 0,
         prune_screen_px=PRUNE_SCREEN_PX if published else 0.0,
         prune_free_space=config.prune_free_space,
     )

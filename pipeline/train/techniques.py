@@ -71,7 +71,7 @@ def make_techniques(
         robust.watch(view.camera for view in views)
         made.append(robust)
     if options.distortion_weight:
-        made.append(Distortion(options.distortion_weight, options.iterations))
+        made.append(Distortion(options.distortion_weight, schedule.iterations))
     if options.prune_free_space and dataset is not None:
         made.append(Clearing(free_space_of(views, dataset), schedule))
     if area is not None:

@@ -17,8 +17,9 @@ from splatpipe.pipeline.photos.dataset import Split, View, load_views, split_vie
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import C0, rgb_to_dc
+from splatpipe.pipeline.train.lengths import Footage
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
+from splatpipe.pipeline.train.schedule import UNKNOWN, Schedule, resolve_schedule
 
 WIDTH, HEIGHT, FOCAL = 72, 54, 70.0
 CAMERAS = 9
@@ -44,8 +45,8 @@ def plain(**options: object) -> TrainConfig:
 def resolver(**density: object) -> Callable[[TrainConfig, int], Schedule]:
     """``resolve_schedule`` with other lengths and limits of density control, to be put into its place."""
 
-    def resolved(config: TrainConfig, photos: int) -> Schedule:
-        schedule = resolve_schedule(config, photos)
+    def resolved(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedule:
+        schedule = resolve_schedule(config, footage)
         return replace(schedule, density=replace(schedule.density, **density))  # type: ignore[arg-type]
 
     return resolved

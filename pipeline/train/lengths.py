@@ -1,0 +1,220 @@
+"""How long a training is: so many visits of every part of every photo, at every size. Plain arithmetic, light.
+
+A training begins with whole photos, halved until they fit into a window, and then goes through the finer sizes window
+by window. The visits follow from the photos, so a capture of 11 and one of 500 photos are seen as well; what one
+iteration costs follows from the window. That coarse sizes come first, and long, is what others found, too: begun at
+full size, growth ends in blur (nerfstudio #2984, gaussian-splatting #958, #1146).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.train.options import TrainConfig
+
+# No capture was compared by these yet: judgement, the reasons theirs.
+WHOLE_VISITS = 20  # of a photo at the size at which it is seen whole, at least
+PART_VISITS = 8  # of every part of every photo at each finer size, at least
+FINEST_SHARE = (
+    0.5  # of the least iterations are at the finest size: where photos are few, its parts are seen more often
+)
+FEWEST_VISITS = 3.0  # of a part, below which a run that was given its length stays with the size before: it learns more
+COARSE_SHARE = 0.5  # of the iterations at the first size are with photos that `coarse_levels` halves further
+
+UNTIL = 0.5  # of a run there is density control: published; of the finest size's iterations, where there are several
+
+WINDOW_PIXELS = {"cpu": 0, "cuda": 0}
+"""Of a photo that an iteration renders, by device. On a CPU an iteration's cost is that of its pixels, so small windows
+cost nothing but their margins; a CUDA device is busy only with larger ones."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Iterations that look at their photos in one way.
+
+    Attributes:
+        level: How often photos are halved.
+        window_pixels: Of a photo, that count in an iteration at most; 0 for all of it.
+        until: The last of the iterations.
+    """
+
+    level: int
+    window_pixels: int
+    until: int
+
+    @property
+    def look(self) -> Look:
+        """The same for one iteration."""
+        return Look(self.level, self.window_pixels)
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Photos as they are trained on.
+
+    Attributes:
+        sizes: Width and height at the finest size, pixels, and how many photos have it.
+        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
+    """
+
+    sizes: tuple[tuple[int, int, int], ...]
+    window_pixels: int = 0
+
+    @property
+    def photos(self) -> int:
+        """How many."""
+        return sum(count for _width, _height, count in self.sizes)
+
+    @property
+    def first_level(self) -> int:
+        """How often photos are halved until half of them fit into a window whole."""
+        areas = sorted((width * height, count) for width, height, count in self.sizes)
+        seen, middle, level = 0, 0, 0
+        for area, count in areas:
+            seen += count
+            if 2 * seen >= self.photos:
+                middle = area
+                break
+        while self.window_pixels and middle / 4**level > self.window_pixels:
+            level += 1
+        return level
+
+    def parts(self, level: int) -> int:
+        """Windows of all photos, halved so often."""
+        return sum(count * math.prod(self._grid(size, level)) for *size, count in self.sizes)
+
+    def window_at(self, level: int) -> int:
+        """Most pixels of a window, at a level; 0 where all photos fit in whole."""
+        return 0 if self.parts(level) == self.photos else self.window_pixels
+
+    def pixels(self, look: Look) -> float:
+        """Of a photo that an iteration looks at, on average."""
+        whole = sum(width * height * count for width, height, count in self.sizes) / 4.0**look.level
+        return whole / (self.parts(look.level) if look.window_pixels else self.photos)
+
+    def share(self, look: Look) -> float:
+        """Of a photo's pixels at that level, that an iteration looks at."""
+        return self.photos / self.parts(look.level) if look.window_pixels else 1.0
+
+    def largest(self, look: Look) -> int:
+        """Pixels of the largest window, without its margins."""
+        found = 0
+        for width, height, _count in self.sizes:
+            wide, tall = max(1, width >> look.level), max(1, height >> look.level)
+            rows, columns = window_grid(wide, tall, look.window_pixels)
+            found = max(found, -(-wide // columns) * -(-tall // rows))
+        return found
+
+    def _grid(self, size: Sequence[int], level: int) -> tuple[int, int]:
+        width, height = size
+        return window_grid(max(1, width >> level), max(1, height >> level), self.window_pixels)
+
+
+def window_grid(width: int, height: int, most_pixels: int) -> tuple[int, int]:
+    """Rows and columns of the fewest windows that a picture is cut into, of those the squarest ones.
+
+    Args:
+        width: Of the picture.
+        height: Of the picture.
+        most_pixels: Of a window, whose sides are rounded up; 0: the picture stays whole.
+    """
+    if most_pixels == 0 or width * height <= most_pixels:
+        return 1, 1
+    found, cells = (height, width), height * width
+    for rows in range(1, height + 1):
+        tall = -(-height // rows)
+        wide = most_pixels // tall
+        if wide == 0:
+            continue
+        columns = -(-width // min(wide, width))
+        grid = (rows, columns)
+        if (rows * columns, _oblong(width, height, grid)) < (cells, _oblong(width, height, found)):
+            found, cells = grid, rows * columns
+        if rows > cells:
+            break
+    return found
+
+
+def _oblong(width: int, height: int, grid: tuple[int, int]) -> float:
+    """How far a cell is from a square: the logarithm of its longer side over the shorter one."""
+    rows, columns = grid
+    return abs(math.log(width * rows / (height * columns)))
+
+
+Length = tuple[int, int]
+"""A level and its iterations."""
+
+
+def lengths(footage: Footage, least: int, finest: int = 0) -> list[Length]:
+    """Iterations at each level, the first one first.
+
+    Args:
+        footage: The photos.
+        least: Iterations in all, at least.
+        finest: The last level.
+    """
+    first = max(finest, footage.first_level)
+    if first == finest:
+        return [(first, max(least, WHOLE_VISITS * footage.parts(first)))]
+    finer = [(level, PART_VISITS * footage.parts(level)) for level in range(first - 1, finest, -1)]
+    last = max(PART_VISITS * footage.parts(finest), math.ceil(FINEST_SHARE * least))
+    whole = max(WHOLE_VISITS * footage.parts(first), least - last - sum(count for _level, count in finer))
+    return [(first, max(whole, math.ceil((1.0 - FINEST_SHARE) * least))), *finer, (finest, last)]
+
+
+def divided(footage: Footage, least: int, iterations: int) -> list[Length]:
+    """So many iterations, divided like those of ``lengths``; a size that comes too short is left out.
+
+    Args:
+        footage: The photos.
+        least: As for ``lengths``.
+        iterations: In all.
+    """
+    for finest in range(footage.first_level + 1):
+        wanted = lengths(footage, least, finest)
+        share = iterations / sum(count for _level, count in wanted)
+        if len(wanted) == 1 or share * wanted[-1][1] >= FEWEST_VISITS * footage.parts(finest):
+            break
+    ends, done = [], 0
+    for _level, count in wanted:
+        done += count
+        ends.append(round(share * done))
+    return [(level, end - start) for (level, _), start, end in zip(wanted, [0, *ends], ends, strict=False)]
+
+
+def lengths_of(config: TrainConfig, footage: Footage) -> list[Length]:
+    """Iterations at each size of the photos, those of the options or what they ask for, the first one first."""
+    if config.iterations == "auto":
+        return lengths(footage, config.least_iterations)
+    return divided(footage, config.least_iterations, config.iterations)
+
+
+def growth_until(each: Sequence[Length]) -> int:
+    """The last iteration of density control: every size adds the Gaussians that its detail asks for."""
+    *before, (_finest, count) = each
+    return sum(earlier for _level, earlier in before) + int(UNTIL * count)
+
+
+def stretches(footage: Footage, each: Sequence[Length], coarse_levels: int = 0) -> tuple[Stretch, ...]:
+    """The same as what iterations look at.
+
+    Args:
+        footage: The photos.
+        each: Levels and their iterations.
+        coarse_levels: Photos of the first are halved so many times more at the start, by equal shares.
+    """
+    (first, whole), *_ = each
+    found, coarse = [], int(COARSE_SHARE * whole)
+    for step in range(coarse_levels if coarse else 0):
+        until = -(-coarse * (step + 1) // coarse_levels)
+        level = first + coarse_levels - step
+        found.append(Stretch(level, footage.window_at(level), until))
+    done = 0
+    for level, count in each:
+        done += count
+        found.append(Stretch(level, footage.window_at(level), done))
+    starts = [0, *(stretch.until for stretch in found)]
+    return tuple(stretch for stretch, start in zip(found, starts, strict=False) if stretch.until > start)
