@@ -17,9 +17,10 @@ from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.needs import whole as whole
 from splatpipe.pipeline.engine.source import Source
 from splatpipe.pipeline.engine.stage import Summary
+from splatpipe.pipeline.train.limits import FIXED_BYTES, PIXEL_BYTES, SMALLEST_WINDOW, bytes_per_gaussian
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import LEAST_SHARE, MEGA, CaptureSize, Work
+from splatpipe.stages.work import FEWEST_GAUSSIANS, LEAST_SHARE, MEGA, CaptureSize, Work
 
 SPEED_NUMBERS = 20_000  # of a text without repeats, whose packing is timed
 SPEED_S = 0.008  # that the machine of the costs takes to pack it, undisturbed
@@ -55,6 +56,12 @@ def forecast(
     filled = work.filling(left, speed).needs(speed)
     whole_time = left / replace(filled["train"], cpu_seconds=1.0).seconds(threads)
     return {**filled, "train": replace(filled["train"], cpu_seconds=whole_time)}
+
+
+def least_memory_bytes(config: LineConfig, costs: Costs = REFERENCE) -> int:
+    """Least limit of memory that a training can keep to: its libraries, the smallest window, the fewest Gaussians."""
+    model = FEWEST_GAUSSIANS * bytes_per_gaussian(config.train.sh_degree)
+    return int(costs.stages["train"].resident) + FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + model
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ from splatpipe.pipeline.app.cli_runs import (
     overrides,
     request_of,
     stages_to_rerun,
+    tell_beforehand,
     with_boundary,
     with_budgets,
 )
@@ -112,7 +113,7 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Turn a folder of photos into a Gaussian splat; what is there and valid is reused."""
-    from splatpipe.pipeline.app.preflight.start import require_readable
+    from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
     from splatpipe.pipeline.engine.config import load_preset
 
     with Ending(out, as_json) as done:
@@ -123,6 +124,8 @@ def run(
         again = stages_to_rerun(rerun or [], rerun_from, until)
         request = request_of(photos, out, resolved, device, threads)
         require_readable(request)
+        require_memory(request)
+        tell_beforehand(request, until)
         with RunSession(request, wait) as runner:
             done.outcome = runner.outcome
             runner.walk(until=until, rerun=again)

@@ -94,6 +94,19 @@ def spent_s() -> float:
         return 0.0
 
 
+def tell_beforehand(request: Request, until: str | None) -> None:
+    """Say what the whole line will take, before its first training."""
+    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.ending import PART_VARIABLE
+    from splatpipe.pipeline.app.preflight.start import told_beforehand
+
+    trained = any((request.out / "stages").glob("train-*"))
+    if trained or until is not None or PART_VARIABLE in os.environ:
+        return
+    if told := told_beforehand(request):
+        say(told)
+
+
 def existing(out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0) -> Request:
     """What ran in OUT, to be run again, with what is to be otherwise."""
     from splatpipe.pipeline.engine.run_folder import open_run_folder

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from pathlib import PurePosixPath
+from pathlib import PurePath, PurePosixPath
 
 PHOTO_SUFFIXES = ("jpg", "jpeg", "jpe", "jfif", "mpo", "png", "tif", "tiff")
+
+
+def is_photo(path: PurePath) -> bool:
+    """Whether a file's name is a photo's."""
+    return path.suffix.casefold().lstrip(".") in PHOTO_SUFFIXES
 
 
 class NameFinder:

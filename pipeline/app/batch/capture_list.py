@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.config import Table, load_file, merge, parse_set
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.names import PHOTO_SUFFIXES
+from splatpipe.pipeline.photos.names import is_photo
 from splatpipe.pipeline.survey.survey_text import TableKind, delimiter_of, read_lines, written_lines
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
@@ -80,11 +80,6 @@ def read_captures(captures: Path, out: Path) -> tuple[Capture, ...]:
     _check_names(found, captures)
     _check_places(found, out.expanduser().resolve())
     return tuple(found)
-
-
-def is_photo(path: Path) -> bool:
-    """Whether a file's name is a photo's."""
-    return path.suffix.casefold().lstrip(".") in PHOTO_SUFFIXES
 
 
 def _of_folder(folder: Path, out: Path) -> list[Capture]:

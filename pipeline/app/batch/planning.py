@@ -5,17 +5,16 @@ from __future__ import annotations
 import importlib.metadata
 import re
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 
-from splatpipe.pipeline.app.batch.capture_list import Capture, is_photo
+from splatpipe.pipeline.app.batch.capture_list import Capture
 from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
 from splatpipe.pipeline.app.cli_runs import Overrides, request_of
-from splatpipe.pipeline.app.preflight.start import require_readable
+from splatpipe.pipeline.app.preflight.sizing import size_of
+from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
 from splatpipe.pipeline.app.report.story import read_story
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
 from splatpipe.pipeline.engine.durable import write_durably
@@ -28,10 +27,8 @@ from splatpipe.pipeline.engine.runner import Line, Standing, survey
 from splatpipe.pipeline.engine.session import Request, survey_line
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.store import Part, is_copy
-from splatpipe.stages.forecast import forecast, has_control, machine_speed
-from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
+from splatpipe.stages.forecast import forecast, machine_speed
 
-SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly alike
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
 CLUSTER_THREADS = 8  # of a job that another machine runs; a profile's set-threads says otherwise
 LONGEST_SLUG = 40
@@ -131,10 +128,7 @@ def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Se
     config = Overrides(tables).resolve(load_preset(planned.preset))
     request = request_of(capture.photos.absolute(), call.out / capture.name, config)
     source = open_source(request.photos, request.out, request.stages, config)
-    paths = [path for path in source.part_files["source.photos"].values() if is_photo(path)]
-    size = replace(
-        capture_size(paths, has_file=source.named.get("source.geo") is not None), control=has_control(source)
-    )
+    size = size_of(source)
     line = Line(request.stages, config, {name: Part(source.folder, "") for name in source.part_files}, source.folder)
     needed = [stage.name for stage in line.needed(settings.until or None)]
     planned = replace(planned, photos=str(request.photos), photo_count=size.photos)
@@ -156,6 +150,7 @@ def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCaptu
     """What the run would end with before its first stage is told without one: such an end leaves no trace in OUT."""
     try:
         require_readable(request)
+        require_memory(request)
     except SplatpipeError as error:
         return replace(planned, message=error.message, hint=error.hint)
     return planned
@@ -193,34 +188,6 @@ def _with_kept_failure(planned: PlannedCapture, first: Standing, out: Path) -> P
     if (culprit.name, culprit.key) != (first.stage.name, first.key):
         return planned
     return replace(planned, message=culprit.message, hint=f"{culprit.hint} {UNTRIED}".strip(), stage=culprit.name)
-
-
-def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
-    """What the forecast asks of a capture, from the headers of a few photos.
-
-    Args:
-        paths: Of all photos.
-        has_file: Whether a file has their positions.
-    """
-    from PIL import Image
-
-    from splatpipe.pipeline.photos.exif import read_exif
-
-    sizes, placed = [], 0
-    step = max(1, len(paths) // SAMPLED)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of odd tags; what is wrong with a photo is told by the run
-        for path in sorted(paths)[::step][:SAMPLED]:
-            try:
-                with Image.open(path) as picture:
-                    sizes.append(picture.size)
-                    placed += read_exif(picture).gps is not None
-            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-                continue
-    megapixels = median(width * height for width, height in sizes) / 1e6 if sizes else 0.0
-    shapes = [min(size) / max(size) for size in sizes]
-    positions = has_file or 2 * placed > len(sizes)
-    return CaptureSize(len(paths), megapixels, positions, median(shapes) if shapes else USUAL_SHAPE)
 
 
 def _threads(outlooks: Sequence[_Outlook], *, local: bool) -> int:

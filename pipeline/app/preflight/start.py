@@ -1,12 +1,13 @@
-"""The cheap part of the preflight, with which every run begins: files that would end it only hours later."""
+"""The cheap part of the preflight, with which every run begins: what would end it only hours later, what it takes."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.session import Request
+    from splatpipe.stages.options import LineConfig
 
 
 def require_readable(request: Request) -> None:
@@ -27,6 +28,61 @@ def require_readable(request: Request) -> None:
         path = source.part_path(part) if part in source.named else None
         if path is not None and path.is_file():
             read(path)
+
+
+def require_memory(request: Request) -> None:
+    """Refuse a limit of memory within which no training goes; a CUDA device's is known only when it is asked.
+
+    Raises:
+        MachineError: if the training's own libraries and the least model are more.
+    """
+    from splatpipe.pipeline.engine.errors import MachineError
+    from splatpipe.stages.forecast import least_memory_bytes
+
+    config = cast("LineConfig", request.config)
+    limit, least = config.train.max_memory_bytes, least_memory_bytes(config)
+    if 0 < limit < least and not _on_cuda(request):
+        raise MachineError(
+            f"No training keeps to {limit / 1e9:.2f} GB: the libraries alone take most of {least / 1e9:.2f} GB.",
+            hint=f"Give --max-memory at least {-(-least // 1_000_000)}M.",
+        )
+
+
+def told_beforehand(request: Request) -> str:
+    """What the whole line takes of this machine, in a sentence; empty where nothing is known of the capture."""
+    from splatpipe.pipeline.app.preflight.sizing import size_of
+    from splatpipe.pipeline.app.report.wording import roughly
+    from splatpipe.pipeline.engine.needs import whole
+    from splatpipe.pipeline.engine.source import open_source
+    from splatpipe.stages.costs import REFERENCE
+    from splatpipe.stages.forecast import forecast, machine_speed
+    from splatpipe.stages.work import Work
+
+    config, threads = cast("LineConfig", request.config), request.machine.threads
+    source = open_source(request.photos, request.out, request.stages, config)
+    size = size_of(source)
+    if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request):
+        return ""
+    needs = forecast(size, config, threads, speed=machine_speed())
+    need, work = whole(needs), Work.of(size, config, REFERENCE, threads)
+    seconds = sum(each.seconds(threads) for each in needs.values())
+    told = f"{size.photos:,} photos of {size.megapixels:.1f} megapixels take about {roughly(seconds)}, "
+    told += (
+        f"{need.memory_bytes / 1e9:.1f} GB of memory and {(need.disk_bytes + need.scratch_bytes) / 1e9:.1f} GB of disk"
+    )
+    if config.train.time_budget_s:
+        return f"{told}."
+    told += f": training {roughly(needs['train'].seconds(threads))}, {work.iterations:,} iterations"
+    if config.train.max_memory_bytes and work.most_gaussians < work.grown:
+        told += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos ask for more"
+    return f"{told}."
+
+
+def _on_cuda(request: Request) -> bool:
+    """Whether the training will be on a CUDA device."""
+    from splatpipe.pipeline.raster.cuda_library import why_not
+
+    return request.machine.device != "cpu" and why_not() is None
 
 
 def _read_control(path: Path) -> None:

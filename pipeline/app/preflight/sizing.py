@@ -1,0 +1,51 @@
+"""How large a capture is, from the headers of a few photos: what forecasts ask before anything is done."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+from splatpipe.pipeline.engine.source import Source
+from splatpipe.pipeline.photos.names import is_photo
+from splatpipe.stages.forecast import has_control
+from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
+
+SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly alike
+
+
+def size_of(source: Source) -> CaptureSize:
+    """The size of a user's folder of photos."""
+    paths = [path for path in source.part_files["source.photos"].values() if is_photo(path)]
+    found = capture_size(paths, has_file=source.named.get("source.geo") is not None)
+    return replace(found, control=has_control(source))
+
+
+def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
+    """What the forecast asks of a capture, from the headers of a few photos.
+
+    Args:
+        paths: Of all photos.
+        has_file: Whether a file has their positions.
+    """
+    from PIL import Image
+
+    from splatpipe.pipeline.photos.exif import read_exif
+
+    sizes, placed = [], 0
+    step = max(1, len(paths) // SAMPLED)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of odd tags; what is wrong with a photo is told by the run
+        for path in sorted(paths)[::step][:SAMPLED]:
+            try:
+                with Image.open(path) as picture:
+                    sizes.append(picture.size)
+                    placed += read_exif(picture).gps is not None
+            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+                continue
+    megapixels = median(width * height for width, height in sizes) / 1e6 if sizes else 0.0
+    shapes = [min(size) / max(size) for size in sizes]
+    positions = has_file or 2 * placed > len(sizes)
+    return CaptureSize(len(paths), megapixels, positions, median(shapes) if shapes else USUAL_SHAPE)
