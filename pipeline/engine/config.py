@@ -156,7 +156,7 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
         replaced: Mapping[str, Mapping[str, JSON]] = getattr(model, "replaced", {})
         by_hint: dict[str, list[str]] = {}
         problems = []
-        for problem in error.errors():
+        for problem in _one_an_option(model, error):
             dotted = ".".join(str(key) for key in problem["loc"])
             if problem["type"] == "extra_forbidden" and dotted in gone:
                 by_hint.setdefault(gone[dotted], []).append(dotted)
@@ -166,6 +166,22 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
                 problems.append(_describe(model, dotted, problem["type"], problem["msg"], problem["input"]))
         problems += [_gone(names, hint) for hint, names in by_hint.items()]
         raise UsageError(" ".join(problems), hint="`splatpipe options` lists every option with its default.") from error
+
+
+def _one_an_option(model: type[BaseModel], error: ValidationError) -> Iterable[dict[str, JSON]]:
+    """The problems, those of an option that takes values of several kinds as one."""
+    known, found = set(option_names(model)), dict[tuple[JSON, ...], dict[str, JSON]]()
+    for problem in error.errors():
+        place = problem["loc"]
+        while len(place) > 1 and ".".join(map(str, place)) not in known and ".".join(map(str, place[:-1])) in known:
+            if problem["type"] == "extra_forbidden":
+                break
+            place = place[:-1]
+        before = found.get(place)
+        message = problem["msg"]
+        told = message if before is None else f"{before['msg']}, or {message[0].lower()}{message[1:]}"
+        found[place] = {**problem, "loc": place, "msg": told}
+    return found.values()
 
 
 def _gone(names: Sequence[str], hint: str) -> str:

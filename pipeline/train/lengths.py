@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
-from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.train.looks import Look, windows_of
 from splatpipe.pipeline.train.options import TrainConfig
 
 # No capture was compared by these yet: judgement, the reasons theirs.
@@ -84,7 +85,7 @@ class Footage:
 
     def parts(self, level: int) -> int:
         """Windows of all photos, halved so often."""
-        return sum(count * math.prod(self._grid(size, level)) for *size, count in self.sizes)
+        return sum(count * _cut(w >> level, h >> level, self.window_pixels)[0] for w, h, count in self.sizes)
 
     def window_at(self, level: int) -> int:
         """Most pixels of a window, at a level; 0 where all photos fit in whole."""
@@ -101,47 +102,14 @@ class Footage:
 
     def largest(self, look: Look) -> int:
         """Pixels of the largest window, without its margins."""
-        found = 0
-        for width, height, _count in self.sizes:
-            wide, tall = max(1, width >> look.level), max(1, height >> look.level)
-            rows, columns = window_grid(wide, tall, look.window_pixels)
-            found = max(found, -(-wide // columns) * -(-tall // rows))
-        return found
-
-    def _grid(self, size: Sequence[int], level: int) -> tuple[int, int]:
-        width, height = size
-        return window_grid(max(1, width >> level), max(1, height >> level), self.window_pixels)
+        return max(_cut(w >> look.level, h >> look.level, look.window_pixels)[1] for w, h, _count in self.sizes)
 
 
-def window_grid(width: int, height: int, most_pixels: int) -> tuple[int, int]:
-    """Rows and columns of the fewest windows that a picture is cut into, of those the squarest ones.
-
-    Args:
-        width: Of the picture.
-        height: Of the picture.
-        most_pixels: Of a window, whose sides are rounded up; 0: the picture stays whole.
-    """
-    if most_pixels == 0 or width * height <= most_pixels:
-        return 1, 1
-    found, cells = (height, width), height * width
-    for rows in range(1, height + 1):
-        tall = -(-height // rows)
-        wide = most_pixels // tall
-        if wide == 0:
-            continue
-        columns = -(-width // min(wide, width))
-        grid = (rows, columns)
-        if (rows * columns, _oblong(width, height, grid)) < (cells, _oblong(width, height, found)):
-            found, cells = grid, rows * columns
-        if rows > cells:
-            break
-    return found
-
-
-def _oblong(width: int, height: int, grid: tuple[int, int]) -> float:
-    """How far a cell is from a square: the logarithm of its longer side over the shorter one."""
-    rows, columns = grid
-    return abs(math.log(width * rows / (height * columns)))
+@cache
+def _cut(width: int, height: int, window_pixels: int) -> tuple[int, int]:
+    """How many windows a picture has, and the pixels of the largest."""
+    windows = windows_of(max(1, width), max(1, height), window_pixels)
+    return len(windows), max(window.pixels for window in windows)
 
 
 Length = tuple[int, int]
