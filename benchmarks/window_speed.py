@@ -1,9 +1,9 @@
 """What an iteration of a window costs beside one of a whole photo of its size: ``window_speed.py --data DATASET``.
 
-The same scene with the same Gaussians, trained by training's own code on photos of several sizes in turn, an iteration
-of each after the other, so that whatever else the machine does falls on all alike. Photos of the first size are
-whole, those of the others are seen in windows of at most that size, each window of each photo equally often. Time is
-of all threads that compute, the one that reads windows among them. Photos are decoded before.
+The same scene with the same Gaussians, trained by training's own code with exposures and the sky, on photos of several
+sizes in turn, an iteration of each after the other, so that whatever else the machine does falls on all alike. Photos
+of the first size are whole, those of the others are seen in windows of at most that size, each window of each photo
+equally often. Time is of all threads that compute, the one that reads windows among them. Photos are decoded before.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
 
 WARMUP = 4  # iterations of each that do not count
 ROUNDING = 1.01  # sides are whole pixels, so that a quarter of 4 MP is a little more than 1 MP
@@ -118,16 +118,17 @@ class Runner:
 
 
 def begin(dataset: Path, start: Gaussians, looks: list[Look], threads: int) -> tuple[Plan, TrainState, PhotoStream]:
-    """A training of a fixed number of Gaussians, in the middle of a long run's rates, with its photos decoded."""
+    """A training of a fixed number of Gaussians with the rates of a long run, its photos decoded, its sky found."""
     views = load_views(dataset)
-    config = TrainConfig(iterations=PUBLISHED_ITERATIONS, sh_degree=1, max_gaussians=10**9, stop_when_flat=0.0)
+    config = TrainConfig(iterations=PUBLISHED_ITERATIONS, max_gaussians=10**9, exposure="affine")
     plan = make_plan(config, views, Split(tuple(view.camera.name for view in views)), len(start))
     if len(looks) >= plan.schedule.density.first:
         raise SystemExit(f"{len(looks)} iterations reach density control; take fewer repeats.")
     photos = PhotoStream(views, looks, 0, 1, dataset)
     photos.fill(SilentReporter())
     with same_bits(threads):
-        return plan, TrainState.begin(start, plan, make_techniques(plan)), photos
+        sky = begin_sky(config, views, dataset, threads, SilentReporter())
+        return plan, TrainState.begin(start, plan, make_techniques(plan, sky, views, dataset)), photos
 
 
 def measure(arguments: argparse.Namespace, folder: Path) -> list[Row]:
