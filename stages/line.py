@@ -128,7 +128,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=2,
+    version=3,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views", "georef.boundary"),
     parts={"splat": "init.ply"},
@@ -136,7 +136,7 @@ INITIALIZE = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=6,
+    version=7,
     config=TrainConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={
@@ -199,7 +199,7 @@ EXPORT = Stage(
 
 FLYTHROUGH = Stage(
     "flythrough",
-    version=2,
+    version=3,
     config=FlythroughConfig,
     reads=("train.model", "train.rendering", "train.sky", "undistort.dataset"),
     parts={"film": "film"},

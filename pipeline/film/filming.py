@@ -15,11 +15,13 @@ from jaxtyping import Float, Float64
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import Lens, angle_of
 from splatpipe.pipeline.film.clearance import Clearance, solid_places
+from splatpipe.pipeline.film.options import MOST_FILM_MEGAPIXELS
 from splatpipe.pipeline.film.photo_route import Capture
 from splatpipe.pipeline.film.video import VideoWriter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_views
-from splatpipe.pipeline.photos.images import Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.photos.images import Pixels, reduced_camera
+from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.render.rendering import Model, as_trained, placed, render_depth, render_normals, render_pixels
@@ -51,10 +53,10 @@ class TrainedScene:
     capture: Capture
 
     def lens(self, size: tuple[int, int] | None) -> Lens:
-        """The photos' angle on a picture of some size; without one 16:9 with as many pixels as photos in training."""
+        """The photos' angle on a picture of some size; else 16:9, as many pixels as in training, Full HD at most."""
         if size is None:
             pixels = float(np.median([camera.width * camera.height for camera in self.cameras]))
-            width = _even(math.sqrt(pixels * ASPECT))
+            width = _even(math.sqrt(min(pixels, 1e6 * MOST_FILM_MEGAPIXELS) * ASPECT))
             size = (width, _even(width / ASPECT))
         return Lens.of_angle(*size, angle_of(self.cameras))
 
@@ -90,7 +92,7 @@ def _up(
     views: Sequence[View], cameras: Sequence[Camera], points: Float64[np.ndarray, "n 3"], threads: int
 ) -> Float64[np.ndarray, " 3"]:
     def photo(index: int) -> SkyPhoto:
-        camera, pixels, _ = reduced_view(views[index], WORK_MEGAPIXELS)
+        camera, pixels, _ = small_view(views[index], WORK_MEGAPIXELS)
         return SkyPhoto(camera, pixels)
 
     return up_of(cameras, photo, points[np.isfinite(points).all(axis=1)], threads)

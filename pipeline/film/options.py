@@ -8,6 +8,10 @@ from pydantic import Field, field_validator
 
 from splatpipe.pipeline.engine.stage import StageConfig
 
+MOST_FILM_MEGAPIXELS = 2.0736
+"""Of a film that nobody gave a size: 1920 × 1080. Screens that show more are few, and 20 megapixels a frame take a
+gigabyte of memory and the night."""
+
 
 class FlythroughConfig(StageConfig):
     seconds: Annotated[float, Field(ge=0.0, le=600.0)] = 10.0
@@ -16,7 +20,8 @@ class FlythroughConfig(StageConfig):
     fps: Annotated[int, Field(ge=1, le=120)] = 25
     """Frames a second."""
     size: Annotated[str, Field(pattern=r"^(auto|[0-9]{2,4}x[0-9]{2,4})$")] = "auto"
-    """Width and height in pixels, even, such as 1280x720. Auto: 16:9, as many pixels as the photos have in training."""
+    """Width and height in pixels, even, such as 1280x720. Auto: 16:9, as many pixels as the photos have in training,
+    at most 1920x1080."""
 
     @field_validator("size")
     @classmethod

@@ -19,7 +19,8 @@ from splatpipe.pipeline.mvs.likeness import Picture
 from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, load_tracks, neighbours
 from splatpipe.pipeline.mvs.sweep import Depths, sweep
 from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.photos.images import reduced_camera, reduced_view
+from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.photos.small_views import small_view
 
 MEGAPIXELS = 0.1  # of a photo in the sweep; its planes see it at half the size
 SWEPT = 4  # neighbours a photo is compared with
@@ -145,7 +146,7 @@ def _keep_depths(capture: _Capture, number: int) -> None:
 
 
 def _picture(view: View) -> tuple[Picture, UInt8[np.ndarray, "h w 3"]]:
-    camera, colour, mask = reduced_view(view, MEGAPIXELS)
+    camera, colour, mask = small_view(view, MEGAPIXELS)
     grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255.0)
     counts = np.ones(grey.shape, np.bool_) if mask is None else mask
     return Picture(camera, grey, counts), colour

@@ -64,7 +64,7 @@ def reduced_sky(view: View, max_megapixels: float) -> Mask | None:
     if view.sky_path is None:
         return None
     camera = reduced_camera(view.camera, max_megapixels)
-    return _reduced(_load_mask(view, view.sky_path), (camera.width, camera.height))
+    return reduced_mask(_load_mask(view, view.sky_path), (camera.width, camera.height))
 
 
 def reduced_camera(camera: Camera, max_megapixels: float | None, level: int = 0) -> Camera:
@@ -116,7 +116,7 @@ def reduced_views(
             continue
         size = (camera.width, camera.height)
         smaller = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-        yield camera, smaller, None if mask is None else _reduced(mask, size)
+        yield camera, smaller, None if mask is None else reduced_mask(mask, size)
 
 
 def _load_mask(view: View, path: Path) -> Mask:
@@ -125,7 +125,7 @@ def _load_mask(view: View, path: Path) -> Mask:
     return np.asarray(pixels > 0)
 
 
-def _reduced(mask: Mask, size: tuple[int, int]) -> Mask:
+def reduced_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     """True where all below is."""
     # Not by a share of 1: OpenCV's weights add up to as little as 0.999, but those of nothing are exactly zero.
     return np.asarray(cv2.resize((~mask).astype(np.float32), size, interpolation=cv2.INTER_AREA) == 0.0)

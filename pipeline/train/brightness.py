@@ -18,7 +18,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks
-from splatpipe.pipeline.photos.images import reduced_view
+from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.train.options import TrainConfig
 
 MEGAPIXELS = 0.3  # of a photo in which colours are looked up: a pixel is a mean of many, and noise is gone
@@ -103,7 +103,7 @@ def _colours(
     view: View, xyz: Float64[np.ndarray, "m 3"], tracks: Mapping[str, Int64[np.ndarray, " _"]]
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """The points that a photo saw, where it is not clipped, and the logarithms of its colours there."""
-    camera, pixels, mask = reduced_view(view, MEGAPIXELS)
+    camera, pixels, mask = small_view(view, MEGAPIXELS)
     tracked = tracks[view.camera.name]
     inside, places, _ = camera.in_view(xyz[tracked])
     rows, (x, y) = tracked[inside], places.astype(np.int64).T

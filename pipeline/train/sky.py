@@ -21,7 +21,8 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points
-from splatpipe.pipeline.photos.images import reduced_sky, reduced_view
+from splatpipe.pipeline.photos.images import reduced_sky
+from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
@@ -104,7 +105,7 @@ class SkyModel(SideModel, Technique):
         cameras = [view.camera for view in views]
 
         def photo(index: int) -> SkyPhoto:
-            camera, pixels, mask = reduced_view(views[index], WORK_MEGAPIXELS)
+            camera, pixels, mask = small_view(views[index], WORK_MEGAPIXELS)
             drawn = reduced_sky(views[index], WORK_MEGAPIXELS)
             return SkyPhoto(camera, pixels, None if mask is None else ~mask, drawn)
 

@@ -15,7 +15,8 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points, load_views
-from splatpipe.pipeline.photos.images import Pixels, read_image
+from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.photos.small_views import read_small
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama
@@ -158,7 +159,8 @@ def _quarter(camera: Camera) -> Camera:
 
 def _shown(view: View, frame: Frame, height: int, held_out: bool) -> ViewerCamera:
     camera, turns = upright(_in_world(view.camera, frame))
-    picture = np.rot90(read_image(view.image_path, _reduced(camera, height)), turns)
+    size = (view.camera.width, view.camera.height)
+    picture = np.rot90(read_small(view.image_path, size, (height, height))[1], turns)
     return ViewerCamera(camera, _thumb(picture, height), held_out)
 
 
@@ -168,13 +170,6 @@ def _in_world(camera: Camera, frame: Frame) -> Camera:
     pose[:3, :3] = camera.cam_from_world[:3, :3] @ np.asarray(similarity.rotation).T
     pose[:3, 3] = -pose[:3, :3] @ similarity.apply(camera.centre()[None])[0]
     return replace(camera, cam_from_world=pose)
-
-
-def _reduced(camera: Camera, height: int) -> int:
-    """How OpenCV is to read a photo: reduced while decoding, still of twice the thumb's size; that is far faster."""
-    room = min(camera.width, camera.height) // (2 * height)
-    steps = ((8, cv2.IMREAD_REDUCED_COLOR_8), (4, cv2.IMREAD_REDUCED_COLOR_4), (2, cv2.IMREAD_REDUCED_COLOR_2))
-    return int(next((flag for factor, flag in steps if room >= factor), cv2.IMREAD_COLOR))
 
 
 def _thumb(picture: Pixels, height: int) -> bytes:

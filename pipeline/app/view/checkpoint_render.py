@@ -19,6 +19,7 @@ from splatpipe.pipeline.photos.images import Pixels, reduced_view
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu
 from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.render.rendering import as_trained, placed, render_pixels
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama, read_panorama
@@ -151,7 +152,7 @@ def device_of(opened: Contents, logged: str) -> str:
 
 
 def pictures(shown: Shown, view: View, threads: int, device: str = "auto") -> tuple[bytes, bytes]:
-    """JPEGs of a render and of its photo, both of the size that is trained on.
+    """JPEGs of a render and of its photo, both of the size that is trained on, 2 megapixels at most.
 
     Args:
         shown: The model.
@@ -163,7 +164,7 @@ def pictures(shown: Shown, view: View, threads: int, device: str = "auto") -> tu
     Raises:
         SplatpipeError: if the photo cannot be read.
     """
-    camera, photo, _ = reduced_view(view, shown.megapixels)
+    camera, photo, _ = reduced_view(view, min(JUDGED_MEGAPIXELS, shown.megapixels or JUDGED_MEGAPIXELS))
     with same_bits(threads):
         render = None if device == "cpu" else _on_card(shown, camera)
         if render is None:
