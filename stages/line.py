@@ -112,7 +112,7 @@ GEOREF = Stage(
 )
 UNDISTORT = Stage(
     "undistort",
-    version=1,
+    version=2,
     config=UndistortConfig,
     reads=("georef.model", "ingest.photos"),
     parts={"dataset": "dataset"},

@@ -28,6 +28,7 @@ PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LIST_NAME = "photos.json"
 CONVERTED_DIR = "converted"
 MASK_DIR = "masks"
+STRIP_ROWS = 256  # of a photo, copied at a time
 SKY_DIR = "sky_masks"
 UNTURN = {  # the inverse of the turn that each EXIF orientation asks for
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -164,10 +165,34 @@ def decode(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h w
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
     """
-    pixels = _decoded(photo_bytes(photo, part, photos_dir), "RGB", photo.name)
-    if pixels.shape != (photo.height, photo.width, 3):
-        raise _changed(photo.name, f"it is {pixels.shape[1]} × {pixels.shape[0]} px now")
+    picture = open_decoded(photo, part, photos_dir)
+    pixels = np.empty((photo.height, photo.width, 3), np.uint8)
+    for top in range(0, photo.height, STRIP_ROWS):  # Pillow makes two copies more of what it hands over at once
+        pixels[top : top + STRIP_ROWS] = picture.rows(top, min(photo.height, top + STRIP_ROWS))
     return pixels
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedPhoto:
+    """A photo decoded as Pillow holds it, four bytes a pixel, from which rows are taken as arrays."""
+
+    picture: Image.Image
+
+    def rows(self, top: int, bottom: int) -> UInt8[np.ndarray, "rows w 3"]:
+        """Those rows, RGB in the stored grid."""
+        return np.asarray(self.picture.crop((0, top, self.picture.width, bottom)))
+
+
+def open_decoded(photo: Photo, part: Path, photos_dir: Path) -> DecodedPhoto:
+    """A photo's pixels as ``decode`` has them, without an array of all of them.
+
+    Raises:
+        SplatpipeError: as ``decode``.
+    """
+    picture = _picture(photo_bytes(photo, part, photos_dir), "RGB", photo.name)
+    if picture.size != (photo.width, photo.height):
+        raise _changed(photo.name, f"it is {picture.width} × {picture.height} px now")
+    return DecodedPhoto(picture)
 
 
 def decode_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None:
@@ -187,7 +212,7 @@ def decode_sky_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None
 def _decode_mask(photo: Photo, file: str | None, part: Path) -> UInt8[np.ndarray, "h w"] | None:
     if file is None:
         return None
-    mask = _decoded(read_checked(_inside(part, file), file), "L", file)
+    mask = np.array(_picture(read_checked(_inside(part, file), file), "L", file))
     if mask.shape != (photo.height, photo.width):
         raise _changed(file, f"it is {mask.shape[1]} × {mask.shape[0]} px now")
     return mask
@@ -229,11 +254,12 @@ def unturn(picture: Image.Image, orientation: int) -> Image.Image:
     return picture if method is None else picture.transpose(method)
 
 
-def _decoded(data: bytes, mode: str, name: str) -> np.ndarray:
+def _picture(data: bytes, mode: str, name: str) -> Image.Image:
     try:
         # What is read here was written by ingest or found plain by it: never a turned TIFF.
-        with open_picture(BytesIO(data)) as picture:
-            return np.array(picture.convert(mode))
+        picture = open_picture(BytesIO(data))
+        picture.load()
+        return picture if picture.mode == mode else picture.convert(mode)
     except (OSError, ValueError, SyntaxError) as error:
         raise _changed(name, str(error)) from error
 

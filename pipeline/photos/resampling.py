@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -11,7 +12,12 @@ from jaxtyping import Float64, UInt8
 
 MAX_SAMPLES = 16  # a side of a pixel; reductions by more are softened first
 STRIP_PIXELS = 1 << 21  # samples held at a time
+SINGLE_PIXELS = 1 << 18  # where a pixel has one sample: then strips need nothing of each other, and are the same bits
+PROJECTED = 1 << 16  # places projected at a time, in double precision
+MARGIN = 3  # rows around those that samples lie in: a cubic takes one before and two after
 ONE_TO_ONE = 1.1  # up to this reduction one sample a pixel, interpolated by a cubic, is sharper than several
+
+Rows = UInt8[np.ndarray, "rows w *channels"]
 
 
 def resample(
@@ -37,19 +43,59 @@ def resample(
         photo = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA))
         source = pycolmap.Camera(source.todict())
         source.rescale(*size)
-        reduction = _reduction(source, target)
+    result = np.empty((target.height, target.width, *photo.shape[2:]), np.uint8)
+    top = 0
+    for strip in _strips(lambda first, last: photo[first:last], source, target):
+        result[top : top + len(strip)] = strip
+        top += len(strip)
+    return result
+
+
+def resampled_strips(
+    rows_of: Callable[[int, int], Rows], source: pycolmap.Camera, target: pycolmap.Camera
+) -> Iterator[UInt8[np.ndarray, "rows tw 3"]]:
+    """What ``resample`` makes of a photo, from the top, strip by strip: neither photo nor result is held as an array.
+
+    Where the whole photo is made smaller by one filter, it is one strip.
+
+    Args:
+        rows_of: The photo's rows from one on and before another, in the source camera's grid.
+        source: Of any model.
+        target: Pinhole.
+    """
+    plain = source.is_undistorted() and _same_view(source, target)
+    if plain or _reduction(source, target) > MAX_SAMPLES:
+        yield resample(rows_of(0, source.height), source, target)
+    else:
+        yield from _strips(rows_of, source, target)
+
+
+def _strips(
+    rows_of: Callable[[int, int], Rows], source: pycolmap.Camera, target: pycolmap.Camera
+) -> Iterator[UInt8[np.ndarray, "rows tw *channels"]]:
+    reduction = _reduction(source, target)
     samples = 1 if reduction <= ONE_TO_ONE else min(MAX_SAMPLES, math.ceil(reduction))
     interpolation = cv2.INTER_CUBIC if samples == 1 else cv2.INTER_LINEAR
-    result = np.empty((target.height, target.width, *photo.shape[2:]), np.uint8)
-    rows = max(1, STRIP_PIXELS // (target.width * samples * samples))
+    held = SINGLE_PIXELS if samples == 1 else STRIP_PIXELS
+    rows = max(1, held // (target.width * samples * samples))
     for top in range(0, target.height, rows):
         bottom = min(target.height, top + rows)
         x, y = _sample_places(source, target, top, bottom, samples)
-        strip = cv2.remap(photo, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
+        first, last = _reach(y, source.height)
+        y -= np.float32(first)  # exact: a whole number off a larger one, or nothing
+        strip = cv2.remap(rows_of(first, last), x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
         if samples > 1:
             strip = cv2.resize(strip, (target.width, bottom - top), interpolation=cv2.INTER_AREA)
-        result[top:bottom] = strip
-    return result
+        yield np.asarray(strip)
+
+
+def _reach(y: np.ndarray, height: int) -> tuple[int, int]:
+    """The first row of the photo that samples at ``y`` look at, and the one after the last; all if one is nowhere."""
+    low, high = float(y.min()), float(y.max())
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return 0, height
+    first = min(max(math.floor(low) - MARGIN, 0), height - 1)
+    return first, max(min(math.ceil(high) + MARGIN + 1, height), first + 1)
 
 
 def _same_view(source: pycolmap.Camera, target: pycolmap.Camera) -> bool:
@@ -87,13 +133,19 @@ def _sample_places(
     The distortion is evaluated at the pixels' centres, one further on every side, and interpolated linearly between
     them, where it is as good as straight.
     """
-    x, y = np.meshgrid(np.arange(-1, target.width + 1) + 0.5, np.arange(top - 1, bottom + 1) + 0.5)
-    places = _project(source, target, np.column_stack([x.ravel(), y.ravel()])) - 0.5  # OpenCV's first centre is 0, 0
+    wide, high = target.width + 2, bottom - top + 2
+    grids = np.empty((2, high, wide), np.float32)
+    at_once = max(1, PROJECTED // wide)
+    for row in range(0, high, at_once):
+        here = np.arange(row, min(high, row + at_once))
+        x, y = np.meshgrid(np.arange(-1, wide - 1) + 0.5, here + (top - 1) + 0.5)
+        places = (
+            _project(source, target, np.column_stack([x.ravel(), y.ravel()])) - 0.5
+        )  # OpenCV's first centre is 0, 0
+        grids[:, here] = places.T.reshape(2, len(here), wide)
     maps = []
-    for axis in (0, 1):
-        grid = places[:, axis].reshape(x.shape).astype(np.float32)
+    for grid in grids:
         if samples > 1:
-            size = grid.shape[1] * samples, grid.shape[0] * samples
-            grid = cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)
+            grid = cv2.resize(grid, (wide * samples, high * samples), interpolation=cv2.INTER_LINEAR)
         maps.append(np.ascontiguousarray(grid[samples:-samples, samples:-samples]))
     return maps[0], maps[1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +15,12 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter
 from splatpipe.pipeline.geometry.camera import reduced_size
 from splatpipe.pipeline.photos.dataset import MASKS, SKY_MASKS, image_path, mask_path
+from splatpipe.pipeline.photos.jpeg_strips import write_jpeg
 from splatpipe.pipeline.photos.names import match_names, some
-from splatpipe.pipeline.photos.photo_list import Photo, decode, decode_mask, decode_sky_mask
-from splatpipe.pipeline.photos.resampling import resample
+from splatpipe.pipeline.photos.photo_list import Photo, decode_mask, decode_sky_mask, open_decoded
+from splatpipe.pipeline.photos.resampling import resample, resampled_strips
 
 SHAPE_TOLERANCE = 0.01  # between the shapes of a photo and of its camera in the model
-JPEG_QUALITY = 97  # with full chroma: far above what training reaches, and a third of a PNG's size and decoding time
 WHITE = 254.5  # of 255: a pixel counts only if nothing of it is masked, and is sky only if all of it is
 LEAST_VIEWS = 2
 
@@ -121,28 +121,27 @@ def pinhole_camera(source: pycolmap.Camera, max_megapixels: float, number: int) 
 
 def write_view(view: Placed, inputs: Inputs, dataset: Path) -> None:
     part = inputs["ingest.photos"]
-    pixels = resample(decode(view.photo, part, inputs.photos_dir), view.source, view.target)
-    _write(image_path(dataset, view.photo.name), pixels[:, :, ::-1])
+    photo = open_decoded(view.photo, part, inputs.photos_dir)
+    strips = resampled_strips(photo.rows, view.source, view.target)
+    _write(image_path(dataset, view.photo.name), (strip[:, :, ::-1] for strip in strips), view.target.height)
     for folder, decoded in ((MASKS, decode_mask), (SKY_MASKS, decode_sky_mask)):
         mask = decoded(view.photo, part)
         if mask is not None:
             white = resample(mask, view.source, view.target) > WHITE
-            _write(mask_path(dataset, view.photo.name, folder), white.astype(np.uint8) * 255)
+            _write(mask_path(dataset, view.photo.name, folder), [white.astype(np.uint8) * 255], len(white))
 
 
-def _write(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
-    """Write a picture in the format of its name: PNG or TIFF without loss, anything else JPEG."""
+def _write(path: Path, strips: Iterable[npt.NDArray[np.uint8]], height: int) -> None:
+    """Write a picture in the format of its name: PNG or TIFF without loss, and whole; anything else JPEG, in strips."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    kind = ".jpg"
-    if suffix in (".png", ".tif", ".tiff"):
-        kind, options = suffix, []
-    done, encoded = cv2.imencode(kind, np.ascontiguousarray(pixels), options)
+    if suffix not in (".png", ".tif", ".tiff"):
+        write_jpeg(path, strips, height)
+        return
+    done, encoded = cv2.imencode(suffix, np.concatenate(list(strips)))
     if not done:
         raise StageError(f"{path.name} could not be encoded.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encoded.tobytes())
+    path.write_bytes(encoded.data)
 
 
 def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[Placed]) -> pycolmap.Reconstruction:
