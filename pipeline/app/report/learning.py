@@ -32,9 +32,9 @@ def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
         return None
     summary, history = holdings.summary("train"), holdings.read("train.history")
     plan, split = summary.get("plan") or {}, holdings.read("split.views")
-    told = {} if story is None else dict(story.told.progress)
-    planned = summary.get("planned_iterations") or told.get("total")
-    reached = summary.get("iterations") or (None if story is None else story.reached)
+    trained = story if story is not None and story.told.progress.get("unit") == "iterations" else None  # not decoding
+    planned = summary.get("planned_iterations") or (None if trained is None else trained.told.progress.get("total"))
+    reached = summary.get("iterations") or (None if trained is None else trained.reached)
     curves = _curves(holdings, history)
     gaussians = summary.get("gaussians") or _last(curves.get("gaussians", {}))
     facts = [
