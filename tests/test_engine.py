@@ -15,8 +15,9 @@ import pytest
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
+from splatpipe.pipeline.engine.line import Line, survey
 from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.engine.runner import Line, Outcome, survey
+from splatpipe.pipeline.engine.runner import Outcome
 from splatpipe.pipeline.engine.session import Request, open_session, survey_line
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.engine.store import open_store

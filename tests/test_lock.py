@@ -18,7 +18,7 @@ import pytest
 
 from splatpipe.pipeline.engine import lock as engine_lock
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
-from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked
+from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_shard
 from splatpipe.pipeline.engine.machine import Mount
 
 ELSEWHERE = {"process": 4711, "host": "node7", "boot": "another", "turn": "first"}
@@ -56,9 +56,9 @@ def holder(out: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
-def at_work_elsewhere(out: Path) -> Iterator[threading.Event]:
+def at_work_elsewhere(out: Path, name: str = LOCK_FILE) -> Iterator[threading.Event]:
     """Another machine, whose lock this one does not see: it has signed the file and touches it."""
-    path, over = out / "stages" / LOCK_FILE, threading.Event()
+    path, over = out / "stages" / name, threading.Event()
     path.write_text(json.dumps(ELSEWHERE))
 
     def touch() -> None:
@@ -221,3 +221,75 @@ def test_a_link_in_the_locks_place_is_not_followed(out: Path, tmp_path: Path) ->
     with pytest.raises(MachineError, match="Cannot lock"), locked(out):
         pass
     assert (tmp_path / "victim").read_text() == "mine"
+
+
+def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> None:
+    with locked_shard(out, "train.1"), locked_shard(out, "train.2"):
+        assert is_locked(out, "train.1") and not is_locked(out, "train.3") and not is_locked(out)
+        with (
+            pytest.raises(UsageError, match=f"process {os.getpid()}\\) is making train.1 in"),
+            locked_shard(out, "train.1"),
+        ):
+            pass
+        with pytest.raises(UsageError, match=f"process {os.getpid()}\\) is working in"), locked(out):
+            pass
+    with locked(out), pytest.raises(UsageError, match="is working in"), locked_shard(out, "train.1"):
+        pass
+    assert all(path.read_bytes() == b"" for path in (out / "stages").glob(f"{LOCK_FILE}*"))
+
+
+def test_a_shard_made_on_another_machine_shuts_out_who_wants_it_or_all(out: Path) -> None:
+    """Where that machine's locks are not seen."""
+    name = f"{LOCK_FILE}.train.1"
+    with at_work_elsewhere(out, name) as over:
+        with pytest.raises(UsageError, match=r"node7.* is making train.1"), locked_shard(out, "train.1"):
+            pass
+        with locked_shard(out, "train.2"):
+            pass
+        with pytest.raises(UsageError, match=r"node7.* is making train.1"), locked(out):
+            pass
+        assert not is_locked(out)
+
+        def tell(text: str) -> None:
+            if "waiting" in text:
+                over.set()
+
+        with locked(out, wait=True, tell=tell):
+            assert over.is_set() and (out / "stages" / name).read_bytes() == b""  # who died there holds up nobody else
+
+
+def test_no_shard_is_made_while_another_machine_has_all(out: Path) -> None:
+    with at_work_elsewhere(out) as over:
+        with pytest.raises(UsageError, match=r"node7.* is working in"), locked_shard(out, "train.1"):
+            pass
+        with locked_shard(out, "train.1", wait=True, tell=lambda text: over.set() if "waiting" in text else None):
+            assert over.is_set()
+
+
+def test_of_a_shard_and_a_run_elsewhere_that_sign_at_once_the_shard_gives_way(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run signs after the look at its file and before the shard's own signature can be seen there."""
+    take = engine_lock._take
+
+    def overtaken(path: Path, *how: object, **more: bool) -> object:
+        signed = take(path, *how, **more)  # type: ignore[arg-type]
+        (out / "stages" / LOCK_FILE).write_text(json.dumps(ELSEWHERE))
+        return signed
+
+    monkeypatch.setattr(engine_lock, "_take", overtaken)
+    with pytest.raises(UsageError, match=r"node7.* is working in"), locked_shard(out, "train.1"):
+        pass
+    assert (out / "stages" / f"{LOCK_FILE}.train.1").read_bytes() == b""
+    with locked_shard(out, "train.1"):  # the same one again, long silent: it died
+        pass
+
+
+def test_a_shards_maker_that_slept_finds_its_signature_taken_off(out: Path) -> None:
+    with locked_shard(out, "train.1") as hold:
+        (out / "stages" / f"{LOCK_FILE}.train.1").write_bytes(b"")
+        deadline_s = time.monotonic() + PATIENCE_S
+        with pytest.raises(MachineError, match=r"has taken over train.1 in"):
+            while time.monotonic() < deadline_s:
+                hold.confirm()
+                time.sleep(0.01)

@@ -29,6 +29,7 @@ from splatpipe.pipeline.app.cli_options import (
     SecondsOption,
     SeedOption,
     SetOption,
+    ShardOption,
     SizeOption,
     StillsOption,
     TargetOption,
@@ -48,6 +49,7 @@ from splatpipe.pipeline.app.cli_runs import (
     request_of,
     stages_to_rerun,
     tell_beforehand,
+    told_standing,
     with_boundary,
     with_budgets,
 )
@@ -159,19 +161,24 @@ def stage(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The stage to run.")],
     out: OutArgument,
     assignments: SetOption = None,
+    shard: ShardOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
     wait: WaitOption = False,
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run one stage again on an existing OUT, and nothing else."""
+    """Run one stage again on an existing OUT, and nothing else; or make one of its shards, if it is not there."""
     with Ending(out, as_json) as done:
         done.notify_by(notify)
         check_stage(name)
-        with RunSession(existing(out, overrides(None, assignments, None).tables, device, threads), wait) as runner:
+        if shard is not None and assignments:
+            raise UsageError("All shards of a stage have the same options.", hint="Leave --set out, or --shard.")
+        done.reports = shard is None
+        request = existing(out, overrides(None, assignments, None).tables, device, threads)
+        with RunSession(request, wait, "" if shard is None else f"{name}.{shard}") as runner:
             done.outcome = runner.outcome
-            runner.run_alone(name)
+            runner.run_alone(name) if shard is None else runner.run_shard(name, shard)
 
 
 @app.command()
@@ -248,24 +255,12 @@ def view(
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Say what is there, what is stale and why."""
     from splatpipe.pipeline.app.console import show_standings
-    from splatpipe.pipeline.engine.needs import used_and_forecast
-    from splatpipe.pipeline.engine.runner import survey
+    from splatpipe.pipeline.engine.line import survey
     from splatpipe.pipeline.engine.session import survey_line
 
     with Ending(out, as_json) as done:
         standings = list(survey(*survey_line(existing(out))))
-        stages = [
-            {
-                "name": standing.stage.name,
-                "state": standing.state,
-                "reason": standing.reason,
-                "seconds": standing.artifact.manifest["seconds"] if standing.artifact else None,
-                "summary": standing.artifact.summary if standing.artifact else None,
-                **(used_and_forecast(standing.artifact.manifest) if standing.artifact else {}),
-            }
-            for standing in standings
-        ]
-        done.told = {"stages": stages}
+        done.told = {"stages": [told_standing(standing) for standing in standings]}
     if not as_json:
         show_standings(standings)
 
@@ -289,14 +284,14 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the present configuration no longer asks for."""
     from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.engine.line import survey
     from splatpipe.pipeline.engine.lock import locked
-    from splatpipe.pipeline.engine.runner import survey
     from splatpipe.pipeline.engine.session import survey_line
 
     with Ending(out, as_json) as done:
         line, store = survey_line(existing(out))
         with locked(store.out, tell=say):
-            keep = [(standing.stage.name, standing.key) for standing in survey(line, store)]
+            keep = [wanted for standing in survey(line, store) for wanted in standing.wanted]
             removed, freed = store.remove_stale(keep)
         done.told = {"removed": removed, "freed_bytes": freed}
         say(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")

@@ -33,6 +33,10 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="SECTION.OPTION=VALUE", help="One option, over all else. Repeatable."),
 ]
+ShardOption = Annotated[
+    int | None,
+    typer.Option(min=1, metavar="K", help="Make this shard alone; other processes may make others at the same time."),
+]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 ThreadsOption = Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. The result is the same.")]
 SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]

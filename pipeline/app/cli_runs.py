@@ -13,6 +13,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.machine import available_cores
 
 if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.line import Standing
     from splatpipe.pipeline.engine.runner import Runner
     from splatpipe.pipeline.engine.session import Request
     from splatpipe.stages.options import LineConfig
@@ -134,18 +135,34 @@ def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | N
     return frozenset([*rerun, *(names[names.index(rerun_from) :] if rerun_from else [])])
 
 
+def told_standing(standing: Standing) -> dict[str, Any]:
+    """Where a stage stands, and its shards if it has some, for ``status --json``."""
+    from splatpipe.pipeline.engine.needs import used_and_forecast
+
+    artifact = standing.artifact
+    return {
+        "name": standing.stage.name,
+        "state": standing.state,
+        "reason": standing.reason,
+        "seconds": artifact.manifest["seconds"] if artifact else None,
+        "summary": artifact.summary if artifact else None,
+        **(used_and_forecast(artifact.manifest) if artifact else {}),
+        **({"shards": [told_standing(shard) for shard in standing.shards]} if standing.shards else {}),
+    }
+
+
 class RunSession:
     """An open session whose events go to the terminal, which is left tidy whatever happens."""
 
-    def __init__(self, request: Request, wait: bool = False) -> None:
-        self._request, self._wait = request, wait
+    def __init__(self, request: Request, wait: bool = False, shard: str = "") -> None:
+        self._request, self._wait, self._shard = request, wait, shard
 
     def __enter__(self) -> Runner:
         from splatpipe.pipeline.app.console import RunConsole
         from splatpipe.pipeline.engine.session import open_session
 
         self._console = RunConsole()
-        self._session = open_session(self._request, self._console, wait=self._wait)
+        self._session = open_session(self._request, self._console, wait=self._wait, shard=self._shard)
         return self._session.__enter__()
 
     def __exit__(self, *error: Any) -> bool | None:

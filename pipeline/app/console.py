@@ -26,8 +26,8 @@ from rich.text import Text
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.runner import Standing
-from splatpipe.pipeline.engine.stage import JSON, Summary
+from splatpipe.pipeline.engine.line import Standing
+from splatpipe.pipeline.engine.stage import JSON, Summary, stage_name
 
 PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
 PLAIN_WIDTH = 120  # columns of a table in a log file
@@ -146,9 +146,10 @@ class RunConsole:
         target.print(f"[{colour}]{sign}[/] {escape(self._label(stage))} {escape(text)}", soft_wrap=True)
 
     def _label(self, stage: str) -> str:
-        if stage not in self._order:
+        of = stage_name(stage)
+        if of not in self._order:
             return stage.ljust(10)
-        return f"{self._order.index(stage) + 1:>2}/{len(self._order)} {stage:<10}"
+        return f"{self._order.index(of) + 1:>2}/{len(self._order)} {stage:<10}"
 
 
 def escape(text: str) -> str:
@@ -170,12 +171,12 @@ def show_standings(standings: Iterable[Standing]) -> None:
     for title in ("stage", "state", "took", "what"):
         table.add_column(title, overflow="fold")
     for standing in standings:
-        artifact = standing.artifact
-        took = _duration(float(artifact.manifest["seconds"])) if artifact else ""
-        what = _brief(artifact.summary) if artifact else standing.reason
-        table.add_row(
-            standing.stage.name, f"[{COLOURS[standing.state]}]{standing.state}[/]", took, Text(what), end_section=False
-        )
+        for row in (standing, *standing.shards):
+            artifact = row.artifact
+            took = _duration(float(artifact.manifest["seconds"])) if artifact else ""
+            what = _brief(artifact.summary) if artifact else row.reason
+            name = row.stage.name if row is standing else f"  {row.stage.name}"
+            table.add_row(name, f"[{COLOURS[row.state]}]{row.state}[/]", took, Text(what), end_section=False)
     Console(highlight=False).print(table)
 
 

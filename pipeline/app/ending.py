@@ -30,6 +30,7 @@ class Ending:
     """Tells the end of a command, good or bad: a summary for people on stderr, one JSON object for programs."""
 
     outcome: Outcome | None = None
+    reports: bool = True  # not who makes one shard: others may be at work in OUT, and the report is of all
     told: Mapping[str, Any] | None = None
     _reported: Path | None = None
     _command: str | None = None
@@ -56,7 +57,7 @@ class Ending:
         if isinstance(error, GeneratorExit | SystemExit):
             return
         step = error is None and PART_VARIABLE in os.environ
-        if self.outcome is not None and not step and not _insists(error):
+        if self.outcome is not None and self.reports and not step and not _insists(error):
             self._report(error)
         if error is None and self.outcome is not None:
             self._show(self.outcome, seconds)

@@ -26,13 +26,13 @@ class Executor:
 
     Args:
         log: File that takes what libraries print.
-        lock: The OUT's lock, inherited so that it lasts as long as the worker writes.
+        locks: The OUT's lock and a shard's, inherited so that they last as long as the worker writes.
         environment: Variables for the worker besides our own (threads of the numeric libraries).
     """
 
-    def __init__(self, log: Path, lock: int, environment: Mapping[str, str]) -> None:
+    def __init__(self, log: Path, locks: tuple[int, ...], environment: Mapping[str, str]) -> None:
         self._log = log
-        self._lock = lock
+        self._locks = locks
         self._environment = {**os.environ, **environment}
         self._process: subprocess.Popen[str] | None = None
 
@@ -125,7 +125,7 @@ class Executor:
                 text=True,
                 encoding="utf-8",
                 env=self._environment,
-                pass_fds=(self._lock,),
+                pass_fds=self._locks,
             )
         except OSError as error:
             raise MachineError(

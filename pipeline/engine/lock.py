@@ -4,6 +4,9 @@ On one machine the kernel's lock decides (``flock``): it ends with the last proc
 Other machines see it only where the file system carries it (NFS does, by a lock on the file's bytes; not with
 ``nolock``, nor 9p, nor most of FUSE). So who holds it also signs the file with the machine's boot and touches it every
 few seconds: what another boot has signed is believed as long as it is touched. No two clocks are compared.
+
+Shards of a stage are made side by side: who makes one shares the OUT's lock and holds a file of the shard's own, signed
+and touched like the other. Each side signs its file first and looks at the other's then, so that one of two sees it.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ BEAT_S = 4.0  # between touches; a server is not troubled by one in that time
 SILENCE_S = 20.0  # without a touch: five missed ones are no busy disk any more
 SETTLE_S = 1.0  # in which two machines that sign at once see who was last
 LOOK_S = 0.25
+FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 LONGEST = 4096  # bytes of a signature
 WIDTH = 1024  # of all, so that of two written over each other the last one stands whole
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
@@ -72,14 +76,17 @@ class Hold:
 
     Args:
         path: The file.
-        descriptor: Of it, for a worker to inherit: the lock lasts as long as either lives.
+        descriptor: Of it.
         holder: As it is signed.
+
+    Attributes:
+        descriptors: Of it, and of what it shares, for a worker to inherit: the lock lasts as long as either lives.
     """
 
     def __init__(self, path: Path, descriptor: int, holder: Holder) -> None:
-        self.descriptor = descriptor
+        self.descriptors = [descriptor]
         self._path, self._holder = path, holder
-        self._taker: Holder | None = None
+        self._taker = ""
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="lock", daemon=True)
         self._thread.start()
@@ -90,9 +97,9 @@ class Hold:
         Raises:
             MachineError: if another machine took it, as it may where this one slept or lost its disk for a while.
         """
-        if self._taker is not None:
+        if self._taker:
             raise MachineError(
-                f"Another splatpipe ({self._taker}) has taken over {self._path.parents[1]}: this one gave no sign of "
+                f"Another splatpipe ({self._taker}) has taken over {_place(self._path)}: this one gave no sign of "
                 f"life for {SILENCE_S:.0f} s.",
                 hint="Let that one end. What was finished is kept.",
             )
@@ -102,18 +109,19 @@ class Hold:
         self._over.set()
         self._thread.join(LOOK_S)  # it may hang with a server
         with suppress(OSError):  # a disk that is gone holds nobody up
-            if self._taker is None and _signed(self._path) == self._holder:
-                os.ftruncate(self.descriptor, 0)
-        os.close(self.descriptor)
+            if not self._taker and _signed(self._path) == self._holder:
+                os.ftruncate(self.descriptors[0], 0)
+        for descriptor in self.descriptors:
+            os.close(descriptor)
 
     def _beat(self) -> None:
         while not self._over.wait(BEAT_S):
             with suppress(OSError):
                 found = _signed(self._path)
-                if found is not None and found != self._holder:
-                    self._taker = found
+                if found != self._holder and (found is not None or self._path.stat().st_size == 0):
+                    self._taker = str(found or "unknown")  # who takes a silent shard's place takes its signature off
                     return
-                os.utime(self.descriptor)
+                os.utime(self.descriptors[0])
 
 
 @contextmanager
@@ -131,28 +139,85 @@ def locked(out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell 
         MachineError: if its file system has no locks, or cannot be written.
     """
     path = out / folder / LOCK_FILE
+    hold = _acquired(path, tell, wait=wait)
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-        try:
-            holder = _take(path, descriptor, tell, wait=wait)
-        except BaseException:
-            os.close(descriptor)
-            raise
-    except OSError as error:
-        raise MachineError(
-            f"Cannot lock {out}: {error.strerror}.",
-            hint="Check its permissions and the free space, or choose another OUT.",
-        ) from error
-    hold = Hold(path, descriptor, holder)
+        for shard in sorted(path.parent.glob(f"{LOCK_FILE}.*")):
+            if _signed(shard) is not None:  # of a process that was killed, or of a machine that this one's lock misses
+                _acquired(shard, tell, wait=wait).close()
+        yield hold
+    finally:
+        hold.close()
+
+
+@contextmanager
+def locked_shard(out: Path, shard: str, *, wait: bool = False, tell: Tell = lambda _text: None) -> Iterator[Hold]:
+    """Hold one shard of an OUT for writing, and the OUT against all but other shards.
+
+    Args:
+        out: Its folder.
+        shard: By name, e.g. ``train.2``.
+        wait: Wait for another that makes the shard, or that has the OUT to itself.
+        tell: Is told whom for.
+
+    Raises:
+        UsageError: if another process makes it, or has the OUT to itself.
+        MachineError: if its file system has no locks, or cannot be written.
+    """
+    path = out / "stages" / LOCK_FILE
+    waiting = _Waiting(path, tell, wait)
+    with _explained(out):
+        shared = os.open(path, FLAGS, 0o666)
+    try:
+        while True:
+            with _explained(out):
+                _wait_for(shared, waiting, fcntl.LOCK_SH)
+                silent = _outlast(path, waiting)
+            hold = _acquired(_shard_file(out, shard), tell, wait=wait)
+            other = _signed(path)
+            if other is None or other == silent or not other.is_elsewhere:
+                break
+            hold.close()  # a machine that this one's lock misses signed meanwhile: it may not have seen us
+            waiting.begin(other)
+    except BaseException:
+        os.close(shared)
+        raise
+    hold.descriptors.append(shared)
     try:
         yield hold
     finally:
         hold.close()
 
 
-def is_locked(out: Path) -> bool:
-    """Whether a splatpipe works in an OUT now, as far as a look tells."""
-    path = out / "stages" / LOCK_FILE
+def _acquired(path: Path, tell: Tell, *, wait: bool) -> Hold:
+    """A lock's file, held alone and signed; the errors are those of ``locked``."""
+    with _explained(path.parents[1]):
+        descriptor = os.open(path, FLAGS, 0o666)
+        try:
+            return Hold(path, descriptor, _take(path, descriptor, tell, wait=wait))
+        except BaseException:
+            os.close(descriptor)
+            raise
+
+
+@contextmanager
+def _explained(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise MachineError(
+            f"Cannot lock {out}: {error.strerror}.",
+            hint="Check its permissions and the free space, or choose another OUT.",
+        ) from error
+
+
+def is_locked(out: Path, shard: str = "") -> bool:
+    """Whether a splatpipe has an OUT to itself now, or makes one of its shards, as far as a look tells.
+
+    Args:
+        out: Its folder.
+        shard: By name; empty for the OUT itself.
+    """
+    path = _shard_file(out, shard) if shard else out / "stages" / LOCK_FILE
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:
@@ -172,19 +237,14 @@ def is_locked(out: Path) -> bool:
 
 def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
     """Lock the file against this machine and others, and sign it."""
-    out = path.parents[1]
     waiting = _Waiting(path, tell, wait)
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not _flocked(descriptor, out):
-        if time.monotonic() > deadline_s:
-            waiting.begin(_signed(path))
-        time.sleep(LOOK_S if wait else LOOK_S / 2)
+    _wait_for(descriptor, waiting, fcntl.LOCK_EX)
     _outlast(path, waiting)
     holder = Holder.here()
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"{json.dumps(asdict(holder))}\n".encode().ljust(WIDTH), 0)
     os.fsync(descriptor)
-    mount = mount_of(out)
+    mount = mount_of(path)
     if mount is not None and mount.kind not in LOCAL_KINDS:
         time.sleep(SETTLE_S)
         if (other := _signed(path)) not in (None, holder):
@@ -210,23 +270,35 @@ class _Waiting:
         if not self.allowed:
             raise _refusal(self.path, other)
         if not self.told:
-            self.tell(
-                f"Another splatpipe ({other or 'unknown'}) is working in {self.path.parents[1]}: waiting for it to end."
-            )
+            self.tell(f"Another splatpipe ({other or 'unknown'}) is {_doing(self.path)}: waiting for it to end.")
             self.told = True
 
 
-def _outlast(path: Path, waiting: _Waiting) -> None:
+def _wait_for(descriptor: int, waiting: _Waiting, kind: int) -> None:
+    """Get the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``; who is waited for where shards are made is one of theirs."""
+    path = waiting.path
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not _flocked(descriptor, path.parents[1], kind):
+        if time.monotonic() > deadline_s:
+            shards = map(_signed, sorted(path.parent.glob(f"{path.name}.*")))
+            waiting.begin(_signed(path) or next(filter(None, shards), None))
+        time.sleep(LOOK_S if waiting.allowed else LOOK_S / 2)
+
+
+def _outlast(path: Path, waiting: _Waiting) -> Holder | None:
     """Wait until what another boot has signed is taken back, or has not been touched for too long.
+
+    Returns:
+        Who signed and has fallen silent; None where nobody is signed in.
 
     Raises:
         UsageError: if it is touched, and nobody wants to wait for it.
     """
     other = _signed(path)
     if other is None or not other.is_elsewhere:
-        return  # this machine's own was killed: it would still hold the lock
+        return None  # this machine's own was killed: it would still hold the lock
     touched, silence_s = _touched(path), 0.0
-    waiting.tell(f"Looking for up to {SILENCE_S:.0f} s whether {other} still works in {path.parents[1]}.")
+    waiting.tell(f"Looking for up to {SILENCE_S:.0f} s whether {other} is still {_doing(path)}.")
     while silence_s < SILENCE_S:
         began_s = time.monotonic()
         time.sleep(LOOK_S)
@@ -234,27 +306,42 @@ def _outlast(path: Path, waiting: _Waiting) -> None:
         # While a server does not answer, nobody's touch arrives: a look that hangs counts as BEAT_S at most.
         silence_s += min(time.monotonic() - began_s, BEAT_S)
         if now != touched:
-            if _signed(path) is None:
-                return
-            touched, silence_s = now, 0.0
+            if (signed := _signed(path)) is None:
+                return None
+            touched, silence_s, other = now, 0.0, signed
             waiting.begin(other)
+    return other
 
 
 def _refusal(path: Path, other: Holder | None) -> UsageError:
     hint = "Wait for it to end (--wait does that), or choose another OUT."
     if other is not None and other.is_elsewhere:  # a server may keep a dead machine's lock: NFS 3 until that is back
         hint += f" If {other.host} has crashed for good, remove {path}."
-    return UsageError(f"Another splatpipe ({other or 'unknown'}) is working in {path.parents[1]}.", hint=hint)
+    return UsageError(f"Another splatpipe ({other or 'unknown'}) is {_doing(path)}.", hint=hint)
 
 
-def _flocked(descriptor: int, out: Path) -> bool:
-    """Try the kernel's lock.
+def _shard_file(out: Path, shard: str) -> Path:
+    return out / "stages" / f"{LOCK_FILE}.{shard}"
+
+
+def _place(path: Path) -> str:
+    """What a lock's file stands for: an OUT, or one of its shards."""
+    shard = path.name.removeprefix(LOCK_FILE).removeprefix(".")
+    return f"{shard} in {path.parents[1]}" if shard else str(path.parents[1])
+
+
+def _doing(path: Path) -> str:
+    return f"{'working in' if path.name == LOCK_FILE else 'making'} {_place(path)}"
+
+
+def _flocked(descriptor: int, out: Path, kind: int) -> bool:
+    """Try the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``.
 
     Raises:
         MachineError: if the file system has none.
     """
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 
-from splatpipe.pipeline.engine.stage import JSON, Summary
+from splatpipe.pipeline.engine.stage import JSON, Shard, Summary
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,10 @@ class Need:
 
 
 Foresight = Callable[[Mapping[str, Summary]], Mapping[str, Need]]
-"""Forecasts by stage from the summaries of those that are done; a stage that nothing is known of is not in it."""
+"""Forecasts by stage from the summaries of those that are done; a stage that nothing is known of is not in it.
+
+A stage's is with all of its shards, one after the other; a shard's own may be there by its name, e.g. ``train.2``.
+"""
 
 
 def unforeseen(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
@@ -44,10 +47,43 @@ def unforeseen(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
     return {}
 
 
+def of_shard(needs: Mapping[str, Need], stage: str, shard: Shard) -> Need | None:
+    """What a shard takes: as it is forecast, else its share of the stage's time and disk, with the stage's memory."""
+    own, of_stage = needs.get(f"{stage}.{shard.number}"), needs.get(stage)
+    if own is not None or of_stage is None:
+        return own
+    share = 1.0 / shard.count
+    return replace(of_stage, cpu_seconds=share * of_stage.cpu_seconds, disk_bytes=round(share * of_stage.disk_bytes))
+
+
+def used_with_shards(used: Mapping[str, JSON], shards: Sequence[Mapping[str, JSON]]) -> dict[str, JSON]:
+    """What a stage took together with its shards, one after the other, for its manifest.
+
+    Args:
+        used: ``seconds``, ``cpu_seconds`` and ``peak_memory_bytes`` of its own body.
+        shards: Manifests of its shards; where there are none, nothing is added.
+    """
+    if not shards:
+        return dict(used)
+    each = [used, *shards]
+    told = [
+        {"key": shard["key"], "disk_bytes": _disk_bytes(shard), **{name: shard[name] for name in used}}
+        for shard in shards
+    ]
+    sums = {name: round(sum(float(one[name]) for one in each), 3) for name in ("seconds", "cpu_seconds")}
+    return {**sums, "peak_memory_bytes": max(int(one["peak_memory_bytes"]) for one in each), "shards": told}
+
+
+def _disk_bytes(manifest: Mapping[str, JSON]) -> int:
+    """What an artifact takes on the disk, with the shards that it was made of."""
+    own = sum(file["size"] for part in manifest["parts"].values() for file in part["files"])
+    return int(own + sum(shard["disk_bytes"] for shard in manifest.get("shards", ())))
+
+
 def used_and_forecast(manifest: Mapping[str, JSON]) -> dict[str, JSON]:
     """What a finished stage took and what had been forecast for it, from its manifest; null where nothing had been."""
-    disk = sum(file["size"] for part in manifest["parts"].values() for file in part["files"])
-    used = {"memory_bytes": manifest["peak_memory_bytes"], "cpu_seconds": manifest["cpu_seconds"], "disk_bytes": disk}
+    used = {"memory_bytes": manifest["peak_memory_bytes"], "cpu_seconds": manifest["cpu_seconds"]}
+    used["disk_bytes"] = _disk_bytes(manifest)
     forecast = manifest.get("forecast")
     return {"used": used, "forecast": None if forecast is None else {name: forecast[name] for name in used}}
 

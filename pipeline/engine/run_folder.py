@@ -159,6 +159,16 @@ class RunFolder:
         return [name.as_posix() for name in names if (self.out / name).is_file()]
 
 
+def shard_events(out: Path, shard: str) -> Path:
+    """Where a process that makes a shard alone tells of it.
+
+    Args:
+        out: The OUT.
+        shard: By name, e.g. ``train.2``.
+    """
+    return Store(out).shards / f"{shard}.jsonl"
+
+
 def open_run_folder(out: Path, stages: Sequence[Stage]) -> RunFolder:
     """The run in a folder.
 

@@ -6,15 +6,13 @@ import importlib.metadata
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from pydantic import BaseModel
 
-from splatpipe.pipeline.engine.config import settings_of
 from splatpipe.pipeline.engine.errors import (
     EXIT_INPUT,
     MachineError,
@@ -26,9 +24,10 @@ from splatpipe.pipeline.engine.errors import (
 )
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
+from splatpipe.pipeline.engine.line import Job, Line, explain, survey
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
-from splatpipe.pipeline.engine.needs import Foresight, unforeseen
-from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary
+from splatpipe.pipeline.engine.needs import Foresight, of_shard, unforeseen, used_with_shards
+from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary, stage_name
 from splatpipe.pipeline.engine.store import MIN_FREE_BYTES, Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.worker import Task
 
@@ -43,91 +42,6 @@ VERSIONED = (
     "pillow",
     "pyproj",
 )
-State = Literal["valid", "stale", "missing", "waiting"]
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line with everything that its answer depends on.
-
-    Attributes:
-        stages: In order; each reads parts of those before it.
-        config: The resolved configuration, a section a stage.
-        source: External parts by name, e.g. ``source.photos``.
-        photos_dir: The user's folder.
-    """
-
-    stages: Sequence[Stage]
-    config: BaseModel
-    source: Mapping[str, Part]
-    photos_dir: Path
-
-    def needed(self, until: str | None = None) -> list[Stage]:
-        """The stages to walk from what the source does not give: those that lead to ``until``, else to deliverables."""
-        names = [stage.name for stage in self.stages]
-        last = names.index(until) if until else len(names) - 1
-        wanted = {names[last]} if until else {names[last], *(stage.name for stage in self.stages if stage.deliverables)}
-        for stage in reversed(self.stages[: last + 1]):
-            if stage.name in wanted:
-                wanted |= {part.split(".")[0] for part in stage.reads if part not in self.source}
-        return [stage for stage in self.stages[: last + 1] if stage.name in wanted]
-
-    def inputs_of(self, stage: Stage, parts: Mapping[str, Part]) -> StageInputs:
-        """What a stage's key is made of."""
-        reads = {name: parts[name].digest for name in stage.reads}
-        return StageInputs(stage.name, stage.version, *settings_of(self.config, stage), reads)
-
-
-@dataclass(frozen=True)
-class Standing:
-    """Where a stage stands without running anything: its artifact where it is valid, else why it is not."""
-
-    stage: Stage
-    state: State
-    key: str = ""
-    reason: str = ""
-    artifact: Artifact | None = None
-
-
-def survey(line: Line, store: Store) -> Iterator[Standing]:
-    """Say of every needed stage whether it is valid, and if not why, without running anything."""
-    parts = dict(line.source)
-    for stage in line.needed():
-        missing = [name for name in stage.reads if name not in parts]
-        if missing:
-            behind = sorted({name.split(".")[0] for name in missing})
-            yield Standing(stage, "waiting", reason=f"waits for {', '.join(behind)}")
-            continue
-        inputs = line.inputs_of(stage, parts)
-        artifact = store.find(stage, inputs.key)
-        if artifact is None:
-            earlier = store.artifacts(stage.name)
-            yield Standing(stage, "stale" if earlier else "missing", inputs.key, explain(inputs, earlier))
-        else:
-            parts.update(artifact.parts)
-            yield Standing(stage, "valid", inputs.key, artifact=artifact)
-
-
-def explain(inputs: StageInputs, earlier: Iterable[Artifact]) -> str:
-    """Why a stage has to run, against its newest artifact."""
-    newest = next(iter(earlier), None)
-    if newest is None:
-        return "not run yet"
-    before = newest.manifest["inputs"]
-    reasons = []
-    if before["version"] != inputs.version:
-        reasons.append(f"splatpipe's {inputs.stage} changed")
-    for mine, old, prefix in (
-        (inputs.config, before["config"], f"{inputs.stage}."),
-        (inputs.borrowed, before["borrowed"], ""),
-    ):
-        reasons += [
-            f"{prefix}{name} changed from {old.get(name)} to {mine.get(name)}"
-            for name in sorted({*mine, *old})
-            if mine.get(name) != old.get(name)
-        ]
-    reasons += [f"{name} changed" for name in inputs.reads if before["reads"].get(name) != inputs.reads[name]]
-    return ", ".join(reasons) or "its files are damaged or gone"
 
 
 @dataclass
@@ -183,52 +97,79 @@ class Runner:
         needed = self.line.needed(until)
         with self._told([stage.name for stage in needed]):
             for stage in needed:
-                inputs = self.line.inputs_of(stage, parts)
-                artifact = self.store.find(stage, inputs.key)
-                if artifact is not None and stage.name not in rerun:
-                    data = {"summary": artifact.summary, "seconds": artifact.manifest["seconds"], "key": inputs.key}
-                    self.sink(Event("stage_reused", stage.name, data))
-                else:
-                    reason = "asked for" if artifact else explain(inputs, self.store.artifacts(stage.name))
-                    artifact = self._run(stage, inputs, parts, reason)
-                outcome.artifacts[stage.name] = artifact
+                job = Job(stage, self.line.inputs_of(stage, parts))
+                artifact = self._found(job, anew=stage.name in rerun)
+                if artifact is None:
+                    artifact = self._make(job, parts, anew=stage.name in rerun)
                 parts.update(artifact.parts)
                 with self._explained():
                     self.store.deliver(artifact, stage)
         return outcome
 
     def run_alone(self, name: str) -> Outcome:
-        """Run one stage again, whether or not it is valid, and nothing else.
+        """Run one stage again, whether or not it is valid, and nothing else but those of its shards that are missing.
 
         Raises:
             UsageError: if a stage that it reads from is not valid.
         """
         with self._explained():
             self.store.recover()
-        outcome = self.outcome
+        stage, parts = self._ready(name)
+        with self._explained():
+            self.save_config(self.line.config)
+        with self._told([name]):
+            artifact = self._make(Job(stage, self.line.inputs_of(stage, parts)), parts)
+            with self._explained():
+                self.store.deliver(artifact, stage)
+        return self.outcome
+
+    def run_shard(self, name: str, number: int) -> Outcome:
+        """Make one shard of a stage and nothing else; one that is there is reused.
+
+        Args:
+            name: The stage's.
+            number: The shard's, from 1 on.
+
+        Raises:
+            UsageError: if there is no such shard, or a stage that it reads from is not valid.
+        """
+        with self._explained():
+            self.store.recover(f"{name}.{number}")
+        stage, parts = self._ready(name)
+        jobs = self.line.shards_of(stage, parts)
+        if not 1 <= number <= len(jobs):
+            has = f"{len(jobs)} here" if stage.shards else "none"
+            raise UsageError(
+                f"The stage {name} has no shard {number}: it has {has}.",
+                hint=f"Leave --shard out, or see splatpipe status {self.store.out}",
+            )
+        job = jobs[number - 1]
+        with self._told([job.stage.name]):
+            self._found(job) or self._run(job, parts)
+        return self.outcome
+
+    def _ready(self, name: str) -> tuple[Stage, dict[str, Part]]:
+        """A stage, and the parts that valid stages before it left.
+
+        Raises:
+            UsageError: if one of them is not valid.
+        """
         parts = dict(self.line.source)
         for standing in survey(self.line, self.store):
             if standing.stage.name == name:
                 break
             if standing.artifact is not None:
-                outcome.artifacts[standing.stage.name] = standing.artifact
+                self.outcome.artifacts[standing.stage.name] = standing.artifact
                 parts.update(standing.artifact.parts)
         stage = next(stage for stage in self.line.stages if stage.name == name)
-        absent = {part.split(".")[0] for part in stage.reads if part not in parts}
+        absent = {stage_name(part) for part in stage.reads if part not in parts}
         missing = [earlier.name for earlier in self.line.stages if earlier.name in absent]
         if missing:
             raise UsageError(
                 f"The stage {name} reads what {', '.join(missing)} leaves, and that is not there or no longer valid.",
                 hint=f"Run the line up to there first: splatpipe run PHOTOS {self.store.out} --until {missing[-1]}",
             )
-        with self._explained():
-            self.save_config(self.line.config)
-        with self._told([name]):
-            artifact = self._run(stage, self.line.inputs_of(stage, parts), parts, "asked for")
-            outcome.artifacts[name] = artifact
-            with self._explained():
-                self.store.deliver(artifact, stage)
-        return outcome
+        return stage, parts
 
     @contextmanager
     def _told(self, stages: Sequence[str]) -> Iterator[None]:
@@ -248,35 +189,58 @@ class Runner:
             with suppress(OSError, MachineError):  # a full disk, or a taken one, is what ended it, and is told
                 self.sink(Event("run_finished", data={"exit_code": exit_code(ended), **told, "seconds": seconds}))
 
-    def _run(self, stage: Stage, inputs: StageInputs, parts: Mapping[str, Part], reason: str) -> Artifact:
-        outcome = self.outcome
+    def _found(self, job: Job, *, anew: bool = False) -> Artifact | None:
+        """The valid artifact of a job, told of as reused; None where it is to be made."""
+        artifact = None if anew else self.store.find(job.stage, job.inputs.key)
+        if artifact is not None:
+            data = {"summary": artifact.summary, "seconds": artifact.manifest["seconds"], "key": artifact.key}
+            self.sink(Event("stage_reused", job.stage.name, data))
+            self.outcome.artifacts[job.stage.name] = artifact
+        return artifact
+
+    def _make(self, job: Job, parts: Mapping[str, Part], *, anew: bool = False) -> Artifact:
+        """Make a stage: those of its shards that are missing, one after the other, then what it joins them to.
+
+        One whose process dies costs itself alone: the others are made before that is told.
+
+        Args:
+            job: The stage's.
+            parts: That are there.
+            anew: Make all shards, also those that are there.
+        """
+        shards: list[Artifact] = []
+        failures: list[tuple[str, StageError]] = []
+        for shard in self.line.shards_of(job.stage, parts):
+            try:
+                shards.append(self._found(shard, anew=anew) or self._run(shard, parts))
+            except StageError as error:
+                failures.append((shard.stage.name, error))
+        if failures:
+            self.outcome.failed, first = failures[0]
+            raise first
+        return self._run(job, parts, shards)
+
+    def _run(self, job: Job, parts: Mapping[str, Part], shards: Sequence[Artifact] = ()) -> Artifact:
+        stage, inputs, outcome = job.stage, job.inputs, self.outcome
         outcome.failed = stage.name
         began_s = time.monotonic()
+        known = self.store.find(stage, inputs.key) is not None
+        reason = "asked for" if known else explain(inputs, self.store.artifacts(stage.name))
+        reason = f"{job.shard}: {reason}" if job.shard else reason
         self.sink(Event("stage_started", stage.name, {"reason": reason, "key": inputs.key}))
         try:
             with self._explained():
                 self._check_space()
                 partial = self.store.begin(stage, inputs.key)
-                task = Task(
-                    stage=stage.name,
-                    entry=stage.entry,
-                    config_type=f"{stage.config.__module__}:{stage.config.__qualname__}",
-                    config=dict(inputs.config),
-                    parts={name: str(parts[name].path) for name in stage.reads},
-                    photos_dir=str(self.line.photos_dir),
-                    settings=dict(inputs.borrowed),
-                    summaries={name: dict(done.summary) for name, done in outcome.artifacts.items()},
-                    machine=asdict(self.machine),
-                    out=str(partial),
-                )
-                result = self.executor.run(task, self.sink)
+                result = self.executor.run(self._task(job, parts, shards, partial), self.sink)
                 self._check_source(stage)
                 summary: Summary = result.pop("summary")
+                result = used_with_shards(result, [shard.manifest for shard in shards])
                 run = {
                     **result,
                     "machine": {**asdict(self.machine), **describe_machine()},
                     "versions": versions(),
-                    **self._forecast(stage),
+                    **self._forecast(job),
                 }
                 artifact = self.store.commit(stage, inputs, partial, summary, run)
         except (SplatpipeError, Stopped, KeyboardInterrupt) as error:
@@ -285,13 +249,33 @@ class Runner:
             raise
         outcome.ran.append(stage.name)
         outcome.failed = ""
+        outcome.artifacts[stage.name] = artifact
         self.sink(Event("stage_finished", stage.name, {"summary": summary, **result, "key": inputs.key}))
         return artifact
 
-    def _forecast(self, stage: Stage) -> dict[str, JSON]:
-        """What the stage was thought to take, for its manifest; empty where nobody could know."""
+    def _task(self, job: Job, parts: Mapping[str, Part], shards: Sequence[Artifact], partial: Path) -> Task:
+        stage = job.stage
+        return Task(
+            stage=stage.name,
+            entry=stage.entry,
+            config_type=f"{stage.config.__module__}:{stage.config.__qualname__}",
+            config=dict(job.inputs.config),
+            parts={name: str(parts[name].path) for name in stage.reads},
+            photos_dir=str(self.line.photos_dir),
+            settings=dict(job.inputs.borrowed),
+            summaries={name: dict(done.summary) for name, done in self.outcome.artifacts.items()},
+            machine=asdict(self.machine),
+            out=str(partial),
+            shard=asdict(job.shard) if job.shard else None,
+            shards=[str(shard.folder) for shard in shards],
+        )
+
+    def _forecast(self, job: Job) -> dict[str, JSON]:
+        """What was thought to be taken, for the manifest; empty where nobody could know."""
         needs = self.foresee({name: done.summary for name, done in self.outcome.artifacts.items()})
-        return {"forecast": needs[stage.name].as_json()} if stage.name in needs else {}
+        name = stage_name(job.stage.name)
+        need = of_shard(needs, name, job.shard) if job.shard else needs.get(name)
+        return {} if need is None else {"forecast": need.as_json()}
 
     def _failed(self, inputs: StageInputs, seconds: float, error: BaseException) -> Event:
         """The event of a stage's bad end; the worker still lives, so that its memory can be told."""

@@ -17,10 +17,11 @@ from splatpipe.pipeline.engine.digests import HashTable
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
 from splatpipe.pipeline.engine.executor import Executor
-from splatpipe.pipeline.engine.lock import locked
+from splatpipe.pipeline.engine.line import Line
+from splatpipe.pipeline.engine.lock import locked, locked_shard
 from splatpipe.pipeline.engine.needs import Foresight, unforeseen
-from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_FILE
-from splatpipe.pipeline.engine.runner import Line, Runner
+from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_FILE, shard_events
+from splatpipe.pipeline.engine.runner import Runner
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Machine, Stage
 from splatpipe.pipeline.engine.store import Part, Store, open_store, unwritable
@@ -48,13 +49,15 @@ class Request:
 
 
 @contextmanager
-def open_session(request: Request, show: Sink, *, wait: bool = False) -> Iterator[Runner]:
+def open_session(request: Request, show: Sink, *, wait: bool = False, shard: str = "") -> Iterator[Runner]:
     """Everything that a run needs, held for its length.
 
     Args:
         request: What to run.
         show: Shows events to the user.
         wait: Wait for another splatpipe that works there.
+        shard: The only one that is to be made, e.g. ``train.2``: others may be by other processes at the same time.
+            It has its own log and events; nothing else of OUT's is written.
 
     Yields:
         The runner.
@@ -68,9 +71,13 @@ def open_session(request: Request, show: Sink, *, wait: bool = False) -> Iterato
     def tell(message: str) -> None:
         show(Event("note", data={"message": message}))
 
-    with locked(store.out, wait=wait, tell=tell) as hold:
-        log = _open_log(store)
-        executor = Executor(store.out / LOG_FILE, hold.descriptor, _worker_environment(request.machine.threads))
+    held = locked_shard(store.out, shard, wait=wait, tell=tell) if shard else locked(store.out, wait=wait, tell=tell)
+    events, said = store.out / EVENTS_FILE, store.out / LOG_FILE
+    if shard:
+        events, said = shard_events(store.out, shard), store.shards / f"{shard}.log"
+    with held as hold:
+        log = _open_log(store, events)
+        executor = Executor(said, tuple(hold.descriptors), _worker_environment(request.machine.threads))
         try:
 
             def sink(event: Event) -> None:
@@ -78,7 +85,7 @@ def open_session(request: Request, show: Sink, *, wait: bool = False) -> Iterato
                 log(event)
                 hold.confirm()
 
-            digests = partial(_digests, request, store, EventReporter("source", sink), remember=True)
+            digests = partial(_digests, request, store, EventReporter("source", sink), remember=not shard)
             line = _open_line(request, digests())
             save = partial(_save_config, store, source.folder)
             yield Runner(line, store, executor, request.machine, sink, digests, save, request.foresee)
@@ -91,9 +98,9 @@ def open_session(request: Request, show: Sink, *, wait: bool = False) -> Iterato
             log.close()
 
 
-def _open_log(store: Store) -> EventLog:
+def _open_log(store: Store, path: Path) -> EventLog:
     try:
-        return EventLog(store.out / EVENTS_FILE)
+        return EventLog(path)
     except OSError as error:
         raise unwritable(store.out, error) from error
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -59,6 +59,45 @@ class NamedFile:
 
 
 @dataclass(frozen=True)
+class Shard:
+    """Which piece of a stage's work.
+
+    Attributes:
+        number: From 1 on.
+        count: How many there are.
+    """
+
+    number: int
+    count: int
+
+    @property
+    def index(self) -> int:
+        """Its place in a list of them."""
+        return self.number - 1
+
+    def __str__(self) -> str:
+        return f"shard {self.number} of {self.count}"
+
+
+@dataclass(frozen=True)
+class Shards:
+    """How a stage's work is divided: into pieces that any process may make, each an artifact of its own.
+
+    Attributes:
+        counted_by: The part, one that the stage reads, that says how many: a JSON object with ``shards``. With 0 the
+            stage's own body does all of it.
+        parts: What each leaves: part name to the file or folder below the shard's own folder.
+        entry: ``module:function`` of the body that makes one; ``Inputs.shard`` says which.
+        resumable: A shard's partial folder is kept after a kill, for the body to go on from.
+    """
+
+    counted_by: str
+    parts: Mapping[str, str]
+    entry: str
+    resumable: bool = False
+
+
+@dataclass(frozen=True)
 class Stage:
     """One step of the line.
 
@@ -74,6 +113,7 @@ class Stage:
         files: Files of the user's by the option that names them (``auto``, ``none`` or a path). Their content is in the
             key and the option is not: the body knows the part alone.
         deliverables: Parts that are copied into OUT for people (a folder part: what is in it).
+        shards: How its work is divided; its own body joins them. None: it is one piece.
     """
 
     name: str
@@ -86,6 +126,36 @@ class Stage:
     resumable: bool = False
     files: Mapping[str, NamedFile] = field(default_factory=dict)
     deliverables: tuple[str, ...] = ()
+    shards: Shards | None = None
+
+    def shard(self, number: int) -> Stage:
+        """What makes one of its shards: a stage as any other, of the same options and inputs.
+
+        Args:
+            number: From 1 on.
+        """
+        assert self.shards is not None
+        return replace(
+            self,
+            name=f"{self.name}.{number}",
+            parts=self.shards.parts,
+            entry=self.shards.entry,
+            resumable=self.shards.resumable,
+            deliverables=(),
+            shards=None,
+        )
+
+
+def stage_name(name: str) -> str:
+    """The stage that a name belongs to: of ``train.2``, its second shard, as of ``train`` that is ``train``."""
+    return name.partition(".")[0]
+
+
+def shards_first(names: Iterable[str]) -> list[str]:
+    """Names of stages in their order, each shard's before its stage's: it is heard of when it begins."""
+    listed = list(names)
+    place = {name: at for at, name in enumerate(listed)}
+    return sorted(listed, key=lambda name: (place.get(stage_name(name), len(listed)), name == stage_name(name)))
 
 
 @dataclass(frozen=True)
@@ -98,6 +168,8 @@ class Inputs:
         settings: The borrowed settings, by their dotted names.
         machine: Device and threads.
         summaries: What the stages before it returned; outside the key, so only for what people read (timings).
+        shard: Which one to make; None for a stage's own body.
+        shards: Folders of the stage's shards in order, for its own body to join; empty where it has none.
     """
 
     parts: Mapping[str, Path]
@@ -105,6 +177,8 @@ class Inputs:
     settings: Mapping[str, JSON] = field(default_factory=dict)
     machine: Machine = field(default_factory=Machine)
     summaries: Mapping[str, Summary] = field(default_factory=dict)
+    shard: Shard | None = None
+    shards: tuple[Path, ...] = ()
 
     def __getitem__(self, part: str) -> Path:
         return self.parts[part]

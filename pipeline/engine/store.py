@@ -89,6 +89,7 @@ class Store:
         self.out = out
         self.stages = out / "stages"
         self.partials = self.stages / ".partial"
+        self.shards = self.stages / ".shards"  # what processes that made one alone have told
 
     def find(self, stage: Stage, key: str) -> Artifact | None:
         """The finished artifact of that key, if all of its files are there with their sizes."""
@@ -178,9 +179,15 @@ class Store:
             )
         return artifact
 
-    def recover(self) -> None:
-        """Finish the rename that a killed run had begun, and drop what it had replaced."""
+    def recover(self, shard: str = "") -> None:
+        """Finish the rename that a killed run had begun, and drop what it had replaced.
+
+        Args:
+            shard: The only one that is held; empty where the whole OUT is.
+        """
         for partial in sorted(self.partials.glob("*")):
+            if shard and not partial.name.removeprefix("replaced-").startswith(f"{shard}-"):
+                continue
             if partial.name.startswith("replaced-"):
                 shutil.rmtree(partial, ignore_errors=True)
             elif (partial / "manifest.json").is_file():
@@ -305,6 +312,7 @@ def open_store(out: Path, *, create: bool) -> Store:
         store.partials.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=store.partials) as probe:
             probe.write(canonical(FORMAT))
+        store.shards.mkdir(exist_ok=True)
         format_file = store.stages / "format.json"
         if not format_file.exists():
             write_durably(format_file, json.dumps({"format": FORMAT}))

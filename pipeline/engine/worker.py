@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import IO
@@ -27,7 +27,7 @@ from splatpipe.pipeline.engine.children import CHILDREN_MEMORY, die_with_parent
 from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, SplatpipeError, StageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.heap import return_free_heap
-from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, StageConfig, load_body
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Shard, StageConfig, load_body
 
 NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # of libraries' errors, in small letters
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
@@ -49,6 +49,8 @@ class Task:
         summaries: Summaries of the stages before it.
         machine: Device and threads.
         out: Where it writes.
+        shard: Number and count of the shard that it is to make; None for a stage's own body.
+        shards: Folders of the stage's shards.
     """
 
     stage: str
@@ -61,6 +63,8 @@ class Task:
     summaries: dict[str, JSON]
     machine: dict[str, JSON]
     out: str
+    shard: dict[str, int] | None = None
+    shards: list[str] = field(default_factory=list)
 
     def inputs(self) -> Inputs:
         """What the body is given."""
@@ -70,6 +74,8 @@ class Task:
             self.settings,
             Machine(**self.machine),
             self.summaries,
+            None if self.shard is None else Shard(**self.shard),
+            tuple(map(Path, self.shards)),
         )
 
 

@@ -80,7 +80,7 @@ def hold(out: Path) -> Iterator[int]:
             except UsageError:
                 if time.monotonic() > deadline:
                     raise
-        yield held.descriptor
+        yield held.descriptors[0]
 
 
 def fresh_call(out: Path, name: str = "call") -> Call:

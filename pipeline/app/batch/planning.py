@@ -19,11 +19,11 @@ from splatpipe.pipeline.app.report.story import read_story
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
+from splatpipe.pipeline.engine.line import Line, Standing, survey
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE
-from splatpipe.pipeline.engine.runner import Line, Standing, survey
 from splatpipe.pipeline.engine.session import Request, survey_line
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.store import Part, is_copy

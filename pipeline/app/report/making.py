@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.wording import count, duration, moment, plural, size
+from splatpipe.pipeline.engine.stage import shards_first
 from splatpipe.stages.line import LINE
 
 Chapter = dict[str, Any]
@@ -37,7 +38,8 @@ def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
         holdings: What there is.
         drawn: Whether to draw charts.
     """
-    rows = [_stage_row(holdings, stage.name) for stage in LINE]
+    names = dict.fromkeys((*(stage.name for stage in LINE), *holdings.story.stages))
+    rows = [_stage_row(holdings, name) for name in shards_first(names)]
     rows = [row for row in rows if row["state"] != "not asked for" or row["made"]]
     versions, machine = dict(holdings.story.versions), dict(holdings.story.machine)
     for artifact in holdings.artifacts.values():

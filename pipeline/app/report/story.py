@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatpipe.pipeline.engine.events import Event, parse_event
+from splatpipe.pipeline.engine.stage import shards_first
 
 Facts = Mapping[str, Any]
 State = Literal["finished", "reused", "failed", "stopped", "broken off", "running", "not reached"]
@@ -154,6 +155,7 @@ class _Reader:
     def finish(self, running: bool) -> Story:
         story = self._story
         story.running, story.keys = running, dict(self._keys)
+        story.stages = {name: story.stages[name] for name in shards_first(story.stages)}
         for stage in story.stages.values():
             if stage.state == "running" and not running:
                 stage.state = "broken off"

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number, plural, share
+from splatpipe.pipeline.engine.stage import stage_name
 from splatpipe.stages.line import LINE
 
 Level = Literal["good", "doubt", "bad"]
@@ -82,7 +83,7 @@ def _ended(holdings: Holdings) -> tuple[Finding | None, str]:
         last = [stage.name for stage in LINE if stage.name in holdings.artifacts][-1:]
         if last == [LINE[-1].name]:
             return None, f"The run ended on {when}."
-        gone = [name for name in story.stages if name not in holdings.artifacts]
+        gone = [name for name in story.stages if name == stage_name(name) and name not in holdings.artifacts]
         if gone:
             lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or cannot be read any more."
             return Finding("bad", "Finished, but its results are damaged", f"{lost} The same command mends it."), ""

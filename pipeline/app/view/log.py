@@ -12,7 +12,7 @@ from splatpipe.pipeline.app.view.files import NotThereError, open_inside
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import parse_event
 from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
-from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.stage import JSON, shards_first, stage_name
 from splatpipe.stages.options import LineConfig
 
 LONGEST_LINE = 1 << 18
@@ -171,7 +171,10 @@ class RunLog:
         elif kind in ("note", "warning"):
             told = {"kind": kind, "stage": stage, "message": str(data["message"]), "hint": str(data.get("hint", ""))}
             self.notes = [*self.notes, told][-MOST_NOTES:]
-        elif stage in self.stages:
+        elif stage_name(stage) in self.stages:
+            if stage not in self.stages:  # a shard that begins
+                known = {**self.stages, stage: StageState(stage)}
+                self.stages = {name: known[name] for name in shards_first(known)}
             self._stage_event(kind, self.stages[stage], data, time_s)
 
     @property

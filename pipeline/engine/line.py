@@ -1,0 +1,166 @@
+"""A line with all that its answer depends on, and where its stages and their shards stand, without running anything."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel
+
+from splatpipe.pipeline.engine.config import settings_of
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.lock import is_locked
+from splatpipe.pipeline.engine.stage import Shard, Stage, stage_name
+from splatpipe.pipeline.engine.store import Artifact, Part, StageInputs, Store
+
+State = Literal["valid", "stale", "missing", "waiting"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What one process makes: a stage's artifact, or a shard's.
+
+    Attributes:
+        stage: What makes it: of a shard as ``Stage.shard`` says.
+        inputs: What its answer depends on.
+        shard: Which one; None for a stage's own.
+    """
+
+    stage: Stage
+    inputs: StageInputs
+    shard: Shard | None = None
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line with everything that its answer depends on.
+
+    Attributes:
+        stages: In order; each reads parts of those before it.
+        config: The resolved configuration, a section a stage.
+        source: External parts by name, e.g. ``source.photos``.
+        photos_dir: The user's folder.
+    """
+
+    stages: Sequence[Stage]
+    config: BaseModel
+    source: Mapping[str, Part]
+    photos_dir: Path
+
+    def needed(self, until: str | None = None) -> list[Stage]:
+        """The stages to walk from what the source does not give: those that lead to ``until``, else to deliverables."""
+        names = [stage.name for stage in self.stages]
+        last = names.index(until) if until else len(names) - 1
+        wanted = {names[last]} if until else {names[last], *(stage.name for stage in self.stages if stage.deliverables)}
+        for stage in reversed(self.stages[: last + 1]):
+            if stage.name in wanted:
+                wanted |= {stage_name(part) for part in stage.reads if part not in self.source}
+        return [stage for stage in self.stages[: last + 1] if stage.name in wanted]
+
+    def inputs_of(self, stage: Stage, parts: Mapping[str, Part]) -> StageInputs:
+        """What a stage's key is made of."""
+        reads = {name: parts[name].digest for name in stage.reads}
+        return StageInputs(stage.name, stage.version, *settings_of(self.config, stage), reads)
+
+    def shards_of(self, stage: Stage, parts: Mapping[str, Part]) -> list[Job]:
+        """A stage's shards in order, each with a key of its own, which nothing of the others is in.
+
+        Raises:
+            StageError: if the part that counts them does not.
+        """
+        if stage.shards is None:
+            return []
+        count = _counted(parts[stage.shards.counted_by].path, stage.name)
+        inputs = self.inputs_of(stage, parts)
+        pieces = [(stage.shard(number), Shard(number, count)) for number in range(1, count + 1)]
+        return [Job(piece, replace(inputs, stage=piece.name), shard) for piece, shard in pieces]
+
+
+def _counted(path: Path, stage: str) -> int:
+    try:
+        count = json.loads(path.read_text(encoding="utf-8"))["shards"]
+    except (OSError, ValueError, KeyError, TypeError):
+        count = None
+    if type(count) is not int or count < 0:
+        raise StageError(
+            f"{path} does not say how many shards {stage} has.", hint="This is a fault of splatpipe; please report it."
+        )
+    return count
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a stage stands without running anything: its artifact where it is valid, else why it is not.
+
+    Attributes:
+        stage: The stage, or what makes a shard.
+        state: Whether it is there.
+        key: Of its artifact; empty where it waits for others.
+        reason: Why it is not there.
+        artifact: What is there.
+        shards: Where its shards stand.
+    """
+
+    stage: Stage
+    state: State
+    key: str = ""
+    reason: str = ""
+    artifact: Artifact | None = None
+    shards: tuple[Standing, ...] = ()
+
+    @property
+    def wanted(self) -> list[tuple[str, str]]:
+        """Names and keys of what is asked for: its own and its shards'."""
+        return [(self.stage.name, self.key), *((shard.stage.name, shard.key) for shard in self.shards)]
+
+
+def survey(line: Line, store: Store) -> Iterator[Standing]:
+    """Say of every needed stage whether it is valid, and if not why, without running anything."""
+    parts = dict(line.source)
+    for stage in line.needed():
+        missing = [name for name in stage.reads if name not in parts]
+        if missing:
+            behind = sorted(set(map(stage_name, missing)))
+            yield Standing(stage, "waiting", reason=f"waits for {', '.join(behind)}")
+            continue
+        shards = tuple(_standing(job, store) for job in line.shards_of(stage, parts))
+        standing = replace(_standing(Job(stage, line.inputs_of(stage, parts)), store), shards=shards)
+        if standing.artifact is not None:
+            parts.update(standing.artifact.parts)
+        yield standing
+
+
+def _standing(job: Job, store: Store) -> Standing:
+    stage, key = job.stage, job.inputs.key
+    artifact = store.find(stage, key)
+    if artifact is not None:
+        return Standing(stage, "valid", key, artifact=artifact)
+    earlier = store.artifacts(stage.name)
+    if job.shard is not None and is_locked(store.out, stage.name):
+        return Standing(stage, "missing", key, "is being made")
+    return Standing(stage, "stale" if earlier else "missing", key, explain(job.inputs, earlier))
+
+
+def explain(inputs: StageInputs, earlier: Iterable[Artifact]) -> str:
+    """Why a stage has to run, against its newest artifact."""
+    newest = next(iter(earlier), None)
+    if newest is None:
+        return "not run yet"
+    before, stage = newest.manifest["inputs"], stage_name(inputs.stage)
+    reasons = []
+    if before["version"] != inputs.version:
+        reasons.append(f"splatpipe's {stage} changed")
+    for mine, old, prefix in (
+        (inputs.config, before["config"], f"{stage}."),
+        (inputs.borrowed, before["borrowed"], ""),
+    ):
+        reasons += [
+            f"{prefix}{name} changed from {old.get(name)} to {mine.get(name)}"
+            for name in sorted({*mine, *old})
+            if mine.get(name) != old.get(name)
+        ]
+    reasons += [f"{name} changed" for name in inputs.reads if before["reads"].get(name) != inputs.reads[name]]
+    return ", ".join(reasons) or "its files are damaged or gone"
