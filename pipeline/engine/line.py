@@ -71,12 +71,23 @@ class Line:
         Raises:
             StageError: if the part that counts them does not.
         """
-        if stage.shards is None:
+        pieces = self.pieces_of(stage, parts)
+        inputs = self.inputs_of(stage, parts)
+        return [
+            Job(piece, replace(inputs, stage=piece.name), Shard(number, len(pieces)))
+            for number, piece in enumerate(pieces, 1)
+        ]
+
+    def pieces_of(self, stage: Stage, parts: Mapping[str, Part]) -> list[Stage]:
+        """What makes each of a stage's shards; empty as long as the part that counts them is not there.
+
+        Raises:
+            StageError: if that part does not count them.
+        """
+        if stage.shards is None or stage.shards.counted_by not in parts:
             return []
         count = _counted(parts[stage.shards.counted_by].path, stage.name)
-        inputs = self.inputs_of(stage, parts)
-        pieces = [(stage.shard(number), Shard(number, count)) for number in range(1, count + 1)]
-        return [Job(piece, replace(inputs, stage=piece.name), shard) for piece, shard in pieces]
+        return [stage.shard(number) for number in range(1, count + 1)]
 
 
 def _counted(path: Path, stage: str) -> int:
@@ -124,7 +135,9 @@ def survey(line: Line, store: Store) -> Iterator[Standing]:
         missing = [name for name in stage.reads if name not in parts]
         if missing:
             behind = sorted(set(map(stage_name, missing)))
-            yield Standing(stage, "waiting", reason=f"waits for {', '.join(behind)}")
+            reason = f"waits for {', '.join(behind)}"
+            waiting = tuple(Standing(piece, "waiting", reason=reason) for piece in line.pieces_of(stage, parts))
+            yield Standing(stage, "waiting", reason=reason, shards=waiting)
             continue
         shards = tuple(_standing(job, store) for job in line.shards_of(stage, parts))
         standing = replace(_standing(Job(stage, line.inputs_of(stage, parts)), store), shards=shards)

@@ -4,10 +4,13 @@ import json
 import os
 import signal
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from arithmetic import READ, ReadConfig
 
+from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shards, Stage, StageConfig, Summary
 
 KILL_VARIABLE = "SHARDED_KILL"  # names the shard whose process dies of SIGKILL half-way
@@ -93,3 +96,28 @@ SUM = Stage(
 SHOW = Stage("show", 1, ShowConfig, ("sum.total",), {"shown": "shown.txt"}, "sharded:show", deliverables=("shown",))
 
 LINE = (READ, DIVIDE, SUM, SHOW)
+
+
+@dataclass(frozen=True)
+class Forecaster:
+    """What the line takes, for where the whole program runs on it (`sharded_site`)."""
+
+    config: LineConfig
+    threads: int
+
+    def __call__(self, _summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
+        return forecast(None, self.config)
+
+
+def forecast(_size: object, config: LineConfig, _threads: int = 1, *, speed: float = 1.0) -> dict[str, Need]:
+    """A hundred million bytes a stage; half of the disk's and a tenth of the time for the third shard."""
+    needs = {stage.name: Need(100_000_000, 60.0, 8_000_000) for stage in LINE}
+    return needs | {"sum.3": Need(100_000_000, 6.0, 4_000_000)}
+
+
+def has_control(_source: object) -> bool:
+    return False
+
+
+def machine_speed() -> float:
+    return 1.0

@@ -13,17 +13,19 @@ from pathlib import Path
 from splatpipe.pipeline.app.batch.pictures import capture_picture
 from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState, Level
-from splatpipe.pipeline.app.batch.tries import Try, TryLog
+from splatpipe.pipeline.app.batch.tries import Try, read_tries
 from splatpipe.pipeline.app.report import REPORT_FILE
 from splatpipe.pipeline.app.report.holdings import Holdings, open_holdings
 from splatpipe.pipeline.app.report.story import read_story
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, SplatpipeError
 from splatpipe.pipeline.engine.machine import available_cores
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
+from splatpipe.pipeline.engine.stage import stage_name
 
 VIEWER_FILE = "viewer.html"
 STOPPED = "It was stopped with the batch."
+LIVELY = ("running", "waiting", "failed", "stopped", "done", "reused")  # of shards side by side, the first one found
 GO_ON = "Repeat the command: it goes on from what is finished."
 
 
@@ -85,32 +87,38 @@ class Account:
             return self._with_facts(failed, planned, ())
         if not planned.jobs:
             return self._with_facts(CaptureState(planned.name, "reused", progress=1.0), planned, ())
-        tries = TryLog(self._call.tries_file(planned.key)).read()
+        tries = read_tries(self._call.tries_files(planned.key))
         return self._with_facts(self._standing(planned, tries, ended=ended), planned, tries)
 
     def _standing(self, planned: PlannedCapture, tries: Sequence[Try], *, ended: bool) -> CaptureState:
-        """Its state and what belongs to it, by its jobs' tries."""
+        """Its state and what belongs to it, by its jobs' tries; of shards side by side the liveliest one's."""
         done = {each.stage for each in tries if each.succeeded}
-        rest = [job for job in planned.jobs if job.stage not in done]
-        if planned.jobs[-1].stage in done:
+        jobs = self._call.jobs(planned)
+        rest = [job for job in jobs if job.stage not in done]
+        if jobs[-1].stage in done:
             most = max(Counter(each.stage for each in tries).values())
             return CaptureState(planned.name, "done", progress=1.0, tries=most, earlier=_reasons(tries))
-        stage = rest[0].stage
-        own = [each for each in tries if each.stage == stage]
-        told = CaptureState(planned.name, "waiting", stage, tries=len(own), earlier=_reasons(tries))
-        fraction = 0.0
-        if own and own[-1].alive and not ended:
-            fraction = self._fraction(planned, stage)
-            told = replace(told, state="running")
-        elif own and not own[-1].alive and self._is_over(own):
-            told = replace(told, state="failed", reason=own[-1].reason, hint=own[-1].hint, earlier=_reasons(tries)[:-1])
-        elif ended:
-            told = replace(told, state="stopped", reason=STOPPED, hint=GO_ON)
+        first = stage_name(rest[0].stage)
+        beside = [job for job in rest if job.stage != first and stage_name(job.stage) == first] or rest[:1]
+        each = [self._job(planned, job.stage, tries, ended=ended) for job in beside]
+        told = min(each, key=lambda state: LIVELY.index(state.state))
+        fractions = {state.stage: state.progress for state in each}
         return replace(
             told,
-            progress=_progress(planned, rest, fraction),
-            left_s=None if told.state in ("failed", "stopped") else _left_s(rest, fraction),
+            progress=_progress(planned, jobs, rest, fractions),
+            left_s=None if told.state in ("failed", "stopped") else _left_s(rest, fractions),
         )
+
+    def _job(self, planned: PlannedCapture, stage: str, tries: Sequence[Try], *, ended: bool) -> CaptureState:
+        """What the capture's state is as far as one job goes; ``progress`` is the job's."""
+        own = [each for each in tries if each.stage == stage]
+        told = CaptureState(planned.name, "waiting", stage, tries=len(own), earlier=_reasons(tries))
+        if own and own[-1].alive and not ended:
+            return replace(told, state="running", progress=self._fraction(planned, stage))
+        if own and not own[-1].alive and self._is_over(own):
+            earlier = tuple(reason for reason in _reasons(tries) if reason != _reasons(own[-1:])[0])
+            return replace(told, state="failed", reason=own[-1].reason, hint=own[-1].hint, earlier=earlier)
+        return replace(told, state="stopped", reason=STOPPED, hint=GO_ON) if ended else told
 
     def _is_over(self, own: Sequence[Try]) -> bool:
         """Whether a stage that ended badly is not begun again."""
@@ -121,7 +129,9 @@ class Account:
 
     def _fraction(self, planned: PlannedCapture, stage: str) -> float:
         """How far a running stage is, by its own events."""
-        story = read_story(self._call.out / planned.name / EVENTS_FILE, running=True)
+        out = self._call.out / planned.name
+        path = out / EVENTS_FILE if stage == stage_name(stage) else shard_events(out, stage)
+        story = read_story(path, running=True)
         found = story.stages.get(stage)
         if found is None or found.state != "running" or not found.told.progress:
             return 0.0
@@ -175,7 +185,7 @@ class Account:
         needed = 0
         for planned in self._plan.captures:
             if planned.name not in over:
-                done = {each.stage for each in TryLog(self._call.tries_file(planned.key)).read() if each.succeeded}
+                done = {each.stage for each in read_tries(self._call.tries_files(planned.key)) if each.succeeded}
                 needed += sum(job.disk_bytes for job in planned.jobs if job.stage not in done)
         return needed
 
@@ -230,18 +240,23 @@ def _reasons(tries: Sequence[Try]) -> tuple[str, ...]:
     return tuple(f"{each.stage}: {each.reason}" for each in tries if each.reason)
 
 
-def _progress(planned: PlannedCapture, rest: Sequence[StageJob], fraction: float) -> float:
-    """Of the whole capture; what was there before counts."""
+def _progress(
+    planned: PlannedCapture, jobs: Sequence[StageJob], rest: Sequence[StageJob], fractions: Mapping[str, float]
+) -> float:
+    """Of the whole capture; what was there before counts. A stage's weight is its jobs' in equal parts."""
     total = sum(planned.weights.values())
     if not total:
         return 0.0
-    weights = [planned.weights.get(job.stage, 0.0) for job in rest]
-    left = sum(weights) - fraction * weights[0]
+    parts = Counter(stage_name(job.stage) for job in jobs)
+    left = 0.0
+    for job in rest:
+        name = stage_name(job.stage)
+        left += planned.weights.get(name, 0.0) / parts[name] * (1.0 - fractions.get(job.stage, 0.0))
     return round(min(1.0, max(0.0, 1.0 - left / total)), 3)
 
 
-def _left_s(rest: Sequence[StageJob], fraction: float) -> float:
-    return sum(job.seconds for job in rest) - fraction * rest[0].seconds
+def _left_s(rest: Sequence[StageJob], fractions: Mapping[str, float]) -> float:
+    return sum(job.seconds * (1.0 - fractions.get(job.stage, 0.0)) for job in rest)
 
 
 def _short(free: int | None, needed: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A job of the workflow, a process of its own: one stage of one capture by `splatpipe run --until`, and how it ended.
+"""A job of the workflow, a process of its own: one stage of one capture by `splatpipe run --until`, or one shard.
 
     python -m splatpipe.pipeline.app.batch.job CALL CAPTURE STAGE THREADS MARKER
 
@@ -20,15 +20,18 @@ from pathlib import Path
 from types import FrameType
 
 from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
-from splatpipe.pipeline.app.batch.tries import HOPELESS, Ending, TryLog
+from splatpipe.pipeline.app.batch.shards import counts_shards, tell_shards
+from splatpipe.pipeline.app.batch.tries import HOPELESS, Ending, TryLog, read_tries, spent_s
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
 from splatpipe.pipeline.app.ending import PART_VARIABLE
 from splatpipe.pipeline.app.report.story import read_story
 from splatpipe.pipeline.engine.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE
-from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
+from splatpipe.pipeline.engine.stage import JSON, stage_name
+from splatpipe.stages.line import LINE
 
+SPLATPIPE = (sys.executable, "-m", "splatpipe.pipeline.app.cli")
 RESERVE_BYTES = 256 << 20  # of the disk, for what other captures' stages are writing at the same time
 
 
@@ -41,16 +44,18 @@ def main() -> None:
         sys.exit(EXIT_TERMINATED)
     plan = call.plan()
     capture = plan.capture(key)
-    log = TryLog(call.tries_file(key))
+    log = TryLog(call.tries_file(key, stage))
     before = [each for each in log.read() if each.stage == stage]
     if before and before[-1].final:
         sys.exit(before[-1].exit_code)
-    job = next(job for job in capture.jobs if job.stage == stage)
+    job = next(job for job in call.jobs(capture) if job.stage == stage)
     log.begin(stage)
     ending = _lacking(Path(plan.out), job) or _run(call, plan, capture, job, threads)
     log.end(ending)
     if ending.exit_code:
         sys.exit(ending.exit_code)
+    if counts_shards(stage, LINE):
+        tell_shards(call, key, threads)
     marker.parent.mkdir(parents=True, exist_ok=True)
     marker.touch()
 
@@ -70,10 +75,10 @@ def _lacking(out: Path, job: StageJob) -> Ending | None:
 
 
 def _run(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads: int) -> Ending:
-    log = call.log(capture.name)
+    log = call.log(capture.name, job.stage)
     log.parent.mkdir(parents=True, exist_ok=True)
-    spent = sum((each.ended_s or each.began_s) - each.began_s for each in TryLog(call.tries_file(capture.key)).read())
-    last = job is capture.jobs[-1]
+    spent = spent_s(read_tries(call.tries_files(capture.key)))
+    last = job.stage == capture.jobs[-1].stage
     with log.open("a", encoding="utf-8") as said:
         process = subprocess.Popen(
             command_of(call, plan, capture, job, threads),
@@ -86,15 +91,23 @@ def _run(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads
         )
     _pass_on_signals(process)
     told, _ = process.communicate()
-    return _ending(process.returncode, told, Path(plan.out) / capture.name)
+    out = Path(plan.out) / capture.name
+    shard = job.stage != stage_name(job.stage)
+    return _ending(process.returncode, told, shard_events(out, job.stage) if shard else out / EVENTS_FILE)
 
 
 def command_of(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
-    """The `splatpipe run` of a job.
+    """The `splatpipe run` of a job, of a shard's the `splatpipe stage`.
 
     The last stage's asks for all that the line has: export, which the film's stage does not need, is told of again.
+    A shard's options are those that the run before it has left in its OUT.
     """
-    until = plan.until if job is capture.jobs[-1] else job.stage
+    out = str(Path(plan.out) / capture.name)
+    stage, _, shard = job.stage.partition(".")
+    if shard:
+        machine = ["--device", plan.device, "--threads", str(threads)]
+        return [*SPLATPIPE, "stage", stage, out, "--shard", shard, *machine, "--json"]
+    until = plan.until if job.stage == capture.jobs[-1].stage else stage
     options = {
         "--preset": capture.preset,
         "--config": str(call.config_file(capture.key)),
@@ -103,15 +116,7 @@ def command_of(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, t
         **({"--until": until} if until else {}),
     }
     words = [word for option in options.items() for word in option]
-    run = [
-        sys.executable,
-        "-m",
-        "splatpipe.pipeline.app.cli",
-        "run",
-        capture.photos,
-        str(Path(plan.out) / capture.name),
-    ]
-    return [*run, *words, "--json"]
+    return [*SPLATPIPE, "run", capture.photos, out, *words, "--json"]
 
 
 def end_with_parent() -> None:
@@ -132,7 +137,7 @@ def _pass_on_signals(process: subprocess.Popen[bytes]) -> None:
         signal.signal(number, pass_on)
 
 
-def _ending(code: int, told: bytes, out: Path) -> Ending:
+def _ending(code: int, told: bytes, events: Path) -> Ending:
     if code < 0:
         name = signal.Signals(-code).name
         hint = "Its log has what it said last; run out of memory is what SIGKILL mostly means."
@@ -141,12 +146,12 @@ def _ending(code: int, told: bytes, out: Path) -> Ending:
         return Ending(0)
     error = _error(told)
     message = str(error.get("message", "")) or f"It ended with exit code {code}."
-    return Ending(code, message, str(error.get("hint", "")), code in HOPELESS and not _may_pass(out))
+    return Ending(code, message, str(error.get("hint", "")), code in HOPELESS and not _may_pass(events))
 
 
-def _may_pass(out: Path) -> bool:
+def _may_pass(events: Path) -> bool:
     """Whether it failed for photos that were changed, or gone for a while, as they are on a network disk."""
-    culprit = read_story(out / EVENTS_FILE, running=False).culprit
+    culprit = read_story(events, running=False).culprit
     return culprit is not None and culprit.state == "failed" and not culprit.lasting
 
 

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 BATCH_FOLDER = ".batch"  # below the batch's folder: what is the command's own
 PLAN_FILE = "plan.json"
+RUNTIME_FACTOR, RUNTIME_MIN = 3.0, 15.0  # a cluster kills at the limit: minutes too many cost nothing
+MEGABYTE = 10**6
+SHARDS_FOLDER = "shards"  # below a call's
+LEAST_S = 1.0  # of a process that only joins
 
 
 @dataclass(frozen=True)
 class StageJob:
-    """One stage of one capture: a job of the workflow.
+    """One stage of one capture, or one of the shards that it is made of: a job of the workflow.
 
     Attributes:
-        stage: Its name.
+        stage: Its name; of a shard ``train.2``.
         threads: That it gets.
         memory_bytes: That it is expected to take at its peak, with a margin.
         seconds: That it is expected to take with these threads.
@@ -31,6 +35,12 @@ class StageJob:
     memory_bytes: int
     seconds: float
     disk_bytes: int
+
+    @property
+    def resources(self) -> list[int]:
+        """What the workflow asks for: threads, megabytes of memory, minutes, megabytes of disk."""
+        minutes = round(RUNTIME_MIN + RUNTIME_FACTOR * self.seconds / 60.0)
+        return [self.threads, max(1, self.memory_bytes // MEGABYTE), minutes, max(1, self.disk_bytes // MEGABYTE)]
 
 
 @dataclass(frozen=True)
@@ -140,13 +150,61 @@ class Call:
         """The options of a capture."""
         return self.folder / "config" / f"{key}.toml"
 
-    def tries_file(self, key: str) -> Path:
-        """What became of a capture's jobs, a JSON object a line."""
-        return self.folder / "tries" / f"{key}.jsonl"
+    def tries_file(self, key: str, job: str = "") -> Path:
+        """What became of a capture's jobs, a JSON object a line; shards have files of their own: they run side by side.
 
-    def log(self, name: str) -> Path:
-        """What a capture's jobs said; it outlives the call."""
-        return self.folder.parent / "logs" / f"{name}.log"
+        Args:
+            key: The capture's.
+            job: The name of a job's stage; any that is no shard has the same file.
+        """
+        return self.folder / "tries" / f"{key}{_shard(job)}.jsonl"
+
+    def tries_files(self, key: str) -> list[Path]:
+        """All of a capture's; none need be there."""
+        return [self.tries_file(key), *sorted(self.tries_file(key).parent.glob(f"{key}.*.jsonl"))]
+
+    def log(self, name: str, job: str = "") -> Path:
+        """What a capture's jobs said; it outlives the call.
+
+        Args:
+            name: The capture's.
+            job: As of ``tries_file``.
+        """
+        return self.folder.parent / "logs" / f"{name}{_shard(job)}.log"
+
+    def shards_file(self, key: str) -> Path:
+        """The jobs of a capture's shards, by stage, as far as they are known; the workflow reads it, too."""
+        return self.folder / SHARDS_FOLDER / f"{key}.json"
+
+    def write_shards(self, key: str, jobs: Mapping[str, Sequence[StageJob]]) -> None:
+        """Keep the jobs of shards by stage; of a stage whose jobs are known already they stay as they are."""
+        told = {
+            stage: {
+                "jobs": [asdict(job) for job in of_stage],
+                "resources": {job.stage: job.resources for job in of_stage},
+            }
+            for stage, of_stage in jobs.items()
+        }
+        path = self.shards_file(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, json.dumps({**told, **self._shards(key)}))
+
+    def jobs(self, capture: PlannedCapture) -> list[StageJob]:
+        """A capture's jobs in order, those of shards before their stage's, which is left with the rest of the time."""
+        known = {stage: [StageJob(**job) for job in told["jobs"]] for stage, told in self._shards(capture.key).items()}
+        found = []
+        for job in capture.jobs:
+            shards = known.get(job.stage, [])
+            rest_s = job.seconds - sum(shard.seconds for shard in shards)
+            found += [*shards, replace(job, seconds=max(LEAST_S, rest_s)) if shards else job]
+        return found
+
+    def _shards(self, key: str) -> Mapping[str, JSON]:
+        try:
+            told: Mapping[str, JSON] = json.loads(self.shards_file(key).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        return told
 
     def write_plan(self, plan: Plan) -> None:
         write_durably(self.folder / PLAN_FILE, json.dumps(asdict(plan), indent=1))
@@ -166,6 +224,11 @@ class Call:
         except FileNotFoundError:
             return {}
         return told
+
+
+def _shard(job: str) -> str:
+    """What a shard's files have in their names that a stage's have not."""
+    return f".{job}" if job != stage_name(job) else ""
 
 
 def _capture(told: Mapping[str, JSON]) -> PlannedCapture:

@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.capture_list import Capture
-from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture
+from splatpipe.pipeline.app.batch.shards import MEMORY_MARGIN, NOTHING, missing_shards, shard_jobs, stage_job
 from splatpipe.pipeline.app.cli_runs import Overrides, request_of
 from splatpipe.pipeline.app.preflight.sizing import size_of
 from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
@@ -23,17 +24,16 @@ from splatpipe.pipeline.engine.line import Line, Standing, survey
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE
+from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
 from splatpipe.pipeline.engine.session import Request, survey_line
 from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.engine.stage import Shard, stage_name
 from splatpipe.pipeline.engine.store import Part, is_copy
 from splatpipe.stages.forecast import forecast, machine_speed
 
-MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
 CLUSTER_THREADS = 8  # of a job that another machine runs; a profile's set-threads says otherwise
 LONGEST_SLUG = 40
 UNTRIED = "Nothing has changed since, so it was not tried again; --retry-failed does."
-NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000)  # a process that looks and ends
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,14 @@ class _Outlook:
         needed: Stages that are asked for.
         names: Those of them that are not valid.
         foresee: What each stage needs with so many threads.
+        shards: That are not there, by those of ``names`` that are made of them, as far as their number is known.
     """
 
     planned: PlannedCapture
     needed: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     foresee: Callable[[int], Mapping[str, Need]] = field(default=lambda _threads: {})
+    shards: Mapping[str, Sequence[Shard]] = field(default_factory=dict)
 
 
 def make_plan(captures: Sequence[Capture], call: Call, settings: Settings) -> Plan:
@@ -94,6 +96,9 @@ def make_plan(captures: Sequence[Capture], call: Call, settings: Settings) -> Pl
     ]
     threads = settings.threads or _threads(outlooks, local=settings.local)
     planned = tuple(_with_jobs(outlook, threads) for outlook in outlooks)
+    for outlook in outlooks:
+        if outlook.shards:
+            call.write_shards(outlook.planned.key, shard_jobs(outlook.shards, outlook.foresee(threads), threads))
     return Plan(
         out=str(call.out),
         began_s=began_s,
@@ -137,13 +142,16 @@ def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Se
     write_durably(path, dump(merge(tables)))
     standings = _standings(request, needed)
     names = _to_run(request, needed, standings)
-    first = next((standing for standing in standings if standing.stage.name in names), None)
+    first = next((each for each in standings if each.stage.name in names and each.artifact is None), None)
     if first is not None and not settings.retry_failed:
         planned = _with_kept_failure(planned, first, request.out)
     if names and not planned.message:
         planned = _with_broken_file(planned, request)
     foresee = partial(forecast, size, config, speed=machine_speed())
-    return _Outlook(planned, tuple(needed), () if planned.message else names, foresee)
+    # Where the stage that counts them is to run, it says how many there are then.
+    counted = [each for each in standings if each.stage.name in names] if first else []
+    shards = {} if planned.message else missing_shards(counted)
+    return _Outlook(planned, tuple(needed), () if planned.message else names, foresee, shards)
 
 
 def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCapture:
@@ -163,12 +171,17 @@ def _standings(request: Request, needed: Sequence[str]) -> list[Standing]:
 
 
 def _to_run(request: Request, needed: Sequence[str], standings: Sequence[Standing]) -> tuple[str, ...]:
-    """Stages that are not valid; the last one where all are, but not all of what it delivered lies in OUT."""
+    """Stages that are not valid; the last one where all are, but not all of what it delivered lies in OUT.
+
+    Before shards comes the stage that counts them, a moment's work where it is valid: it leaves the options for them.
+    """
     if not standings:
         return tuple(needed)
-    names = tuple(standing.stage.name for standing in standings if standing.artifact is None)
+    names = {standing.stage.name for standing in standings if standing.artifact is None}
     if names:
-        return names
+        divided = (stage.shards for stage in request.stages if stage.name in names and stage.shards is not None)
+        names |= {stage_name(shards.counted_by) for shards in divided}
+        return tuple(name for name in needed if name in names)
     delivered = all(
         (request.out / name).is_file() and is_copy(file, request.out / name)
         for standing in standings
@@ -180,14 +193,17 @@ def _to_run(request: Request, needed: Sequence[str], standings: Sequence[Standin
 
 def _with_kept_failure(planned: PlannedCapture, first: Standing, out: Path) -> PlannedCapture:
     """A stage that could do nothing with its input gets the same input: what it said then holds, and nothing runs."""
-    story = read_story(out / EVENTS_FILE, running=is_locked(out))
-    culprit = story.culprit
-    alike = story.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
-    if culprit is None or culprit.state != "failed" or not culprit.lasting or not alike:
-        return planned
-    if (culprit.name, culprit.key) != (first.stage.name, first.key):
-        return planned
-    return replace(planned, message=culprit.message, hint=f"{culprit.hint} {UNTRIED}".strip(), stage=culprit.name)
+    for standing in (first, *first.shards):
+        for path in (out / EVENTS_FILE, shard_events(out, standing.stage.name)):
+            story = read_story(path, running=is_locked(out))
+            culprit = story.culprit
+            alike = story.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
+            if culprit is None or culprit.state != "failed" or not culprit.lasting or not alike:
+                continue
+            if (culprit.name, culprit.key) == (standing.stage.name, standing.key):
+                hint = f"{culprit.hint} {UNTRIED}".strip()
+                return replace(planned, message=culprit.message, hint=hint, stage=culprit.name)
+    return planned
 
 
 def _threads(outlooks: Sequence[_Outlook], *, local: bool) -> int:
@@ -218,14 +234,5 @@ def _memory(need: Need) -> int:
 
 def _with_jobs(outlook: _Outlook, threads: int) -> PlannedCapture:
     needs = _of(outlook, threads, outlook.needed)
-    jobs = tuple(
-        StageJob(
-            name,
-            threads,
-            round(MEMORY_MARGIN * needs[name].memory_bytes),
-            needs[name].seconds(threads),
-            needs[name].disk_bytes + needs[name].scratch_bytes,
-        )
-        for name in outlook.names
-    )
+    jobs = tuple(stage_job(name, needs[name], threads) for name in outlook.names)
     return replace(outlook.planned, jobs=jobs, weights={name: need.seconds(threads) for name, need in needs.items()})

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.job import end_with_parent
-from splatpipe.pipeline.app.batch.plan import Call, Plan
-from splatpipe.pipeline.app.batch.workflow import MEGABYTE, SNAKEFILE
+from splatpipe.pipeline.app.batch.plan import MEGABYTE, Call, Plan
+from splatpipe.pipeline.app.batch.workflow import SNAKEFILE
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
 

@@ -6,7 +6,7 @@ import json
 import os
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -80,8 +80,23 @@ class Try:
         return self.message or NO_WORD
 
 
+def spent_s(tries: Iterable[Try]) -> float:
+    """Seconds in which any of these was at work: shards are side by side, and one that never told its end took none."""
+    spent, until_s = 0.0, 0.0
+    for each in sorted(tries, key=lambda each: each.began_s):
+        ended_s = each.ended_s or each.began_s
+        spent += max(0.0, ended_s - max(each.began_s, until_s))
+        until_s = max(until_s, ended_s)
+    return spent
+
+
+def read_tries(paths: Iterable[Path]) -> list[Try]:
+    """The tries of several files, in the order in which they began."""
+    return sorted((each for path in paths for each in TryLog(path).read()), key=lambda each: each.began_s)
+
+
 class TryLog:
-    """The tries of one capture; only one of its jobs runs at a time.
+    """Tries of jobs of one capture of which one runs at a time.
 
     Args:
         path: Of the file.

@@ -10,16 +10,15 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.plan import Call, Plan
-from splatpipe.pipeline.engine.stage import JSON, Stage
+from splatpipe.pipeline.app.batch.plan import SHARDS_FOLDER, Call, Plan
+from splatpipe.pipeline.app.batch.shards import counts_shards
+from splatpipe.pipeline.engine.stage import JSON, Stage, stage_name
 
 SNAKEFILE = "Snakefile"
 GPU_STAGES = ("train", "evaluate", "flythrough")
-RUNTIME_FACTOR, RUNTIME_MIN = 3.0, 15.0  # a cluster kills at the limit: minutes too many cost nothing
-MEGABYTE = 10**6
 
 _HEAD = """\
 # Written by splatpipe batch for one call; the next call writes its own.
@@ -30,10 +29,11 @@ BEFORE = {{capture: dict(zip(list(jobs)[1:], jobs)) for capture, jobs in JOBS.it
 
 def before(wildcards, stage):
     return [f"{done}/{{wildcards.capture}}/{{name}}" for name in [BEFORE[wildcards.capture].get(stage)] if name]
-
+{shards}
 
 wildcard_constraints:
     capture="[0-9A-Za-z-]+",
+    shard="[0-9]+",
 
 
 rule all:
@@ -41,21 +41,40 @@ rule all:
         [f"{done}/{{capture}}/{{list(jobs)[-1]}}" for capture, jobs in JOBS.items()],
 """
 
+_SHARDS = """
+# Of a capture's shards, by name, as JOBS; the job that counts them writes the file, or the command where it is known.
+def shards(capture, stage):
+    import json
+
+    try:
+        with open(f"{folder}/{{capture}}.json", encoding="utf-8") as file:
+            return json.load(file)[stage]["resources"]
+    except (FileNotFoundError, KeyError):
+        return None
+
+
+def joined(wildcards, stage, counted):
+    if shards(wildcards.capture, stage) is None:
+        counted.get(capture=wildcards.capture)
+    names = shards(wildcards.capture, stage) or {{}}
+    return [*before(wildcards, stage), *(f"{done}/{{wildcards.capture}}/{{name}}" for name in names)]
+"""
+
 _RULE = """
 
-rule {stage}:
+{kind} {name}:
     input:
-        lambda wildcards: before(wildcards, "{stage}"),
+        lambda wildcards: {after},
     output:
-        "{done}/{{capture}}/{stage}",
+        "{done}/{{capture}}/{output}",
     priority: {priority}
-    threads: lambda wildcards: JOBS[wildcards.capture]["{stage}"][0]
+    threads: lambda wildcards: {jobs}[0]
     resources:
-        mem_mb=lambda wildcards, attempt: JOBS[wildcards.capture]["{stage}"][1] * attempt,
-        runtime=lambda wildcards, attempt: JOBS[wildcards.capture]["{stage}"][2] * attempt,
-        disk_mb=lambda wildcards: JOBS[wildcards.capture]["{stage}"][3],
+        mem_mb=lambda wildcards, attempt: {jobs}[1] * attempt,
+        runtime=lambda wildcards, attempt: {jobs}[2] * attempt,
+        disk_mb=lambda wildcards: {jobs}[3],
 {gpu}    shell:
-        "exec {job} {{wildcards.capture:q}} {stage} {{threads}} {{output:q}}"
+        "exec {job} {{wildcards.capture:q}} {output_name} {{threads}} {{output:q}}"
 """
 
 
@@ -68,31 +87,39 @@ def workflow_text(call: Call, plan: Plan, stages: Sequence[Stage]) -> str:
         stages: The line, in order; a stage without a job gets no rule.
     """
     jobs: dict[str, dict[str, JSON]] = {
-        capture.key: {
-            job.stage: _resources(job.threads, job.memory_bytes, job.seconds, job.disk_bytes) for job in capture.jobs
-        }
-        for capture in plan.captures
-        if capture.jobs
+        capture.key: {job.stage: job.resources for job in capture.jobs} for capture in plan.captures if capture.jobs
     }
     done = f"done-{plan.began_s:.3f}"  # a storage that outlives the call has those of earlier ones
     wanted = {name for stages_of in jobs.values() for name in stages_of}
     words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder)]
     job = shlex.join(words).encode("unicode_escape").decode("ascii")  # as it stands in a text of Python's
     job = job.replace('"', '\\"').replace("{", "{{").replace("}", "}}")
-    rules = [
+    rules, divided = [], False
+    for place, stage in enumerate(stages):
+        if stage.name not in wanted:
+            continue
         # Broken photos are told first; then what is nearest to its end goes first, so that captures are finished one
         # after the other and not all in the morning.
-        _RULE.format(done=done, stage=stage.name, priority=place or len(stages), job=job, gpu=_gpu(stage.name, plan))
-        for place, stage in enumerate(stages)
-        if stage.name in wanted
-    ]
+        rule = {"done": done, "job": job, "priority": place or len(stages), "gpu": _gpu(stage.name, plan)}
+        kind = "checkpoint" if counts_shards(stage.name, stages) else "rule"
+        after = f'before(wildcards, "{stage.name}")'
+        if stage.shards is not None:
+            divided = True
+            rules.append(_shard_rule(stage.name, rule, after))
+            after = f'joined(wildcards, "{stage.name}", checkpoints.{stage_name(stage.shards.counted_by)})'
+        names = {"name": stage.name, "output": stage.name, "output_name": stage.name}
+        own = f'JOBS[wildcards.capture]["{stage.name}"]'
+        rules.append(_RULE.format(**rule, **names, kind=kind, after=after, jobs=own))
     lines = ",\n".join(f"    {json.dumps(key)}: {json.dumps(of_capture)}" for key, of_capture in jobs.items())
-    return _HEAD.format(done=done, jobs=f"{{\n{lines}\n}}") + "".join(rules)
+    shards = _SHARDS.format(done=done, folder=SHARDS_FOLDER) if divided else ""
+    return _HEAD.format(done=done, jobs=f"{{\n{lines}\n}}", shards=shards) + "".join(rules)
 
 
-def _resources(threads: int, memory_bytes: int, seconds: float, disk_bytes: int) -> list[int]:
-    minutes = round(RUNTIME_MIN + RUNTIME_FACTOR * seconds / 60.0)
-    return [threads, max(1, memory_bytes // MEGABYTE), minutes, max(1, disk_bytes // MEGABYTE)]
+def _shard_rule(stage: str, rule: Mapping[str, JSON], after: str) -> str:
+    """The rule of a stage's shards, a job each; how many is known when the stage before it is there, or already."""
+    names = {"name": f"{stage}_shard", "output": f"{stage}.{{shard}}", "output_name": f"{stage}.{{wildcards.shard}}"}
+    own = f'shards(wildcards.capture, "{stage}")["{stage}." + wildcards.shard]'
+    return _RULE.format(**rule, **names, kind="rule", after=after, jobs=own)
 
 
 def _gpu(stage: str, plan: Plan) -> str:

@@ -1,0 +1,71 @@
+"""Jobs of the shards that stages are made of: how many there are is known when the stage that counts them has run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from splatpipe.pipeline.app.batch.plan import Call, StageJob
+from splatpipe.pipeline.app.cli_runs import existing
+from splatpipe.pipeline.engine.line import Standing, survey
+from splatpipe.pipeline.engine.needs import Need, of_shard
+from splatpipe.pipeline.engine.session import survey_line
+from splatpipe.pipeline.engine.stage import Shard, Stage, stage_name
+
+MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
+NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000)  # a process that looks and ends
+
+
+def stage_job(name: str, need: Need, threads: int) -> StageJob:
+    """A job by what it is expected to take."""
+    memory = round(MEMORY_MARGIN * need.memory_bytes)
+    return StageJob(name, threads, memory, need.seconds(threads), need.disk_bytes + need.scratch_bytes)
+
+
+def missing_shards(standings: Iterable[Standing]) -> dict[str, list[Shard]]:
+    """Shards that are still to be made, by stage, of stages whose number of shards is known."""
+    return {
+        standing.stage.name: [
+            Shard(number, len(standing.shards))
+            for number, shard in enumerate(standing.shards, 1)
+            if shard.artifact is None and standing.artifact is None
+        ]
+        for standing in standings
+        if standing.stage.shards is not None and (standing.shards or standing.state != "waiting")
+    }
+
+
+def shard_jobs(
+    missing: Mapping[str, Sequence[Shard]], needs: Mapping[str, Need], threads: int
+) -> dict[str, list[StageJob]]:
+    """The jobs of shards, by stage.
+
+    Args:
+        missing: Shards by stage.
+        needs: The forecast.
+        threads: Of a job.
+    """
+    return {
+        stage: [
+            stage_job(f"{stage}.{shard.number}", of_shard(needs, stage, shard) or NOTHING, threads) for shard in shards
+        ]
+        for stage, shards in missing.items()
+    }
+
+
+def counts_shards(stage: str, line: Sequence[Stage]) -> bool:
+    """Whether a stage says how many shards another has."""
+    return any(each.shards is not None and stage_name(each.shards.counted_by) == stage for each in line)
+
+
+def tell_shards(call: Call, key: str, threads: int) -> None:
+    """Leave the jobs of a capture's shards for Snakemake, once the stage that counts them has run.
+
+    Args:
+        call: Whose job has run it.
+        key: The capture's.
+        threads: Of a job.
+    """
+    request = existing(call.out / call.plan().capture(key).name)
+    standings = list(survey(*survey_line(request)))
+    summaries = {each.stage.name: each.artifact.summary for each in standings if each.artifact is not None}
+    call.write_shards(key, shard_jobs(missing_shards(standings), request.foresee(summaries), threads))

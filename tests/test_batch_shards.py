@@ -1,0 +1,145 @@
+"""A batch whose line has a stage made of shards: a job each, as many as the stage before it counts."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.app.batch.account import Account
+from splatpipe.pipeline.app.batch.driver import fresh_call
+from splatpipe.pipeline.app.batch.job import command_of
+from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.tries import Ending, Try, TryLog, read_tries, spent_s
+from splatpipe.pipeline.app.batch.workflow import workflow_text
+from splatpipe.pipeline.engine.errors import EXIT_STAGE
+
+LINES = Path(__file__).parent / "lines"
+sys.path.insert(0, str(LINES))
+import sharded  # noqa: E402
+
+NORTH, SOUTH = (3, 14, 15, 92), (2, 71)
+TOTALS = {name: sum(number**2 for number in numbers) for name, numbers in (("north", NORTH), ("south", SOUTH))}
+BAD = Ending(EXIT_STAGE, "The stage sum.2 died.", "See the log.")
+
+
+def captures(folder: Path) -> Path:
+    for name, numbers in (("north", NORTH), ("south", SOUTH)):
+        (folder / name).mkdir(parents=True)
+        for at, number in enumerate(numbers):
+            (folder / name / f"{at}.txt").write_text(str(number))
+    listed = folder / "list.toml"
+    listed.write_text('[[capture]]\nphotos = "north"\n[[capture]]\nphotos = "south"\n')
+    return listed
+
+
+def batch(listed: Path, out: Path, *more: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """The whole program on the line of `sharded`."""
+    path = os.pathsep.join([str(LINES / "sharded_site"), str(LINES), os.environ.get("PYTHONPATH", "")])
+    words = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "batch", str(listed), str(out), *more]
+    return subprocess.run(
+        words, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path, **variables}
+    )
+
+
+def test_captures_run_in_shards_and_one_that_is_killed_costs_its_own_job_alone(tmp_path: Path) -> None:
+    """Their number is known when the stage that counts them has run; afterwards before anything runs."""
+    listed, out = captures(tmp_path), tmp_path / "night"
+    told = batch(listed, out, "--dry-run")
+    assert told.returncode == 0 and "sum_shard" not in told.stderr and "checkpoint divide:" in told.stderr
+    done = batch(listed, out, "--until", "sum", "--threads", "1", "--json", SHARDED_KILL="2")
+    assert done.returncode == 0, done.stderr
+    sums = {path.parts[-4]: json.loads(path.read_text())["total"] for path in out.glob("*/stages/sum-*/total.json")}
+    assert sums == TOTALS
+    tries = {
+        name: [each.stage for each in read_tries(Call(out / ".batch" / "call").tries_files(f"000{at}-{name}"))]
+        for at, name in enumerate(TOTALS, 1)
+    }
+    assert sorted(tries["north"]) == ["divide", "read", "sum", "sum.1", "sum.2", "sum.2", "sum.2"]
+    assert sorted(tries["south"]) == ["divide", "read", "sum", "sum.1"]
+    assert not list(out.glob("*/stages/.partial/*"))
+    changed = batch(listed, out, "--until", "sum", "--set", "sum.offset=1", "--dry-run")
+    counts = dict(line.split() for line in changed.stderr.splitlines() if len(line.split()) == 2 and "sum" in line)
+    assert counts["sum_shard"] == "3" and counts["sum"] == "2"
+    # A shard's command takes the options that lie in its OUT: a job before it leaves them there, though all is valid.
+    listed.write_text('[[capture]]\nphotos = "south"\n')
+    assert batch(listed, out, "--until", "sum", "--set", "sum.offset=1").returncode == 0
+    totals = sorted(json.loads(path.read_text())["total"] for path in out.glob("south/stages/sum-*/total.json"))
+    assert totals == [TOTALS["south"], TOTALS["south"] + len(SOUTH)]
+
+
+def job(stage: str, seconds: float = 60.0) -> StageJob:
+    return StageJob(stage, 2, 900_000_000, seconds, 50_000_000)
+
+
+def call_of(out: Path) -> Call:
+    weights = {"divide": 1.0, "sum": 6.0, "show": 1.0}
+    jobs = (job("divide"), job("sum", 300.0), job("show"))
+    call = fresh_call(out)
+    capture = PlannedCapture("house", "0001-house", "/photos", "preview", jobs, weights)
+    call.write_plan(Plan(str(out), time.time(), (capture,), retries=1))
+    return call
+
+
+def test_the_workflow_has_a_job_a_shard_and_a_checkpoint_that_counts_them(tmp_path: Path) -> None:
+    call = call_of(tmp_path)
+    text = workflow_text(call, call.plan(), sharded.LINE)
+    kinds = [line for line in text.splitlines() if line.startswith(("rule ", "checkpoint "))]
+    assert kinds == ["rule all:", "checkpoint divide:", "rule sum_shard:", "rule sum:", "rule show:"]
+    (house,) = call.plan().captures
+    words = command_of(call, call.plan(), house, job("sum.2"), 3)
+    assert words[3:] == [
+        "stage", "sum", str(tmp_path / "house"), "--shard", "2", "--device", "auto", "--threads", "3", "--json",
+    ]  # fmt: skip
+
+
+def test_shards_have_their_own_part_of_what_a_stage_takes(tmp_path: Path) -> None:
+    call = call_of(tmp_path)
+    (house,) = call.plan().captures
+    assert [each.stage for each in call.jobs(house)] == ["divide", "sum", "show"]
+    call.write_shards(house.key, {"sum": [job("sum.1", 100.0), job("sum.2", 150.0)]})
+    call.write_shards(house.key, {"sum": [job("sum.1", 1.0)]})  # what is known stays
+    assert [(each.stage, each.seconds) for each in call.jobs(house)] == [
+        ("divide", 60.0), ("sum.1", 100.0), ("sum.2", 150.0), ("sum", 50.0), ("show", 60.0),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("tries", "ended", "expected"),
+    [
+        ((), False, ("waiting", "sum.1", 0.125)),
+        ((("sum.2", None),), False, ("running", "sum.2", 0.125)),
+        ((("sum.1", Ending(0)), ("sum.2", BAD)), False, ("waiting", "sum.2", 0.375)),
+        ((("sum.2", BAD), ("sum.2", BAD)), False, ("waiting", "sum.1", 0.125)),
+        ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", None)), False, ("running", "sum.1", 0.125)),
+        ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", Ending(0))), False, ("failed", "sum.2", 0.375)),
+        ((("sum.2", BAD), ("sum.2", BAD)), True, ("failed", "sum.2", 0.125)),
+        ((("sum.2", BAD),), True, ("stopped", "sum.1", 0.125)),
+        ((("sum.1", Ending(0)), ("sum.2", Ending(0))), False, ("waiting", "sum", 0.625)),
+    ],
+)
+def test_of_shards_side_by_side_the_liveliest_is_told_of(
+    tmp_path: Path, tries: Sequence[tuple[str, Ending | None]], ended: bool, expected: tuple[object, ...]
+) -> None:
+    call = call_of(tmp_path)
+    call.write_shards("0001-house", {"sum": [job("sum.1"), job("sum.2")]})
+    for stage, ending in (("divide", Ending(0)), *tries):
+        log = TryLog(call.tries_file("0001-house", stage))
+        log.begin(stage)
+        if ending is not None:
+            log.end(ending)
+    if ended:
+        call.write_end(time.time(), 0, "")
+    (house,) = Account(call).state().captures
+    assert (house.state, house.stage, house.progress) == expected
+    failed = house.state == "failed"
+    assert house.reason == (BAD.message if failed else house.reason) and house.tries == (2 if failed else house.tries)
+
+
+def test_time_of_shards_side_by_side_counts_once() -> None:
+    spans = ((0.0, 10.0), (12.0, 20.0), (13.0, 15.0), (14.0, 26.0), (30.0, None))
+    assert spent_s([Try("sum.1", began, "here", 1, ended) for began, ended in reversed(spans)]) == 24.0
