@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, replace
 
 from splatpipe.pipeline.engine.needs import Need
+from splatpipe.pipeline.film.options import MOST_FILM_MEGAPIXELS
+from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.train.lengths import (
     WINDOW_PIXELS,
     Footage,
@@ -230,14 +232,15 @@ class Work:
         if 0.0 < budget < FILM_FROM_BUDGET_S:
             return 0.0
         size = film.film_size
-        frame = size[0] * size[1] / MEGA if size else self.trained_at
+        frame = size[0] * size[1] / MEGA if size else min(self.trained_at, MOST_FILM_MEGAPIXELS)
         return film.seconds * film.fps * frame
 
     def units(self) -> dict[str, Units]:
         """By stage: CPU time, memory, disk."""
         size, train = self.size, self.config.train
         photos, pixels = float(size.photos), size.photos * size.megapixels
-        keypoints, trained, gaussians = photos * self.keypoints, photos * self.trained_at, float(self.gaussians)
+        keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
+        judged = photos * min(self.kept_at, JUDGED_MEGAPIXELS)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
         done = self.costs.flat if train.stop_when_flat and not train.time_budget_s else 1.0
@@ -258,7 +261,7 @@ class Work:
             "split": Units(photos, 0.0, photos),
             "initialize": Units(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
             "train": Units(done * self.training, state, gaussians),
-            "evaluate": Units(trained, gaussians, trained),
+            "evaluate": Units(judged, gaussians, judged),
             "export": Units(gaussians, gaussians, gaussians),
             "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
         }

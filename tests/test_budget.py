@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.heap import return_free_heap
@@ -34,9 +35,9 @@ from splatpipe.pipeline.train.budget import (
     forecast,
 )
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.lengths import WHOLE_VISITS, Footage
+from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, Footage, lengths_of
 from splatpipe.pipeline.train.limits import FEWEST, FIXED_BYTES, LONGEST, PIXEL_BYTES, bytes_per_gaussian
-from splatpipe.pipeline.train.measure import Measured
+from splatpipe.pipeline.train.measure import Measured, middle_of
 from splatpipe.pipeline.train.memory import resident_bytes
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.plan import Plan, duration, make_plan
@@ -124,6 +125,48 @@ def test_a_speed_is_found_again_from_its_timings() -> None:
         assert fitted.seconds(n, p) == pytest.approx(SPEED.seconds(n, p), rel=1e-6)
 
 
+def test_a_speed_tells_apart_what_windows_leave_out() -> None:
+    true = replace(SPEED, seen_s=5e-7)
+    cases = [(n, p, share) for n in (5_000, 60_000) for p, share in ((1e5, 1.0), (4e5, 1.0), (1e5, 0.25), (5e4, 0.05))]
+    fitted = fit_speed([Timing(n, int(p), true.seconds(n, p, share), share) for n, p, share in cases])
+    for n, p, share in ((200_000, 4e5, 0.02), (7_000, 1e6, 1.0)):
+        assert fitted.seconds(n, p, share) == pytest.approx(true.seconds(n, p, share), rel=1e-6)
+
+
+def test_a_forecast_counts_windows_as_they_are_cut() -> None:
+    footage = Footage(((2304, 1728, 50),), 500_000)
+    schedule = resolve_schedule(TrainConfig(least_iterations=1000, max_gaussians=50_000), footage)
+    speed, looks = replace(SPEED, seen_s=5e-7), schedule.looks_to(schedule.iterations)
+    assert len(set(looks)) == 3
+    rooms = [room_at(schedule.density, 8_000, number) for number in range(1, len(looks) + 1)]
+    each = [
+        speed.seconds(room, footage.pixels(look), footage.share(look)) for room, look in zip(rooms, looks, strict=True)
+    ]
+    assert forecast(speed, schedule, 8_000, footage) == pytest.approx(math.fsum(each), rel=0.01)
+
+
+def test_the_window_that_is_timed_is_the_middle_of_its_photo() -> None:
+    camera = tiny_scene.cameras()[0]
+    colour = torch.rand(camera.height, camera.width, 3)
+    window = middle_of(TrainingPhoto(camera, colour, None))
+    left, top = (camera.width - window.camera.width) // 2, (camera.height - window.camera.height) // 2
+    assert window.camera.whole() == camera and window.share == pytest.approx(0.25, abs=0.01)
+    assert torch.equal(window.colour, colour[top : top + window.camera.height, left : left + window.camera.width])
+
+
+def test_a_size_whose_parts_would_be_seen_too_seldom_loses_to_the_one_before() -> None:
+    sizes = ((2304, 1728, 50),)
+    tasks = [Task(tiny_scene.plain(), 8_000, 0, sizes, 500_000, SPEED, 0.0, s) for s in (15.0, 60.0, 240.0, 3600.0)]
+    chosen = [choose(task) for task in tasks]
+    found = [choice.options.max_megapixels or tasks[0].megapixels for choice in chosen]
+    assert found == sorted(found) and found[0] < 1.0 < found[-1] == tasks[0].megapixels
+    for task, choice, size in zip(tasks, chosen, found, strict=True):
+        assert 0.9 * task.seconds <= choice.forecast_s <= SCHEDULE_SHARE * task.seconds
+        level, count = lengths_of(choice.options, task.footage(size))[-1]
+        assert level == 0 and count >= 0.99 * PART_VISITS * task.footage(size).parts(0)
+        assert choice.options.stop_when_flat == 0.0  # there was more to be had: the time is spent
+
+
 def test_no_cost_is_below_zero_whatever_was_measured() -> None:
     noisy = [Timing(10, 100, 0.02), Timing(10, 400, 0.01), Timing(900, 100, 0.005), Timing(900, 400, 0.03)]
     fitted = fit_speed(noisy)
@@ -143,7 +186,7 @@ def test_forecast_is_the_sum_over_the_iterations() -> None:
 def task_of(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Task:
     """8,000 sparse points."""
     config = tiny_scene.plain(time_budget_s=seconds, max_gaussians=cap)
-    return Task(config, 8_000, 0, ((1000, round(1000 * size), photos),), 0, SPEED, 0.0, lambda _size: seconds)
+    return Task(config, 8_000, 0, ((1000, round(1000 * size), photos),), 0, SPEED, 0.0, seconds)
 
 
 def plan_for(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Choice:
@@ -313,7 +356,7 @@ def test_iterations_beyond_the_schedule_fill_the_time_and_change_none_before(
     assert digest(tmp_path / "longer") != digest(tmp_path / "schedule")
 
 
-def test_photos_are_trained_on_and_measured_at_the_planned_size(
+def test_photos_are_trained_on_at_the_planned_size_and_measured_at_the_datasets(
     scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
@@ -324,7 +367,7 @@ def test_photos_are_trained_on_and_measured_at_the_planned_size(
     parts |= {"undistort.dataset": scene / "dataset"} | tiny_scene.split_part(scene / "dataset", 4)
     evaluate.run(EvaluateConfig(), Inputs(parts, scene), out, tiny_scene.Recorder())
     for view in json.loads((out / "metrics.json").read_text())["per_view"]:
-        assert view["width"] * view["height"] <= 2000 and view["psnr"] > 10.0
+        assert (view["width"], view["height"]) == (tiny_scene.WIDTH, tiny_scene.HEIGHT) and view["psnr"] > 10.0
 
 
 def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused(scene: Path, tmp_path: Path) -> None:
@@ -362,8 +405,8 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
 from splatpipe.pipeline.train import plan
-from splatpipe.pipeline.train.measure import Measured
-from splatpipe.pipeline.train.lengths import WHOLE_VISITS, Footage
+from splatpipe.pipeline.train.measure import Measured, middle_of
+from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, Footage, lengths_of
 from splatpipe.pipeline.train.limits import FIXED_BYTES
 from splatpipe.pipeline.train.memory import resident_bytes
 
@@ -427,5 +470,6 @@ def test_a_budget_long_enough_for_a_film_keeps_time_for_it() -> None:
         config = TrainConfig(time_budget_s=budget)
         plan = make_plan(config, views, tiny_scene.split_of(views, 4), 100)
         scene = planning.Scene(config, Start(tiny_scene.true_model(), 100), views, 3, Machine())
-        left.append(planning._task(plan, scene, measured, 500.0).seconds(0.5))
-    assert left[0] - left[1] == pytest.approx(planning.FILM_VIEWS * 2.0 * 0.5)
+        left.append(planning._task(plan, scene, measured, 500.0).seconds)
+    size = 1e-6 * tiny_scene.WIDTH * tiny_scene.HEIGHT
+    assert left[0] - left[1] == pytest.approx(planning.FILM_VIEWS * 2.0 * size)

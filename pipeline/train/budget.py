@@ -134,7 +134,7 @@ class Task:
         window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
         speed: Of this machine on this scene.
         prepare_s: Decoding every photo once, whatever sizes are made of it.
-        seconds: What is left for the training when its photos have so many megapixels.
+        seconds: What is left for the training.
     """
 
     config: TrainConfig
@@ -144,7 +144,7 @@ class Task:
     window_pixels: int
     speed: Speed
     prepare_s: float
-    seconds: Callable[[float], float]
+    seconds: float
 
     @property
     def megapixels(self) -> float:
@@ -157,9 +157,9 @@ class Task:
         most = self.config.max_megapixels or None
         return footage_of(self.sizes, most if megapixels >= self.megapixels else megapixels, self.window_pixels)
 
-    def left(self, megapixels: float, cap: int) -> float:
+    def left(self, cap: int) -> float:
         """Seconds for the training when as many Gaussians as the cap allows are to be exported."""
-        return self.seconds(megapixels) - EXPORT_GAUSSIAN_S * cap
+        return self.seconds - EXPORT_GAUSSIAN_S * cap
 
     def takes(self, options: TrainConfig, megapixels: float) -> float:
         """Forecast of a training, its photos' decoding (once a size) included, seconds."""
@@ -214,7 +214,7 @@ def choose(task: Task) -> Choice:
     options = planned_options(task, size, cap, iterations)
     if size < task.megapixels or cap < most:
         options = options.model_copy(update={"stop_when_flat": 0.0})
-    return Choice(options, iterations, task.left(size, cap), task.takes(options, size))
+    return Choice(options, iterations, task.left(cap), task.takes(options, size))
 
 
 def sizes(megapixels: float) -> list[float]:
@@ -229,7 +229,7 @@ def sizes(megapixels: float) -> list[float]:
 
 def wanted_iterations(task: Task, megapixels: float) -> int:
     """Iterations that are worth more than larger photos or more Gaussians: every part is seen often enough."""
-    least = worthwhile_iterations(task.seconds(megapixels))
+    least = worthwhile_iterations(task.seconds)
     return sum(count for _level, count in lengths(task.footage(megapixels), least))
 
 
@@ -239,7 +239,7 @@ def planned_options(task: Task, megapixels: float, cap: int, iterations: int) ->
     halvings = int(max(0.0, math.log(first / COARSEST_MEGAPIXELS, 4)))
     planned = {
         "iterations": iterations,
-        "least_iterations": worthwhile_iterations(task.seconds(megapixels)),
+        "least_iterations": worthwhile_iterations(task.seconds),
         "max_megapixels": config.max_megapixels if megapixels >= task.megapixels else megapixels,
         "max_gaussians": cap,
         "coarse_levels": max(config.coarse_levels, min(2, halvings)),
@@ -249,7 +249,7 @@ def planned_options(task: Task, megapixels: float, cap: int, iterations: int) ->
 
 def _fits(task: Task, megapixels: float, cap: int, iterations: int) -> bool:
     options = planned_options(task, megapixels, cap, iterations)
-    return task.takes(options, megapixels) <= SCHEDULE_SHARE * task.left(megapixels, cap)
+    return task.takes(options, megapixels) <= SCHEDULE_SHARE * task.left(cap)
 
 
 def _largest(least: int, most: int, fits: Callable[[int], bool]) -> int:

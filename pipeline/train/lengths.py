@@ -27,7 +27,7 @@ COARSE_SHARE = 0.5  # of the iterations at the first size are with photos that `
 
 UNTIL = 0.5  # of a run there is density control: published; of the finest size's iterations, where there are several
 
-WINDOW_PIXELS = {"cpu": 0, "cuda": 0}
+WINDOW_PIXELS = {"cpu": 500_000, "cuda": 2_000_000}
 """Of a photo that an iteration renders, by device. On a CPU an iteration's cost is that of its pixels, so small windows
 cost nothing but their margins; a CUDA device is busy only with larger ones."""
 

@@ -31,6 +31,7 @@ NEVER = 1_000_000_000  # iterations until a step of density control
 WARM_UP_ITERATIONS = 100  # until opacities, which step by a twentieth of a logit, are spread as in training
 WARM_UP_SHARE = 0.5  # of the time for measuring at most
 PILOT_ITERATION = 10  # the state claims to be so far, so that all SH degrees take part
+WINDOW_SIDE = 2  # times smaller are the sides of the windows that are timed
 SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a surface shared out (0.5)
 STREAM = 7  # of the jitter's random numbers; the pilot is thrown away, so nothing depends on them
 
@@ -83,7 +84,7 @@ class Subject:
 
 
 def measure(plan: Plan, subject: Subject, step: Step, effort: Effort) -> Measured:
-    """Time real iterations at two sizes and two numbers of Gaussians.
+    """Time real iterations at two sizes, on windows of the larger one, and at two numbers of Gaussians.
 
     Args:
         plan: Without a budget; its cap is the larger number of Gaussians.
@@ -108,7 +109,7 @@ def measure(plan: Plan, subject: Subject, step: Step, effort: Effort) -> Measure
     _evaluation_seconds(finished, small[0], plan)  # pays for what is loaded once
     evaluate_s = _evaluation_seconds(finished, large[0], plan)
     timings = [first]
-    for photos in zip(small, large, strict=True):
+    for photos in zip(small, large, map(middle_of, large), strict=True):
         for state in states:
             timings += [_timed(state, trial, photo, step, device) for photo in photos]
         if time.monotonic() - began > effort.most_s:
@@ -168,13 +169,26 @@ def _photos(views: Sequence[View], megapixels: float, device: Device) -> tuple[l
     return photos, (time.monotonic() - began) / len(photos)
 
 
+def middle_of(photo: TrainingPhoto) -> TrainingPhoto:
+    """The window in the middle of a photo, of half its sides: most of what is around it is not seen."""
+    camera = photo.camera
+    width, height = max(1, camera.width // WINDOW_SIDE), max(1, camera.height // WINDOW_SIDE)
+    left, top = (camera.width - width) // 2, (camera.height - height) // 2
+    rows, columns = slice(top, top + height), slice(left, left + width)
+    mask = None if photo.mask is None else photo.mask[rows, columns].contiguous()
+    share = width * height / (camera.width * camera.height)
+    colour = photo.colour[rows, columns].contiguous()
+    return TrainingPhoto(camera.cut(left, top, width, height), colour, mask, photo.is_empty, None, share)
+
+
 def _timed(state: TrainState, trial: Plan, photo: TrainingPhoto, step: Step, device: Device) -> Timing:
     device.wait()
     began = time.monotonic()
     step(state, trial, photo)
     device.wait()
     seconds = time.monotonic() - began
-    return Timing(len(state.gaussians), photo.camera.width * photo.camera.height, max(seconds, 1e-6))
+    pixels, whole = photo.camera.width * photo.camera.height, photo.camera.whole()
+    return Timing(len(state.gaussians), pixels, max(seconds, 1e-6), pixels / (whole.width * whole.height))
 
 
 def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Plan) -> float:

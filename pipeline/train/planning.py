@@ -12,12 +12,14 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster.device import Device, cpu, free_bytes
+from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, Task, choose
 from splatpipe.pipeline.train.limits import FIRST_ITERATIONS, device_bytes_per_gaussian, worthwhile_iterations
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.measure import Effort, Measured, Step, Subject, measure
 from splatpipe.pipeline.train.memory import within_memory
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import Plan, footage_of
 from splatpipe.pipeline.train.shortage import HINT
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.start import Start, started
@@ -130,13 +132,9 @@ def pilot(plan: Plan, scene: Scene) -> Plan:
 def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
     options = scene.config.model_copy(update={"max_gaussians": plan.options.max_gaussians})
     least = LEAST_SHARE * options.time_budget_s
-
     views = scene.held_out + (FILM_VIEWS if options.time_budget_s >= FILM_FROM_BUDGET_S else 0)
-
-    def seconds(megapixels: float) -> float:
-        after = EXPORT_SECONDS + views * measured.evaluate_s * megapixels
-        return max(least, left - after)
-
+    looked_at = 1e-6 * footage_of(plan.sizes, JUDGED_MEGAPIXELS, 0).pixels(Look())  # whatever is trained
+    after = EXPORT_SECONDS + views * measured.evaluate_s * looked_at
     return Task(
         config=options,
         sparse=scene.start.sparse,
@@ -145,5 +143,5 @@ def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
         window_pixels=plan.window_pixels,
         speed=measured.speed,
         prepare_s=measured.decode_s * len(scene.trained_on),
-        seconds=seconds,
+        seconds=max(least, left - after),
     )
