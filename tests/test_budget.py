@@ -36,7 +36,14 @@ from splatpipe.pipeline.train.budget import (
 )
 from splatpipe.pipeline.train.densify import room_at
 from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, Footage, lengths_of
-from splatpipe.pipeline.train.limits import FEWEST, FIXED_BYTES, LONGEST, PIXEL_BYTES, bytes_per_gaussian
+from splatpipe.pipeline.train.limits import (
+    FEWEST,
+    FIXED_BYTES,
+    LONGEST,
+    PIXEL_BYTES,
+    SMALLEST_WINDOW,
+    bytes_per_gaussian,
+)
 from splatpipe.pipeline.train.measure import Measured, middle_of
 from splatpipe.pipeline.train.memory import resident_bytes
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
@@ -394,6 +401,26 @@ def test_memory_that_holds_the_sparse_points_takes_the_sweep_s_without_a_warning
         assert capped.options.max_gaussians == 2000
         assert len(recorder.warnings) == told
     assert "2,000 Gaussians, fewer than the 2,500 sparse points" in recorder.warnings[0]
+
+
+def test_little_memory_takes_smaller_windows_before_it_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "resident_bytes", lambda: 0)
+    views = [View(camera.scaled(2304, 1728), Path("photo.jpg"), None) for camera in tiny_scene.cameras()]
+    plan = make_plan(TrainConfig(least_iterations=100), views, tiny_scene.split_of(views, 4), 150, 500_000)
+    of_one, room = bytes_per_gaussian(3), 100_000_000
+    limited = plan.of(plan.options.model_copy(update={"max_memory_bytes": FIXED_BYTES + room}))
+    fitted = memory.within_memory(limited, 150, tiny_scene.Recorder())
+    assert fitted.window_pixels == pytest.approx(0.25 * room / PIXEL_BYTES, abs=1)
+    assert (
+        fitted.options.max_gaussians * of_one >= 0.74 * room and fitted.schedule.iterations > plan.schedule.iterations
+    )
+    least = FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + FEWEST_GAUSSIANS * of_one
+    tight = limited.of(plan.options.model_copy(update={"max_memory_bytes": least}))
+    assert memory.within_memory(tight, 5000, tiny_scene.Recorder()).window_pixels == SMALLEST_WINDOW
+    refused = limited.of(plan.options.model_copy(update={"max_memory_bytes": FIXED_BYTES + of_one}))
+    with pytest.raises(MachineError, match="need room") as raised:
+        memory.within_memory(refused, 5000, tiny_scene.Recorder())
+    assert "at least" in raised.value.hint
 
 
 TRAIN_IN_LITTLE_MEMORY = """

@@ -29,7 +29,7 @@ class IngestConfig(StageConfig):
 
 class UndistortConfig(StageConfig):
     max_megapixels: Annotated[float, Field(gt=0.005, le=200.0)] = 0.5
-    """Photos are reduced to this size for training and evaluation."""
+    """Photos are reduced to this size in the dataset: the most that training and evaluation can use of them."""
 
 
 class SplitConfig(StageConfig):

@@ -1,0 +1,65 @@
+"""What a run says before it begins: what it takes, and that a limit of memory is too small."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from splatpipe.demo import capture_path
+from splatpipe.pipeline.app.cli_runs import request_of
+from splatpipe.pipeline.app.preflight.start import require_memory, told_beforehand
+from splatpipe.pipeline.engine.config import load_preset, resolve
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.session import Request
+from splatpipe.stages.costs import REFERENCE
+from splatpipe.stages.forecast import forecast, least_memory_bytes
+from splatpipe.stages.options import LineConfig
+from splatpipe.stages.work import CaptureSize, Work
+
+
+def request(tmp_path: Path, preset: str, **train: object) -> Request:
+    config = resolve(LineConfig, [load_preset(preset), {"train": train}])
+    return request_of(capture_path(), tmp_path / "out", config, "cpu", 2)
+
+
+def test_a_limit_that_no_training_keeps_to_is_refused_before_anything_is_done(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(tmp_path / "out")]
+    command += ["--device", "cpu", "--max-memory", "500M"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 4 and "No training keeps to 0.50 GB" in done.stderr and "at least" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_least_limit_that_is_told_is_taken(tmp_path: Path) -> None:
+    least = least_memory_bytes(LineConfig())
+    require_memory(request(tmp_path, "standard"))
+    require_memory(request(tmp_path, "standard", max_memory_bytes=least))
+    with pytest.raises(MachineError) as raised:
+        require_memory(request(tmp_path, "standard", max_memory_bytes=least - 1))
+    assert f"{-(-least // 1_000_000)}M" in raised.value.hint
+
+
+def test_a_run_says_what_it_takes_and_what_memory_leaves_out(tmp_path: Path) -> None:
+    told = told_beforehand(request(tmp_path, "preview"))
+    assert told.startswith("40 photos of 1.1 megapixels take about ") and "1,500 iterations" in told
+    assert "GB of memory" in told and "GB of disk" in told and "memory holds" not in told
+    least = least_memory_bytes(LineConfig())
+    tight = request(tmp_path, "standard", max_memory_bytes=least)
+    assert "the memory holds" in told_beforehand(tight) and "the photos ask for more" in told_beforehand(tight)
+    assert told_beforehand(request(tmp_path, "preview", time_budget_s=600.0)).endswith("GB of disk.")
+
+
+@pytest.mark.parametrize("preset", ["preview", "standard", "high"])
+def test_forecasts_follow_lengths_windows_and_limits(preset: str) -> None:
+    config = resolve(LineConfig, [load_preset(preset)])
+    small, large = (CaptureSize(photos, 20.0, True) for photos in (50, 1000))
+    each = [Work.of(size, config, REFERENCE, 2) for size in (small, large)]
+    assert all(work.iterations >= 20 * work.size.photos and work.window <= 0.5 for work in each)
+    few, many = (forecast(size, config)["train"] for size in (small, large))
+    assert many.cpu_seconds > few.cpu_seconds and many.scratch_bytes > 5 * few.scratch_bytes
+    limited = resolve(LineConfig, [load_preset(preset), {"train": {"max_memory_bytes": 800_000_000}}])
+    assert Work.of(small, limited, REFERENCE, 2).window < each[0].window
+    assert forecast(small, limited)["train"].memory_bytes <= 800_000_000
