@@ -27,9 +27,10 @@ COARSE_SHARE = 0.5  # of the iterations at the first size are with photos that `
 
 UNTIL = 0.5  # of a run there is density control: published; of the finest size's iterations, where there are several
 
-WINDOW_PIXELS = {"cpu": 500_000, "cuda": 2_000_000}
+WINDOW_PIXELS = {"cpu": 1 << 19, "cuda": 1 << 21}
 """Of a photo that an iteration renders, by device. On a CPU an iteration's cost is that of its pixels, so small windows
-cost nothing but their margins; a CUDA device is busy only with larger ones."""
+cost nothing but their margins; a CUDA device is busy only with larger ones. Powers of two: a little over half a
+megapixel and over two, so that photos which were reduced to those are still seen whole."""
 
 
 @dataclass(frozen=True)
