@@ -66,6 +66,12 @@ def test_others_are_decoded_whole_and_have_the_same_bits(tmp_path: Path, suffix:
     np.testing.assert_array_equal(pixels, expected[1])
 
 
+def test_a_photo_is_what_its_content_says_not_its_name(tmp_path: Path) -> None:
+    view = view_of(tmp_path, textured(), ".png")
+    named = View(view.camera, view.image_path.rename(tmp_path / "photo.JPG"), None)
+    np.testing.assert_array_equal(small_view(named, 0.02)[1], reduced_view(named, 0.02)[1])
+
+
 def test_a_photo_of_another_size_than_its_camera_is_refused(tmp_path: Path) -> None:
     view = view_of(tmp_path, textured())
     cv2.imwrite(str(view.image_path), textured(800, 600))

@@ -24,7 +24,7 @@ STEPS = (
     (4, cv2.IMREAD_REDUCED_COLOR_4),
     (2, cv2.IMREAD_REDUCED_COLOR_2),
 )
-JPEG = (".jpg", ".jpeg")  # as `undistort` names them; anything else is decoded whole before it is made smaller
+JPEG_BEGINS = b"\xff\xd8"  # anything else is decoded whole before it is made smaller
 
 
 def small_view(view: View, max_megapixels: float) -> tuple[Camera, Pixels, Mask | None]:
@@ -72,6 +72,15 @@ def read_small(path: Path, size: tuple[int, int], wanted: tuple[int, int]) -> tu
         StageError: if it cannot be read.
     """
     room = min(side // (ROOM * want) for side, want in zip(size, wanted, strict=True))
-    small = path.suffix.lower() in JPEG
+    small = room >= STEPS[-1][0] and _is_jpeg(path)
     factor, flag = next(((by, how) for by, how in STEPS if small and room >= by), (1, cv2.IMREAD_COLOR))
     return factor, read_image(path, flag)
+
+
+def _is_jpeg(path: Path) -> bool:
+    """By its content: names are the user's. What cannot be opened is told by who decodes it."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(JPEG_BEGINS)) == JPEG_BEGINS
+    except OSError:
+        return False
