@@ -46,7 +46,8 @@ def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
         ValueError: if the shapes differ, a value is not finite, or the mask leaves no pixel (so of every measure here).
     """
     x, y, counts = _prepare(render, photo, mask)
-    error = _mean((x - y).square(), counts)
+    errors = (_sum((a - b).square_(), counts) for a, b in zip(x, y, strict=True))
+    error = math.fsum(errors) / (3 * int(counts.sum()))
     return 10.0 * math.log10(1.0 / error) if error > 0.0 else math.inf
 
 
@@ -183,7 +184,9 @@ def sharpness(render: Image, photo: Image, mask: Mask | None = None) -> float:
     tenth of the counting pixels where the photo's gradient is largest.
     """
     x, y, counts = _prepare(render, photo, mask)
-    gx, gy = (_gradient(pad(_luma(image)[None], [1] * 4, mode="replicate")[0], (1.0, 2.0, 1.0)) for image in (x, y))
+    lumas = (_luma(x), _luma(y))
+    del x, y
+    gx, gy = (_gradient(pad(luma[None], [1] * 4, mode="replicate")[0], (1.0, 2.0, 1.0)) for luma in lumas)
     gx, gy = gx[1:-1, 1:-1][counts], gy[1:-1, 1:-1][counts]  # (pixels,)
     edges = max(1, math.ceil(_EDGE_SHARE * gy.numel()))
     order = torch.sort(gy, descending=True, stable=True).indices[:edges]
@@ -217,11 +220,21 @@ def _prepare(render: Tensor, photo: Tensor, mask: Tensor | None) -> tuple[Tensor
     if counts.shape != render.shape[:2]:
         raise ValueError(f"mask {tuple(counts.shape)} is not {tuple(render.shape[:2])}")
     _require_pixels(counts)
-    x, y = (image.detach().cpu().to(torch.float64).permute(2, 0, 1).contiguous() for image in (render, photo))
-    x = torch.where(counts, x, y)
-    if not bool(torch.isfinite(x).all() and torch.isfinite(y).all()):
-        raise ValueError("the render or the photo has values that are not finite")
+    x, y = (_planes(image.detach().cpu()) for image in (render, photo))
+    for channel, other in zip(x, y, strict=True):
+        if mask is not None:
+            channel.copy_(torch.where(counts, channel, other))
+        if not bool(torch.isfinite(channel).all() and torch.isfinite(other).all()):
+            raise ValueError("the render or the photo has values that are not finite")
     return x, y, counts
+
+
+def _planes(image: Tensor) -> Float[Tensor, "3 h w"]:
+    """The channels one after the other, in float64, a channel at a time: pictures of megapixels are large in it."""
+    planes = torch.empty((3, *image.shape[:2]), dtype=torch.float64)
+    for plane, channel in zip(planes, image.unbind(2), strict=True):
+        plane.copy_(channel)
+    return planes
 
 
 def _require_pixels(counts: Tensor) -> None:
