@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -65,9 +65,40 @@ class PhotoSkies:
 
 def seen_by_cpu(found: SkyMask, camera: Camera) -> SeenSky:
     """A photo's sky at the size of ``camera``, or in its window."""
-    share = found.unpacked().astype(np.float32)
-    wider = np.asarray(cv2.dilate(share, np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)))
+    share = found.unpacked()
+    if camera.window is not None and camera.whole().height >= share.shape[0]:
+        return _seen_in_window(share, camera)
+    wider = _widened(share)
     return SeenSky(_surely(share, camera), _surely(wider, camera))
+
+
+def _widened(share: Bool[np.ndarray, "_ _"]) -> Bool[np.ndarray, "_ _"]:
+    """With the rim around."""
+    return np.asarray(cv2.dilate(share.view(np.uint8), np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8))).view(bool)
+
+
+def _seen_in_window(share: Bool[np.ndarray, "_ _"], camera: Camera) -> SeenSky:
+    """The same for a window of a photo larger than its mask: only what the window shows of the mask is looked at."""
+    taken, places = [], []
+    for old, (new, pixels) in zip(share.shape, _sides(camera), strict=True):
+        step = old / new
+        first, last = (0.5 * step - 0.5 + step * pixel for pixel in (pixels.start, pixels.stop - 1))
+        begin = max(0, int(first) - RIM_PX - 1)
+        taken.append(slice(begin, int(last) + RIM_PX + 3))
+        places.append((step, first - begin))
+    part = np.ascontiguousarray(share[taken[0], taken[1]])
+    if not part.any() or part.all():
+        everywhere = torch.full((camera.height, camera.width), bool(part.any()))
+        return SeenSky(everywhere, everywhere)
+    (down, top), (right, left) = places
+    from_window = np.array([[right, 0.0, left], [0.0, down, top]])
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = (camera.width, camera.height)
+    mask, around = (
+        cv2.warpAffine(sky.astype(np.float32), from_window, size, flags=how, borderMode=cv2.BORDER_REPLICATE) > SURE
+        for sky in (part, _widened(part))
+    )
+    return SeenSky(torch.from_numpy(mask), torch.from_numpy(around))
 
 
 def seen_by_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camera: Camera) -> SeenSky:
@@ -94,26 +125,13 @@ def _sides(camera: Camera) -> tuple[tuple[int, slice], tuple[int, slice]]:
     return (whole.height, slice(top, top + camera.height)), (whole.width, slice(left, left + camera.width))
 
 
-def _surely(share: Float32[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
+def _surely(sky: Bool[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
     (height, rows), (width, columns) = _sides(camera)
-    if share.shape == (height, width):
-        return torch.from_numpy(share[rows, columns] > SURE)
-    if height < share.shape[0]:
-        share = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-        return torch.from_numpy(share[rows, columns] > SURE)
-    if camera.window is None:
-        share = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-        return torch.from_numpy(share > SURE)
-    return torch.from_numpy(_enlarged(_enlarged(share, height, rows).T, width, columns).T > SURE)
-
-
-def _enlarged(share: Float32[np.ndarray, "old _"], size: int, rows: slice) -> Float32[np.ndarray, "new _"]:
-    """Some rows of what OpenCV's bilinear filter makes of a picture; all of them would be those of a whole photo."""
-    old = share.shape[0]
-    place = np.clip((np.arange(rows.start, rows.stop) + 0.5) * (old / size) - 0.5, 0.0, old - 1.0)
-    before = np.minimum(place.astype(np.int64), max(0, old - 2))
-    weight = (place - before).astype(np.float32)[:, None]
-    return np.asarray((1.0 - weight) * share[before] + weight * share[np.minimum(before + 1, old - 1)])
+    share = sky.astype(np.float32)
+    if share.shape != (height, width):
+        way = cv2.INTER_AREA if height < share.shape[0] else cv2.INTER_LINEAR
+        share = np.asarray(cv2.resize(share, (width, height), interpolation=way), np.float32)
+    return torch.from_numpy(share[rows, columns] > SURE)
 
 
 def _resizing(old: int, new: int, rows: slice, like: Tensor) -> Float[Tensor, "rows old"]:
