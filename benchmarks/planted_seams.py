@@ -1,0 +1,65 @@
+"""Seams as bad merges leave them, planted into a splat that has none: what a detector of seams is held against."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.sh import C0
+
+STRIP = 20.0  # of a doubled wall, in pixels: what two blocks overlap in when margins are kept
+
+
+def gap(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, width: float) -> Gaussians:
+    """Without the Gaussians whose centres lie near a border.
+
+    Args:
+        gaussians: The splat.
+        plan: The ground's.
+        line: The border.
+        width: Of what is empty, world units.
+    """
+    return gaussians.select(torch.from_numpy(~_near(gaussians, plan, line, width / 2.0)))
+
+
+def doubled(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, rise: float, strip: float) -> Gaussians:
+    """With those near a border there twice, once of them higher.
+
+    Args:
+        gaussians: The splat.
+        plan: The ground's.
+        line: The border.
+        rise: Of the second surface above the first, world units.
+        strip: How wide that is, world units.
+    """
+    again = gaussians.select(torch.from_numpy(_near(gaussians, plan, line, strip / 2.0)))
+    up = torch.from_numpy(rise * plan.up).to(again.means)
+    return Gaussians.concat([gaussians, replace(again, means=again.means + up)])
+
+
+def colour_step(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, step: float) -> Gaussians:
+    """With all on the left of a border, as far as it goes, brighter.
+
+    Args:
+        gaussians: The splat.
+        plan: The ground's.
+        line: The border.
+        step: Of the colour, 0 to 1.
+    """
+    places = plan.places(gaussians.means.double().numpy())
+    along = line.along(places)
+    left = (line.beside(places) > 0.0) & (along >= 0.0) & (along <= line.length)
+    sh = gaussians.sh.clone()
+    sh[torch.from_numpy(left), 0] += step / C0
+    return replace(gaussians, sh=sh)
+
+
+def _near(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, most: float) -> Bool[np.ndarray, " n"]:
+    places = plan.places(gaussians.means.double().numpy())
+    along = line.along(places)
+    return np.asarray((np.abs(line.beside(places)) < most) & (along >= 0.0) & (along <= line.length))

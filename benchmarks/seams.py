@@ -1,0 +1,171 @@
+"""Whether borders of blocks show in a splat: ``seams.py OUT COARSE.ply [--merged MERGED.ply] [--partition FILE]``.
+
+OUT is a run; its splat, or MERGED in its place, is looked at along the borders of a partition (its JSON as
+``Partition.facts`` gives it; without, OUT's site is cut into ``--blocks`` cells), against COARSE, a splat of the same
+frame without blocks. With ``--plant`` the splat is taken to be without seams: gaps, doubled surfaces and steps of
+colour of graded strength are put on its longest borders, and the table says which are found. Sizes are in pixels as a
+camera over the border has them, colours 0 to 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from opened_run import OpenedRun, open_run
+from planted_seams import STRIP, colour_step, doubled, gap
+from tables import Row, print_table
+
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
+from splatpipe.pipeline.photos.dataset import load_points_and_tracks
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.seams import Seam, border_cameras, find_seams
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.train.blocks.cutting import cut, site, work_map
+from splatpipe.pipeline.train.blocks.partition import BACKDROP, Border, Partition
+from splatpipe.pipeline.train.blocks.sight import sights
+
+GRADES = {  # what is planted: pixels empty, pixels higher, of the colour's range
+    "gap": (1.0, 2.0, 4.0, 8.0),
+    "doubled": (1.0, 2.0, 4.0),
+    "colour": (0.01, 0.02, 0.04, 0.08),
+}
+PLANTED_BORDERS = 2  # the longest
+COLUMNS = {
+    "border": "border:",
+    "length m": "length:.1f",
+    "planted": "planted:",
+    "strength": "strength:",
+    "found": "found:",
+    "by": "measure:",
+    "size": "size:.3f",
+    "score": "score:.1f",
+    "from m": "start:.1f",
+    "to m": "end:.1f",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """What borders are looked at in.
+
+    Attributes:
+        run: The run.
+        partition: Its cells.
+        cameras: Of its photos, at the size of training.
+        coarse: The model without blocks.
+        metres: A unit of the model's frame.
+    """
+
+    run: OpenedRun
+    partition: Partition
+    cameras: Sequence[Camera]
+    coarse: Gaussians
+    metres: float
+
+    def seams(self, splat: Gaussians, line: PlanLine) -> list[Seam]:
+        """What shows of a border of a splat."""
+        return find_seams((splat, self.coarse), self.partition.plan, line, self.cameras, self.run.options)
+
+    def pixel(self, splat: Gaussians, line: PlanLine) -> float:
+        """Of the cameras over a border, on the surface below them, world units."""
+        cameras, height = border_cameras(splat, self.partition.plan, line, self.cameras, self.run.options)
+        return height / cameras[0].fx
+
+
+def open_site(arguments: argparse.Namespace) -> Site:
+    """Read what the command line names.
+
+    Raises:
+        SplatpipeError: if something is not there, or broken.
+    """
+    run = open_run(arguments.out)
+    frame = load_frame(run.parts["georef.frame"].path).world_from_model
+    cameras = [run.camera(view) for view in run.views]
+    if arguments.partition is not None:
+        try:
+            partition = Partition.of_facts(json.loads(arguments.partition.read_text(encoding="utf-8")))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UsageError(f"{arguments.partition} is no partition: {error}") from error
+    else:
+        points, tracks = load_points_and_tracks(run.parts["undistort.dataset"].path)
+        seen = sights(cameras, [tracks[camera.name] for camera in cameras], run.median_depth)
+        plan = GroundPlan.across(frame.rotation[2])
+        partition = cut(work_map(plan, site(plan, seen, points.xyz), seen, points.xyz), arguments.blocks)
+    return Site(run, partition, cameras, read_splat(arguments.coarse), frame.scale)
+
+
+def judged(place: Site, splat: Gaussians, border: Border) -> Iterator[Row]:
+    """A row for each seam of a border, or one that says that there is none."""
+    facts: Row = {"border": f"{border.blocks[0]}–{border.blocks[1]}", "length": border.line.length * place.metres}
+    seams = place.seams(splat, border.line)
+    for seam in seams:
+        shown = seam.response
+        row = {"found": seam.kind, "measure": f"{shown.measure}, {2 * shown.width} px", "size": shown.size}
+        yield (
+            facts
+            | row
+            | {
+                "score": shown.score,
+                "start": seam.start * place.metres,
+                "end": seam.end * place.metres,
+            }
+        )
+    if not seams:
+        yield facts | {"found": "-"}
+
+
+def planted(place: Site, splat: Gaussians, border: Border) -> Iterator[Row]:
+    """Rows of each seam that was put on a border: what was found of its kind, or the first of what else was."""
+    plan, line = place.partition.plan, border.line
+    pixel = place.pixel(splat, line)
+    plants: dict[str, Callable[[float], Gaussians]] = {
+        "gap": lambda strength: gap(splat, plan, line, strength * pixel),
+        "doubled": lambda strength: doubled(splat, plan, line, strength * pixel, STRIP * pixel),
+        "colour": lambda strength: colour_step(splat, plan, line, strength),
+    }
+    for kind, grades in GRADES.items():
+        for strength in grades:
+            rows = list(judged(place, plants[kind](strength), border))
+            row = next((row for row in rows if row["found"] == kind), rows[0])
+            unit = "" if kind == "colour" else " px"
+            yield row | {"planted": kind, "strength": f"{strength:g}{unit}"}
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("out", type=Path, help="OUT of a run that was trained")
+    options.add_argument("coarse", type=Path, help="splat of the same frame without blocks")
+    options.add_argument("--merged", type=Path, help="splat in the place of OUT's")
+    options.add_argument("--partition", type=Path, help="JSON of the cells")
+    options.add_argument("--blocks", type=int, default=4, help="cells without it")
+    options.add_argument("--plant", action="store_true", help="put seams of graded strength on the longest borders")
+    options.add_argument("--threads", type=int, default=1)
+    arguments = options.parse_args()
+    try:
+        with same_bits(arguments.threads):
+            place = open_site(arguments)
+            splat = place.run.model[0] if arguments.merged is None else read_splat(arguments.merged)
+            inner = [border for border in place.partition.borders() if border.blocks[1] != BACKDROP]
+            rows = [row for border in inner for row in judged(place, splat, border)]
+            longest = sorted(inner, key=lambda border: -border.line.length)[:PLANTED_BORDERS]
+            rows += [row for border in longest if arguments.plant for row in planted(place, splat, border)]
+    except SplatpipeError as error:
+        options.exit(error.exit_code, f"{error.message} {error.hint}\n")
+    print_table(f"borders of {len(place.partition.cells)} cells", rows, COLUMNS)
+    found = sum(row["found"] != "-" for row in rows if "planted" not in row)
+    print(f"{found} seams on {len(inner)} borders")
+    if arguments.plant:
+        hit = [row for row in rows if "planted" in row and row["found"] == row["planted"]]
+        print(f"{len(hit)} of {sum('planted' in row for row in rows)} planted seams found")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,328 @@
+"""Whether a splat that was put together from blocks shows where: gaps, doubled surfaces and steps of colour on borders.
+
+Each border is looked at by cameras in the vertical plane that it spans, from the height of the flight: straight down,
+and obliquely along it both ways. There the border is the picture's middle column, exactly and whatever the depth, so
+that the splat's own depth is not asked where its two sides are. From each picture that of a model without blocks, be it
+a coarse one, is taken off, and with it most edges that the scene has of itself. What is measured on the border's column
+is also measured on the columns beside it, where no border is: a seam is what stands out among them, all along the
+border or a piece of it. So what is left of the scene's edges raises what a seam has to show, instead of an alarm.
+
+| measure | in a strip at the border, against strips on its two sides | kind |
+|---|---|---|
+| alpha | how much less of the light the splat stops | gap |
+| hole | how much deeper the surface lies, pixels | gap |
+| bump | how much nearer the surface lies, pixels | doubled |
+| spread | how much farther along the rays what stops them is spread, pixels | doubled |
+| line | how far its colour is from the mean of both sides' | colour |
+| step | how far the two sides' colours are apart | colour |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+
+KINDS = {"alpha": "gap", "hole": "gap", "bump": "doubled", "spread": "doubled", "line": "colour", "step": "colour"}
+WIDTHS = (2, 4, 8, 16)  # pixels of half a strip: a gap's, or that of the step that Gaussians of some pixels make
+REACH = 160  # columns beside the border that are compared with it
+GUARD = 2  # times the strip's width: nearer columns see the seam themselves
+MOST = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05, "step": 0.08}  # of a row: one edge of a
+# house is not to outweigh all others
+STATION = 0.7  # of the height above the surface, from one camera over the border to the next
+FARTHEST = 2.5  # times that height: farther rows are seen at too small an angle
+PIECE = 0.35  # of that height: the least length of a border that is judged by itself
+LEAST_ROWS = 24  # of a piece, in all pictures together
+TILT = math.radians(45.0)  # of the oblique cameras, below the horizon
+LIMITS = {  # of a seam along a whole border: score, and size; `benchmarks/seams.py` prints what they find
+    "alpha": (5.0, 0.002),
+    "hole": (4.2, 0.15),
+    "bump": (4.2, 0.25),
+    "spread": (5.0, 0.5),
+    "line": (7.5, 0.015),
+    "step": (5.5, 0.012),
+}
+PIECE_FACTORS = (2.2, 2.5)  # on both for a piece of a border, or one that is as short: chance has more tries there
+SHORT = 0.7  # of the height: a border that is no longer counts as a piece
+LEVEL_COLUMNS = 32  # on each side of the border, whose median depth says where a row lies
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What a measure says of one piece of a border.
+
+    Attributes:
+        measure: One of `KINDS`.
+        piece: Its number along the border; -1 for the whole border.
+        width: Half the strip's width, pixels.
+        size: At the border.
+        others: At the columns beside it.
+        rows: Of pictures that it was taken from.
+    """
+
+    measure: str
+    piece: int
+    width: int
+    size: float
+    others: Float64[np.ndarray, " k"]
+    rows: int
+
+    @property
+    def score(self) -> float:
+        """How far it stands out among the others, in their standard deviations."""
+        return (self.size - float(self.others.mean())) / max(float(self.others.std()), 1e-9)
+
+    def excess(self, score_factor: float, size_factor: float) -> float:
+        """How often it has what a seam is to have; 1 or more is one.
+
+        Args:
+            score_factor: On the least score.
+            size_factor: On the least size.
+        """
+        score, size = LIMITS[self.measure]
+        return min(self.score / (score * score_factor), self.size / (size * size_factor))
+
+
+@dataclass(frozen=True)
+class Seam:
+    """A border that can be seen.
+
+    Attributes:
+        kind: ``gap``, ``doubled`` or ``colour``.
+        response: What shows it most.
+        start: Where on the border it begins, plan units.
+        end: Where it ends.
+    """
+
+    kind: str
+    response: Response
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a picture that show the border, about its column.
+
+    Attributes:
+        along: Where on the border each row lies, plan units.
+        channels: Opacity, depth and spread of depth in pixels, red, green, blue of the columns from left to right.
+    """
+
+    along: Float64[np.ndarray, " r"]
+    channels: Float64[np.ndarray, "6 r c"]
+
+
+def border_cameras(
+    gaussians: Gaussians, plan: GroundPlan, line: PlanLine, like: Sequence[Camera], options: rasterizer.RenderOptions
+) -> tuple[list[Camera], float]:
+    """Cameras over a border, and how high above the surface they stand, world units; none where no surface is.
+
+    Args:
+        gaussians: The model.
+        plan: The ground's.
+        line: The border.
+        like: The photos' cameras, at the size that the model is judged at: the new ones are of their middle kind.
+        options: How the model is rendered.
+    """
+    middle = sorted(like, key=lambda camera: (camera.fx, camera.name))[len(like) // 2]
+    level = float(np.median(plan.heights(np.array([camera.centre() for camera in like]))))
+    ahead = np.array([*line.direction]) @ plan.axes
+    down = _view(middle, plan, ahead, -plan.up)
+    found, heights, along = [], [], 0.0
+    while along <= line.length:
+        centre = plan.points(line.place(along)[None], np.array([level]))[0]
+        height = _height_above(gaussians, _placed(down, centre), options)
+        if height is None:
+            along += line.length / 8.0
+            continue
+        heights.append(height)
+        back = math.cos(TILT) / math.sin(TILT) * height * ahead
+        for sign in (1.0, -1.0):
+            tilted = sign * math.cos(TILT) * ahead - math.sin(TILT) * plan.up
+            found.append(_placed(_view(middle, plan, sign * ahead, tilted), centre - sign * back))
+        found.append(_placed(down, centre))
+        along += STATION * height
+    return found, float(np.median(heights)) if heights else 0.0
+
+
+def find_seams(
+    models: tuple[Gaussians, Gaussians],
+    plan: GroundPlan,
+    line: PlanLine,
+    like: Sequence[Camera],
+    options: rasterizer.RenderOptions,
+) -> list[Seam]:
+    """What shows of a border: of each kind the strongest sign; none where nobody would see it.
+
+    Args:
+        models: As for ``responses``.
+        plan: The ground's, in the model's frame.
+        line: The border, in plan.
+        like: The photos' cameras, at the size that the model is judged at.
+        options: How the model is rendered.
+    """
+    found, height = responses(models, plan, line, like, options)
+    pieces = 1 + max((response.piece for response in found), default=0)
+    strongest: dict[str, tuple[float, Seam]] = {}
+    for response in found:
+        part = response.piece >= 0 or line.length < SHORT * height
+        excess = response.excess(*(PIECE_FACTORS if part else (1.0, 1.0)))
+        kind = KINDS[response.measure]
+        if excess >= 1.0 and excess > strongest.get(kind, (0.0, None))[0]:
+            first, last = (0, pieces) if response.piece < 0 else (response.piece, response.piece + 1)
+            seam = Seam(kind, response, first / pieces * line.length, last / pieces * line.length)
+            strongest[kind] = (excess, seam)
+    return [seam for _, seam in strongest.values()]
+
+
+def responses(
+    models: tuple[Gaussians, Gaussians],
+    plan: GroundPlan,
+    line: PlanLine,
+    like: Sequence[Camera],
+    options: rasterizer.RenderOptions,
+) -> tuple[list[Response], float]:
+    """All that the measures say of a border: of each of its pieces, and of all of it; and how high the cameras stand.
+
+    Args:
+        models: The one that was put together, and one of the same scene without blocks; without sky.
+        plan: The ground's, in the model's frame.
+        line: The border, in plan.
+        like: The photos' cameras, at the size that the model is judged at.
+        options: How the model is rendered.
+    """
+    cameras, height = border_cameras(models[0], plan, line, like, options)
+    if not cameras:
+        return [], height
+    pieces = max(1, int(line.length / (PIECE * height)))
+    sums: dict[tuple[int, str], Float64[np.ndarray, "p _ k"]] = {}
+    counts = np.zeros(pieces + 1, np.int64)  # of the rows of all, and of each piece
+    for camera in cameras:  # each picture's rows are added up at once: all of them would be hundreds of megabytes
+        rows = _rows(models, plan, line, camera, (options, height))
+        number = np.clip((rows.along / line.length * pieces).astype(np.int64), 0, pieces - 1)
+        chosen = [np.ones(len(number), np.bool_), *(number == piece for piece in range(pieces))]
+        counts += [int(part.sum()) for part in chosen]
+        reach = rows.channels.shape[2] // 2
+        for width in (width for width in WIDTHS if reach >= (4 + GUARD) * width + 4):  # narrow pictures have fewer
+            for name, values in _measured(rows.channels, width).items():
+                added = np.stack([values[:, part].sum(axis=1) for part in chosen])
+                sums[width, name] = sums.get((width, name), 0.0) + added
+    shown = np.flatnonzero(counts >= LEAST_ROWS).tolist()
+    found = [
+        _response(total[piece] / counts[piece], (name, piece - 1, width), int(counts[piece]))
+        for (width, name), total in sums.items()
+        for piece in shown
+    ]
+    return found, height
+
+
+def _response(mean: Float64[np.ndarray, "_ k"], which: tuple[str, int, int], rows: int) -> Response:
+    """A measure's mean over rows at each column, as it is at the border and beside it."""
+    curve = np.linalg.norm(mean, axis=0) if len(mean) > 1 else mean[0]
+    middle = len(curve) // 2
+    beside = np.abs(np.arange(len(curve)) - middle) >= GUARD * which[2] + 4
+    return Response(*which, float(curve[middle]), curve[beside], rows)
+
+
+def _measured(channels: Float64[np.ndarray, "6 r c"], width: int) -> dict[str, Float64[np.ndarray, "_ r k"]]:
+    """Each measure of each row, at each column that has its strips."""
+    sums = np.concatenate([np.zeros((*channels.shape[:2], 1)), np.cumsum(channels, axis=2)], axis=2)
+    places = channels.shape[2] + 1 - 6 * width
+
+    def mean(begin: int, end: int) -> Float64[np.ndarray, "6 r k"]:
+        """Of the columns from ``begin`` to ``end`` right of each place."""
+        first, last = (sums[..., 3 * width + at :][..., :places] for at in (begin, end))
+        return np.asarray((last - first) / (end - begin))
+
+    left, right, strip = mean(-3 * width, -width), mean(width, 3 * width), mean(-width, width)
+    apart = (left + right) / 2.0 - strip
+    step = mean(0, 2 * width)[3:] - mean(-2 * width, 0)[3:]
+    found = {
+        "alpha": apart[:1],
+        "hole": -apart[1:2],
+        "bump": apart[1:2],
+        "spread": -apart[2:3],
+        "line": apart[3:],
+        "step": step,
+    }
+    return {name: np.clip(values, -MOST[name], MOST[name]) for name, values in found.items()}
+
+
+def _rows(
+    models: tuple[Gaussians, Gaussians],
+    plan: GroundPlan,
+    line: PlanLine,
+    camera: Camera,
+    how: tuple[rasterizer.RenderOptions, float],
+) -> _Rows:
+    """What a camera over a border shows of it, less what it shows of the second model."""
+    options, height = how
+    stacks = [_stack(model, camera, options, height) for model in models]
+    reach = stacks[0].shape[2] // 2
+    about = stacks[0][1][:, reach - LEVEL_COLUMNS : reach + LEVEL_COLUMNS]
+    about = np.where(about > 0.0, about, np.nan)
+    shown = np.flatnonzero(np.isfinite(about).any(axis=1))
+    level = np.nanmedian(about[shown], axis=1)
+    pixels = np.column_stack([np.full(len(shown), camera.cx), shown + 0.5])
+    along = line.along(plan.places(camera.unproject(pixels, level)))
+    inside = (along >= 0.0) & (along <= line.length) & (level <= FARTHEST * height)
+    shown, level, along = shown[inside], level[inside], along[inside]
+    pixel = (level / camera.fx)[:, None]
+    channels = np.zeros((6, len(shown), 2 * reach))
+    for sign, stack in zip((1.0, -1.0), stacks, strict=True):
+        part = stack[:, shown]
+        part[1] = np.where(part[1] > 0.0, part[1] - level[:, None], 0.0) / pixel
+        part[2] /= pixel
+        channels += sign * part
+    backward = bool((line.direction @ plan.axes) @ np.cross(plan.up, camera.cam_from_world[0, :3]) < 0.0)
+    return _Rows(along, channels[..., ::-1] if backward else channels)  # the line's left is always on the left
+
+
+def _stack(
+    gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions, height: float
+) -> Float64[np.ndarray, "6 h c"]:
+    """Opacity, median depth, spread of depth, red, green and blue of the columns about a picture's middle."""
+    with torch.no_grad():
+        seen = rasterizer.render(gaussians, camera, options).colour
+        deep = rasterizer.render(gaussians, camera, replace(options.for_depths(), depth_origin=height))
+    reach = min(REACH, camera.width // 2)
+    columns = slice(camera.width // 2 - reach, camera.width // 2 + reach)
+    parts = (deep.alpha, deep.median_depth, deep.depth_sum, deep.depth_square_sum, *seen.unbind(2))
+    alpha, depth, sums, squares, *colours = (part.double().numpy(force=True)[:, columns] for part in parts)
+    weight = np.maximum(alpha, 1e-6)
+    spread = np.sqrt(np.maximum(squares / weight - np.square(sums / weight - height), 0.0))
+    return np.stack([alpha, depth, spread, *colours])
+
+
+def _height_above(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> float | None:
+    """The median depth below a camera that looks straight down; None where it sees no surface."""
+    with torch.no_grad():
+        depth = rasterizer.render(gaussians, camera, options.for_depths()).median_depth.numpy(force=True)
+    near = depth[:, camera.width // 2 - LEVEL_COLUMNS : camera.width // 2 + LEVEL_COLUMNS]
+    return float(np.median(near[near > 0.0])) if (near > 0.0).mean() > 0.5 else None
+
+
+def _view(like: Camera, plan: GroundPlan, ahead: np.ndarray, forward: np.ndarray) -> Camera:
+    """A camera at the origin that looks forward, in a vertical plane which is its middle column: even, and centred."""
+    width, height = min(like.width - like.width % 2, 2 * REACH), like.height - like.height % 2
+    right = np.cross(ahead, plan.up)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    focal = math.sqrt(like.fx * like.fy)
+    return Camera("seam", width, height, focal, focal, width / 2.0, height / 2.0, pose)
+
+
+def _placed(camera: Camera, centre: np.ndarray) -> Camera:
+    pose = camera.cam_from_world.copy()
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return replace(camera, cam_from_world=pose)
