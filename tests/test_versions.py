@@ -70,6 +70,15 @@ def test_a_changed_answer_without_a_raised_version_is_noticed(copy: Path) -> Non
     assert "make versions" in record.complaint(copy)
 
 
+def test_the_body_of_a_stages_shards_belongs_to_it(copy: Path) -> None:
+    entry = '    entry="splatpipe.stages.split:run",'
+    shards = '    shards=Shards("undistort.dataset", {}, entry="splatpipe.stages.train:run"),'
+    replace(copy / "stages/line.py", f"^{entry}", f"{entry}\n{shards}")
+    record.write(copy, record.present(copy))
+    replace(copy / "pipeline/splat/free_space.py", r"^CELLS = \d+", "CELLS = 99")
+    assert {"split", "train"} <= complained_of(copy)
+
+
 def test_kernels_belong_to_the_stages_that_reach_them(copy: Path) -> None:
     kernel = copy / "pipeline/raster/native/adam_cpu.cpp"
     append(kernel, "\n// A comment,\n/* and\nanother */\n\n")

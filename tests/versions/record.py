@@ -32,8 +32,16 @@ def present(root: Path) -> dict[str, StageSources]:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Stage":
             said = {keyword.arg: keyword.value for keyword in node.keywords}
             name, version, entry = (ast.literal_eval(said_) for said_ in (node.args[0], said["version"], said["entry"]))
-            found[name] = StageSources(version, sources.digest(entry))
+            found[name] = StageSources(version, sources.digest(entry, *_shards_entry(said.get("shards"))))
     return found
+
+
+def _shards_entry(said: ast.expr | None) -> list[str]:
+    """The body of a stage's shards, where it has some."""
+    if not isinstance(said, ast.Call):
+        return []
+    named = [keyword.value for keyword in said.keywords if keyword.arg == "entry"]
+    return [ast.literal_eval(value) for value in (*said.args[2:3], *named)]
 
 
 def recorded(root: Path) -> dict[str, StageSources]:

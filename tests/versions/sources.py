@@ -37,14 +37,14 @@ class Sources:
     def __init__(self, root: Path) -> None:
         self._root = root
 
-    def digest(self, entry: str) -> str:
-        """sha256 (hex) of all that a body reaches.
+    def digest(self, *entries: str) -> str:
+        """sha256 (hex) of all that a stage's bodies reach.
 
         Args:
-            entry: The body, ``module:function``.
+            entries: Its body and its shards', ``module:function``.
         """
         pieces = []
-        for module in sorted(self.reached(entry.partition(":")[0])):
+        for module in sorted({each for entry in entries for each in self.reached(entry.partition(":")[0])}):
             file = self._file(module)
             assert file is not None
             pieces.append([module, _module_digest(file.read_text(encoding="utf-8"))])
