@@ -18,7 +18,7 @@ import pytest
 
 from splatpipe.pipeline.engine import lock as engine_lock
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
-from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_shard
+from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_shard, shards_being_made
 from splatpipe.pipeline.engine.machine import Mount
 
 ELSEWHERE = {"process": 4711, "host": "node7", "boot": "another", "turn": "first"}
@@ -226,6 +226,7 @@ def test_a_link_in_the_locks_place_is_not_followed(out: Path, tmp_path: Path) ->
 def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> None:
     with locked_shard(out, "train.1"), locked_shard(out, "train.2"):
         assert is_locked(out, "train.1") and not is_locked(out, "train.3") and not is_locked(out)
+        assert shards_being_made(out) == ["train.1", "train.2"]
         with (
             pytest.raises(UsageError, match=f"process {os.getpid()}\\) is making train.1 in"),
             locked_shard(out, "train.1"),
@@ -236,6 +237,7 @@ def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> N
     with locked(out), pytest.raises(UsageError, match="is working in"), locked_shard(out, "train.1"):
         pass
     assert all(path.read_bytes() == b"" for path in (out / "stages").glob(f"{LOCK_FILE}*"))
+    assert shards_being_made(out) == []
 
 
 def test_a_shard_made_on_another_machine_shuts_out_who_wants_it_or_all(out: Path) -> None:

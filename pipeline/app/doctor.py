@@ -8,6 +8,7 @@ import platform
 import shutil
 from pathlib import Path
 
+from splatpipe.pipeline.engine.lock import is_locked, shards_being_made
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes, mount_of
 from splatpipe.pipeline.engine.runner import versions
 from splatpipe.pipeline.engine.stage import JSON
@@ -31,6 +32,7 @@ def examine(place: Path) -> dict[str, JSON]:
         "place of results": str(place),
         "file system there": _file_system(place),
         "free disk there": _free(place),
+        "at work there": _at_work(place),
         **versions(),
         "rasterizer": f"native, {isa_name()} (of {', '.join(isa_names())})",
         "CUDA": _cuda(),
@@ -66,6 +68,12 @@ def _free(place: Path) -> str:
 def _file_system(place: Path) -> str:
     mount = mount_of(place)
     return "unknown" if mount is None else f"{mount.kind} at {mount.point}"
+
+
+def _at_work(place: Path) -> str:
+    if is_locked(place):
+        return "a run"
+    return ", ".join(shards_being_made(place)) or "nobody"
 
 
 def _memory() -> str:

@@ -235,6 +235,12 @@ def is_locked(out: Path, shard: str = "") -> bool:
     return holder is not None and holder.is_elsewhere and touched_s < SILENCE_S
 
 
+def shards_being_made(out: Path) -> list[str]:
+    """Names of an OUT's shards that somebody makes now on their own, as far as a look tells."""
+    names = sorted(path.name.removeprefix(f"{LOCK_FILE}.") for path in (out / "stages").glob(f"{LOCK_FILE}.*"))
+    return [name for name in names if is_locked(out, name)]
+
+
 def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
     """Lock the file against this machine and others, and sign it."""
     waiting = _Waiting(path, tell, wait)
