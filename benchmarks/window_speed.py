@@ -161,7 +161,7 @@ def main() -> None:
     options.add_argument("--megapixels", type=float, nargs="+", default=[4.0, 20.0], help="of the photos in windows")
     options.add_argument("--points", default="sparse", help="name of the point set")
     options.add_argument("--photos", type=int, default=4, help="so many, the first in name order")
-    options.add_argument("--repeats", type=int, default=84, help="iterations of each size that count")
+    options.add_argument("--repeats", type=int, default=80, help="iterations that count: whole rounds of the windows")
     arguments = parse(options)
     facts = machine(arguments.threads)
     with scratch() as folder:
