@@ -24,6 +24,7 @@ from splatpipe.pipeline.train.blocks.needs import (
     block_need,
     fewest_blocks,
     need_of_blocks,
+    round_pixels,
     shared_cap,
     with_margin,
 )
@@ -31,7 +32,7 @@ from splatpipe.pipeline.train.blocks.partition import BACKDROP, Border, Cell, Pa
 from splatpipe.pipeline.train.blocks.sight import Sight, sights
 from splatpipe.pipeline.train.blocks.surroundings import surroundings
 from splatpipe.pipeline.train.blocks.thinning import thinned
-from splatpipe.pipeline.train.blocks.visibility import block_views
+from splatpipe.pipeline.train.blocks.visibility import block_views, windows
 from splatpipe.pipeline.train.limits import FIXED_BYTES
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -192,6 +193,29 @@ def test_block_sees_its_cell_whole_and_by_sight(seen: list[Sight], sparse: Float
             assert shown <= 0.08 * seen[number].pixels
 
 
+def test_work_of_a_block_is_told_before_anything_is_cut(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
+    pixels = sum(sight.pixels for sight in seen)
+    window = math.sqrt(80 * 60) * building_site.HEIGHT / building_site.FOCAL
+    area = building_site.LENGTH * building_site.WIDTH
+    for blocks in (2, 4, 7):
+        views = block_views(divided(seen, sparse, blocks), seen, sparse, building_site.quarters)
+        real = sum(view.pixels for view in views) / blocks
+        assert 1 / 1.5 < round_pixels(pixels, blocks, window, area) / real < 1.5
+    assert round_pixels(pixels, 1, window, area) == pixels
+    assert round_pixels(pixels, 2, 100.0 * window, area) == pixels  # each block sees all, and no more than all
+
+
+def test_windows_are_those_of_training(seen: list[Sight]) -> None:
+    camera = seen[0].camera
+    assert windows(camera, 0).tolist() == [[0, 0, camera.width, camera.height]]
+    parts = windows(camera, 5000)
+    shown = np.zeros((camera.height, camera.width), np.int64)
+    for left, top, right, bottom in parts.tolist():
+        shown[top:bottom, left:right] += 1
+        assert (right - left) * (bottom - top) <= 5000
+    assert len(parts) > 1 and (shown == 1).all()
+
+
 def test_a_building_hides_the_ground_behind_it(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> None:
     """A photo that looks at a wall from nearby does not train the block behind it, however near that is."""
     x0, y0, x1, y1, _ = building_site.BUILDINGS[0]
@@ -241,9 +265,9 @@ def test_surroundings_leave_the_blocks_photos_as_they_are(
     """What a block draws, trained and frozen, looks in its photos like the whole; thinned, nearly so."""
     partition = divided(seen, sparse, 4)
     views = block_views(partition, seen, sparse, building_site.quarters)
-    windows = [building_site.quarters(sight.camera) for sight in seen]
+    cuts = [building_site.quarters(sight.camera) for sight in seen]
     for block in (0, 3):
-        view, worst = (views[block], seen, windows), []
+        view, worst = (views[block], seen, cuts), []
         whole = surroundings(partition, block, coarse, view, len(coarse))
         assert whole.seen == len(whole.frozen) < len(coarse) - len(whole.trained)
         fewer = surroundings(partition, block, coarse, view, len(whole.frozen) // 2)
@@ -252,16 +276,16 @@ def test_surroundings_leave_the_blocks_photos_as_they_are(
         own = coarse.select(torch.from_numpy(whole.trained))
         for around in (whole.frozen, fewer.frozen, whole.frozen.select(evenly)):
             drawn = Gaussians.concat([own, around])
-            psnr = [_likeness(coarse, drawn, seen[p.photo], windows[p.photo][p.windows]) for p in view[0].photos]
+            psnr = [_likeness(coarse, drawn, seen[p.photo], cuts[p.photo][p.windows]) for p in view[0].photos]
             worst.append(min(psnr))
         assert worst[0] > 45.0 and worst[1] > 24.0 and worst[1] > worst[2] + 3.0
 
 
-def _likeness(whole: Gaussians, drawn: Gaussians, sight: Sight, windows: np.ndarray) -> float:
+def _likeness(whole: Gaussians, drawn: Gaussians, sight: Sight, parts: np.ndarray) -> float:
     pictures = [render(model, sight.camera, building_site.OPTIONS).colour for model in (whole, drawn)]
     square = np.square((pictures[0] - pictures[1]).numpy())
-    parts = [square[top:bottom, left:right].ravel() for left, top, right, bottom in windows.tolist()]
-    return -10.0 * math.log10(max(float(np.concatenate(parts).mean()), 1e-12))
+    shown = [square[top:bottom, left:right].ravel() for left, top, right, bottom in parts.tolist()]
+    return -10.0 * math.log10(max(float(np.concatenate(shown).mean()), 1e-12))
 
 
 def test_thinning_keeps_moments_and_lone_ones() -> None:
@@ -379,7 +403,7 @@ def test_demo_is_cut_seen_and_put_together(demo_run: Path) -> None:
     found = shares(work, partition)
     assert found.max() <= 1.5 / 4 and found.min() >= 0.5 / 4
     assert (partition.owners(points.xyz) != BACKDROP).mean() > 0.8
-    views = block_views(partition, seen, points.xyz, building_site.quarters)
+    views = block_views(partition, seen, points.xyz, lambda camera: windows(camera, camera.width * camera.height // 6))
     assert min(view.covered for view in views) >= 0.95
     whole = merged(partition, coarse, dict.fromkeys(range(4), coarse))
     assert len(whole) == len(coarse)

@@ -7,6 +7,7 @@ photos is in none of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -86,6 +87,22 @@ def fewest_blocks(cap: int, room_bytes: int, window_pixels: int, sh_degree: int)
         if need_of_blocks(blocks, cap, window_pixels, sh_degree).memory_bytes <= room_bytes:
             return blocks
     return None
+
+
+def round_pixels(pixels: float, blocks: int, window_side: float, site_area: float) -> float:
+    """Pixels of one visit of each window that one of so many equal blocks trains on.
+
+    A window that shows a square of the ground meets, along each axis, one cell and as many more as borders cross it, on
+    average over where on the site it lies: so often is it trained on. Oblique windows show more than a square.
+
+    Args:
+        pixels: Of all photos, at the size that is trained.
+        blocks: At least 1.
+        window_side: Of what a window shows of the ground, world units: its pixels' root times the size of one.
+        site_area: Of all cells, square world units.
+    """
+    meets = 1.0 + (math.sqrt(blocks) - 1.0) * window_side / math.sqrt(site_area)
+    return pixels * min(1.0, meets**2 / blocks)
 
 
 def shared_cap(cap: int, weights: Sequence[float], least: int = 0) -> list[int]:

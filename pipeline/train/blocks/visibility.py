@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.train.blocks.partition import BACKDROP, Partition
 from splatpipe.pipeline.train.blocks.sight import Samples, Sight
+from splatpipe.pipeline.train.looks import windows_of
 
 LEAST_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner of it that its neighbours show whole
 LEAST_POINTS = 4  # observed by the photo, in the cell and in the window: thin things that a coarse depth misses
@@ -65,11 +66,22 @@ class BlockViews:
         return sum(photo.covered for photo in self.photos) / seen if seen > 0.0 else 1.0
 
 
+def windows(camera: Camera, window_pixels: int) -> Windows:
+    """How training cuts a photo at full size.
+
+    Args:
+        camera: The photo's, at the finest size that is trained.
+        window_pixels: Of a window at most; 0 for the whole photo in one.
+    """
+    frames = windows_of(camera.width, camera.height, window_pixels)
+    return np.array([[frame.left, frame.top, frame.right, frame.bottom] for frame in frames])
+
+
 def block_views(
     partition: Partition,
     seen: Sequence[Sight],
     xyz: Float64[np.ndarray, "p 3"],
-    windows_of: Callable[[Camera], Windows],
+    cut: Callable[[Camera], Windows],
 ) -> list[BlockViews]:
     """The photos and windows of each block.
 
@@ -77,16 +89,16 @@ def block_views(
         partition: The cells.
         seen: What the photos see.
         xyz: All sparse points.
-        windows_of: How training cuts a photo at the finest size that it has; they cover it and do not overlap.
+        cut: How training cuts a photo at the finest size (``windows``); the parts cover it and do not overlap.
     """
     found: list[list[BlockPhoto]] = [[] for _ in partition.cells]
     for number, sight in enumerate(seen):
-        windows = windows_of(sight.camera)
-        weights = _counted(partition, sight.samples(xyz), windows)
+        parts = cut(sight.camera)
+        weights = _counted(partition, sight.samples(xyz), parts)
         points = sight.of_points(xyz)
         points = Samples(points.pixels, points.places, np.ones(len(points.places)), points.distances)
-        observed = _counted(partition, points, windows)
-        sizes = (windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1])
+        observed = _counted(partition, points, parts)
+        sizes = (parts[:, 2] - parts[:, 0]) * (parts[:, 3] - parts[:, 1])
         chosen = (weights >= LEAST_SHARE * sizes) | (observed >= LEAST_POINTS)
         for block in np.flatnonzero(chosen.any(axis=1)).tolist():
             rows = chosen[block]
@@ -96,20 +108,20 @@ def block_views(
     return [BlockViews(tuple(photos)) for photos in found]
 
 
-def _counted(partition: Partition, samples: Samples, windows: Windows) -> Float64[np.ndarray, "cells w"]:
+def _counted(partition: Partition, samples: Samples, parts: Windows) -> Float64[np.ndarray, "cells w"]:
     """Weights of the samples of each cell in each window."""
     owners = partition.owners(samples.places)
-    inside = _window_of(samples.pixels, windows)
+    inside = _window_of(samples.pixels, parts)
     rows = (owners != BACKDROP) & (inside >= 0)
-    flat = owners[rows] * len(windows) + inside[rows]
-    size = len(partition.cells) * len(windows)
-    return np.bincount(flat, samples.weights[rows], minlength=size).reshape(-1, len(windows))
+    flat = owners[rows] * len(parts) + inside[rows]
+    size = len(partition.cells) * len(parts)
+    return np.bincount(flat, samples.weights[rows], minlength=size).reshape(-1, len(parts))
 
 
-def _window_of(pixels: Float64[np.ndarray, "n 2"], windows: Windows) -> Int64[np.ndarray, " n"]:
+def _window_of(pixels: Float64[np.ndarray, "n 2"], parts: Windows) -> Int64[np.ndarray, " n"]:
     """The window that each pixel lies in; -1 for none."""
     found = np.full(len(pixels), -1, np.int64)
-    for number, (left, top, right, bottom) in enumerate(windows.tolist()):
+    for number, (left, top, right, bottom) in enumerate(parts.tolist()):
         x, y = pixels.T
         found[(x >= left) & (x < right) & (y >= top) & (y < bottom)] = number
     return found
