@@ -16,13 +16,15 @@ from functools import cache
 from splatpipe.pipeline.train.looks import Look, windows_of
 from splatpipe.pipeline.train.options import TrainConfig
 
-# No capture was compared by these yet: judgement, the reasons theirs.
+# Judgement but for the one that says otherwise; no curve over CPU time was measured yet.
 WHOLE_VISITS = 20  # of a photo at the size at which it is seen whole, at least
-PART_VISITS = 8  # of every part of every photo at each finer size, at least
+PART_VISITS = 16  # of every part of every photo at each finer size, at least; 8 lost, see docs/lengths.md
 FINEST_SHARE = (
     0.5  # of the least iterations are at the finest size: where photos are few, its parts are seen more often
 )
-FEWEST_VISITS = 3.0  # of a part, below which a run that was given its length stays with the size before: it learns more
+FEWEST_VISITS = (
+    10.0  # of a part, below which a run that was given its length stays with the size before: it learns more
+)
 COARSE_SHARE = 0.5  # of the iterations at the first size are with photos that `coarse_levels` halves further
 
 UNTIL = 0.5  # of a run there is density control: published; of the finest size's iterations, where there are several
