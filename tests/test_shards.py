@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from splatpipe.pipeline.app.report.story import read_story
+from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event
@@ -142,7 +143,10 @@ def test_a_killed_shard_costs_itself(numbers: Path, out: Path, monkeypatch: pyte
         walk(request_of(numbers, out))
     story = read_story(out / "events.jsonl", running=False)
     assert story.culprit is not None and story.culprit.name == "sum.2"
-    assert list(story.stages) == ["read", "divide", *SHARDS, "sum", "show"]
+    log = RunLog(out, "events.jsonl")
+    log.read()
+    assert list(story.stages) == list(log.stages) == ["read", "divide", *SHARDS, "sum", "show"]
+    assert [log.stages[name].state for name in (*SHARDS, "sum")] == ["done", "failed", "done", "waiting"]
     monkeypatch.delenv(sharded.KILL_VARIABLE)
     outcome, _ = walk(request_of(numbers, out))
     assert outcome.ran == ["sum.2", "sum", "show"]
