@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.images import Mask, Pixels
@@ -90,6 +91,8 @@ def _measured(function: Callable[..., float], render: Tensor, photo: Tensor, mas
         value = float(function(render, photo, mask))
     except ValueError:  # too few pixels for this measure
         return None
+    finally:
+        return_free_heap()  # measures free hundreds of megabytes, which the heaps of several threads would keep
     value = min(value, EQUAL_DB) if function in (metrics.psnr, metrics.psnr_cc) else value
     return round(value, 6) if math.isfinite(value) else None
 
