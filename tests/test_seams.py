@@ -113,4 +113,4 @@ def test_benchmark_finds_what_it_plants(demo_run: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "0 seams on 1 borders" in done.stdout
     rows = [[cell.strip() for cell in line.split("│")] for line in done.stdout.splitlines() if line.startswith("│")]
-    assert {row[3] for row in rows if row[3] == row[5]} == {"gap", "doubled", "colour"}, done.stdout
+    assert {row[3] for row in rows if row[3] == row[5]} == {"-", "gap", "doubled", "colour"}, done.stdout
