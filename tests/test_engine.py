@@ -14,7 +14,7 @@ import pytest
 
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
-from splatpipe.pipeline.engine.events import Event, EventReporter
+from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter
 from splatpipe.pipeline.engine.line import Line, survey
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.runner import Outcome
@@ -504,3 +504,17 @@ def test_folder_is_at_work_as_long_as_a_session_is_open(numbers: Path, out: Path
     with open_session(request_of(numbers, out), lambda event: None):
         assert open_run_folder(out, arithmetic.LINE).at_work
     assert not open_run_folder(out, arithmetic.LINE).at_work
+
+
+def test_the_log_thins_the_progress_of_a_thing_and_keeps_what_begins(tmp_path: Path) -> None:
+    log = EventLog(tmp_path / "events.jsonl")
+    for time_s, what, done in (
+        (9.0, "decoding", 1),
+        (9.1, "decoding", 2),
+        (9.2, "training", 10),
+        (11.1, "decoding", 3),
+    ):
+        log(Event("progress", "train", {"done": done, "total": 99, "what": what, "unit": ""}, time_s))
+    log.close()
+    told = [json.loads(line)["data"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [(data["what"], data["done"]) for data in told] == [("decoding", 1), ("training", 10), ("decoding", 3)]

@@ -101,12 +101,12 @@ class EventReporter:
 
 
 class EventLog:
-    """Appends events to ``events.jsonl``, one JSON object a line, each whole or not there; progress thinned out."""
+    """Appends events to ``events.jsonl``, one JSON object a line, whole or not there; progress of a thing thinned."""
 
     def __init__(self, path: Path) -> None:
         self._name = path.name
         self._descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        self._last_progress_s = 0.0
+        self._last_progress_s: dict[tuple[str, str], float] = {}  # of each thing that a stage does
         size = os.fstat(self._descriptor).st_size
         if size and os.pread(self._descriptor, 1, size - 1) != b"\n":  # a machine that stopped in the middle of a line
             os.write(self._descriptor, b"\n")
@@ -118,9 +118,10 @@ class EventLog:
             OSError: if the disk is full or gone; what is there ends with a whole line.
         """
         if event.kind == "progress":
-            if event.time_s - self._last_progress_s < LOGGED_PROGRESS_INTERVAL_S:
+            thing = event.stage, str(event.data.get("what"))
+            if event.time_s - self._last_progress_s.get(thing, 0.0) < LOGGED_PROGRESS_INTERVAL_S:
                 return
-            self._last_progress_s = event.time_s
+            self._last_progress_s[thing] = event.time_s
         line = f"{json.dumps(_finite(asdict(event)), allow_nan=False)}\n".encode()
         size = os.fstat(self._descriptor).st_size
         if os.write(self._descriptor, line) < len(line):
