@@ -1,5 +1,6 @@
 """Shared by all tests: where the real photos are, and a browser."""
 
+import os
 import shutil
 import signal
 import subprocess
@@ -39,6 +40,13 @@ def captures(request: pytest.FixtureRequest) -> Path:
     folder = request.config.getoption("--captures")
     assert folder, "give the folder of real captures with --captures"
     return Path(folder)
+
+
+@pytest.fixture
+def lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes find the small lines of `tests/lines`."""
+    folder = Path(__file__).parent / "lines"
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture(scope="session")

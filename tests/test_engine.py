@@ -27,12 +27,9 @@ LINES = Path(__file__).parent / "lines"
 sys.path.insert(0, str(LINES))
 import arithmetic  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("lines")
+
 Walk = Callable[..., Outcome]
-
-
-@pytest.fixture(autouse=True)
-def _workers_find_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(LINES), os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture

@@ -29,6 +29,8 @@ LINES = Path(__file__).parent / "lines"
 sys.path.insert(0, str(LINES))
 import sharded  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("lines")
+
 NUMBERS = (3, 14, 15, 92, 65, 35)
 TOTAL = sum(number**2 for number in NUMBERS)
 SHARDS = ("sum.1", "sum.2", "sum.3")
@@ -47,11 +49,6 @@ def show(event):
 with open_session(request, show, shard=shard, wait="--wait" in sys.argv) as runner:
     runner.run_shard("sum", int(shard.split(".")[1])) if shard else runner.walk()
 """
-
-
-@pytest.fixture(autouse=True)
-def _workers_find_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(LINES), os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture

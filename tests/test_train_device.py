@@ -233,7 +233,7 @@ def test_a_trial_that_a_device_does_not_hold_is_told(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(planning, "measure", measure)
     with pytest.raises(MachineError, match=r"does not hold the trial .* of 9,000 Gaussians") as failure:
         planning.within_time(*budgeted(60.0, cpu()), iterate, tiny_scene.Recorder())
-    assert "undistort.max_megapixels" in failure.value.hint
+    assert "train.max_megapixels" in failure.value.hint
 
 
 def test_colours_are_the_same_numbers_on_a_device() -> None:

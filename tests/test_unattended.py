@@ -27,14 +27,11 @@ LINES = Path(__file__).parent / "lines"
 sys.path.insert(0, str(LINES))
 import arithmetic  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("lines")
+
 DISK = "40m"  # beyond what every stage asks to be free, and less than the stage that fills it writes
 LINE = ["read", "add", "count", "tell"]
 HOSTILE = 'a\nb\r\u2028\x1b[31mred\x85\udcff\0"},{'
-
-
-@pytest.fixture(autouse=True)
-def _workers_find_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(LINES), os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture

@@ -265,7 +265,7 @@ def tell_growth_ended(state: TrainState, plan: Plan, report: Reporter) -> None:
         f"The {'memory limit is close' if limited else 'device has no memory left'}, "
         f"so no Gaussian is added after iteration {state.iteration:,}.",
         hint=f"{'Give more with --max-memory' if limited else 'Lower train.max_gaussians'}, "
-        "or smaller photos with undistort.max_megapixels.",
+        "or smaller photos with train.max_megapixels.",
     )
 
 

@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 KEPT_SHARE = 0.9  # of the Gaussians each time, the most opaque: what is lost is what shows least
-HINT = "Lower undistort.max_megapixels or train.max_gaussians, or close what else uses the graphics card."
+HINT = "Lower train.max_megapixels or train.max_gaussians, or close what else uses the graphics card."
 
 Step = Callable[[TrainState, Plan, TrainingPhoto], None]
 

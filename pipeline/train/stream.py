@@ -161,7 +161,7 @@ class PhotoStream:
             report.warning(
                 f"The decoded photos take {wanted / 1e6:,.0f} MB, and the disk has room for {room / 1e6:,.0f} MB: "
                 "those that do not fit are decoded every time they are trained on, which is slower.",
-                hint="Make room on the disk of OUT, or lower undistort.max_megapixels.",
+                hint="Make room on the disk of OUT, or lower train.max_megapixels.",
             )
 
     def _store(self, index: int) -> None:
