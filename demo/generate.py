@@ -35,7 +35,7 @@ SHOT_NOISE, READ_NOISE = 2.0e-5, 1.0e-6  # variance per unit of light, and in th
 GPS_SIGMA_M = (1.5, 1.5, 3.0)
 RTK_SIGMA_M = (0.02, 0.02, 0.03)
 MARK_SIGMA_PX = 0.3
-PHOTO_BUDGET_BYTES = 7_150_000
+PHOTO_BUDGET_BYTES = 7_150_000  # at 1200 x 900; larger photos have as much a pixel
 CALIBRATED_FOCAL_PX = 853.0  # the maker's calibration, 0.2 % off, as they are
 RTK_XMP = {
     "GpsStatus": "RTK",
@@ -66,15 +66,15 @@ def develop(radiance: Array, exposure_ev: float, rng: np.random.Generator) -> ND
     return np.asarray(coded * 255 + 0.5, np.uint8)
 
 
-def compress(photos: list[NDArray[np.uint8]]) -> list[bytes]:
-    """All photos as JPEG, at the best common quality that keeps within the budget."""
+def compress(photos: list[NDArray[np.uint8]], budget: float) -> list[bytes]:
+    """All photos as JPEG, at the best common quality that keeps within the budget (bytes in all)."""
     for quality in range(94, 40, -1):
         files = []
         for photo in photos:
             buffer = io.BytesIO()
             Image.fromarray(photo).save(buffer, "JPEG", quality=quality, optimize=True, subsampling=2)
             files.append(buffer.getvalue())
-        if sum(map(len, files)) <= PHOTO_BUDGET_BYTES:
+        if sum(map(len, files)) <= budget:
             print(f"JPEG quality {quality}")
             break
     return files
@@ -136,7 +136,8 @@ def write_photos(
     ]
     (out / "photos").mkdir(parents=True, exist_ok=True)
     start, entries = datetime(2026, 6, 18, 13, 42, 5), []
-    for k, (pose, jpeg) in enumerate(zip(poses, compress(developed), strict=True)):
+    budget = PHOTO_BUDGET_BYTES * (lens.width * lens.height) / (Lens.width * Lens.height)
+    for k, (pose, jpeg) in enumerate(zip(poses, compress(developed, budget), strict=True)):
         taken = (start + timedelta(seconds=7 * k + (45 if k >= 16 else 0) + (60 if k >= 31 else 0))).strftime(
             "%Y:%m:%d %H:%M:%S"
         )
