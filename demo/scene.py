@@ -9,7 +9,7 @@ import numpy as np
 from .house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE, add_house
 from .mesh import Array, Builder, Plane, TexturedMesh, paint_faces
 from .surroundings import add_surroundings
-from .textures import target
+from .textures import Painter, target
 
 SEED = 20261120
 PLOT_YAW_DEG = 17.0  # the house is turned against north, as houses are
@@ -94,26 +94,17 @@ def build_scene(seed: int = SEED) -> Scene:
     return Scene(meshes, points)
 
 
-def building_corners() -> Array:
+def building_corners(paint: Painter | None = None) -> Array:
     """The corners of the house's own triangles, (m, 3, 3), without painting it: the same as in the scene, to float32.
 
     Targets lie 12 mm before its walls and roofs and do not belong to it.
+
+    Args:
+        paint: Only those that are painted so; None for all.
     """
     builder = Builder()
     add_house(builder)
-    corners = np.concatenate([face.vertices[face.triangles] for face in builder.faces])
+    faces = [face for face in builder.faces if paint is None or face.paint is paint]
+    corners = np.concatenate([face.vertices[face.triangles] for face in faces])
     turned = corners.astype(np.float32).astype(np.float64) @ _turn(PLOT_YAW_DEG).T
     return np.asarray(turned.astype(np.float32), np.float64)
-
-
-def surface_of(scene: Scene) -> tuple[Array, np.ndarray[tuple[int, int], np.dtype[np.int64]]]:
-    """All triangles of the scene as one mesh: vertices (n, 3) and triangles (m, 3), equal vertices joined."""
-    vertices, triangles, count = [], [], 0
-    for mesh in scene.meshes:
-        vertices.append(mesh.vertices)
-        triangles.append(mesh.triangles.astype(np.int64) + count)
-        count += len(mesh.vertices)
-    joined, index = np.unique(np.vstack(vertices), axis=0, return_inverse=True)
-    corners = index.reshape(-1)[np.vstack(triangles)]
-    whole = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
-    return joined.astype(np.float64), corners[whole]
