@@ -91,7 +91,7 @@ def iteration_times(count: int, megapixels: float, where: torch.device, repeats:
     steps = WARMUP + repeats
     with tempfile.TemporaryDirectory() as cache, choose_rules(where):
         state = TrainState.begin(gpu_scenes.gaussians(CAPTURE, count, where), plan, make_techniques(plan))
-        with PhotoStream(views, [Look()] * steps, 0, 1, Path(cache), megapixels).to(where) as photos:
+        with PhotoStream.over(views, [Look()] * steps, 0, 1, Path(cache), megapixels).to(where) as photos:
             for photo in islice(photos, WARMUP):
                 iterate(state, plan, photo)
             forget_peak(where)

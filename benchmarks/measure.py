@@ -175,7 +175,7 @@ def time_case(case: Case) -> Row:
     if steps >= plan.schedule.density.first:
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
     parts, pairs, pixels = Parts(), [], 0
-    with same_bits(case.threads), PhotoStream(views, [Look()] * steps, case.seed, 1, Path(case.dataset)) as photos:
+    with same_bits(case.threads), PhotoStream.over(views, [Look()] * steps, case.seed, 1, Path(case.dataset)) as photos:
         state = TrainState.begin(start, plan, make_techniques(plan))
         for photo in islice(photos, warmup):
             iterate(state, plan, photo)

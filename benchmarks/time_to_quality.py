@@ -110,7 +110,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
         clocks.start()
         sky = begin_sky(options, trained_on, dataset, arguments.threads, SilentReporter())
         state = TrainState.begin(room, plan, make_techniques(plan, sky, trained_on, dataset))
-        with PhotoStream(trained_on, looks, plan.options.seed, 1, dataset) as photos:
+        with PhotoStream.over(trained_on, looks, plan.options.seed, 1, dataset) as photos:
             for photo in photos:
                 iterate(state, plan, photo)
                 last = state.iteration == ends_at(plan, state.history.flat_at)

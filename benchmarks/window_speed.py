@@ -124,7 +124,7 @@ def begin(dataset: Path, start: Gaussians, looks: list[Look], threads: int) -> t
     plan = make_plan(config, views, Split(tuple(view.camera.name for view in views)), len(start))
     if len(looks) >= plan.schedule.density.first:
         raise SystemExit(f"{len(looks)} iterations reach density control; take fewer repeats.")
-    photos = PhotoStream(views, looks, 0, 1, dataset)
+    photos = PhotoStream.over(views, looks, 0, 1, dataset)
     photos.fill(SilentReporter())
     with same_bits(threads):
         sky = begin_sky(config, views, dataset, threads, SilentReporter())

@@ -43,7 +43,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[View]:
 def trained(views: list[View], cache: Path, kernels: CudaKernels | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Parameters and exposures, and what density control has observed, after every iteration of ``LOOKS``."""
     plan = make_plan(OPTIONS, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
-    with use_kernels(kernels), same_bits(1), PhotoStream(views, LOOKS, 0, 1, cache) as photos:
+    with use_kernels(kernels), same_bits(1), PhotoStream.over(views, LOOKS, 0, 1, cache) as photos:
         training = TrainState.begin(tiny_scene.true_model(), plan, make_techniques(plan, views=views))
         assert plan.schedule.density.first > len(LOOKS), "the Gaussians stay the same"
         for photo in photos:

@@ -43,7 +43,7 @@ def cache(tmp_path: Path) -> Path:
 
 
 def streamed(views: list[View], cache: Path, levels: list[int], first: int = 1, **size: float) -> list[TrainingPhoto]:
-    with PhotoStream(views, [Look(level) for level in levels], 0, first, cache, **size) as photos:
+    with PhotoStream.over(views, [Look(level) for level in levels], 0, first, cache, **size) as photos:
         return list(photos)
 
 
@@ -156,7 +156,7 @@ def touched(place: int, full: int, reduced: int) -> npt.NDArray[np.bool_]:
 def test_photos_are_decoded_once_and_the_files_are_not_needed_again(dataset: Path, cache: Path) -> None:
     views = load_views(dataset)
     levels = [1] * len(views) + [0] * len(views)
-    with PhotoStream(views, [Look(level) for level in levels * 2], 0, 1, cache) as photos:
+    with PhotoStream.over(views, [Look(level) for level in levels * 2], 0, 1, cache) as photos:
         first = [next(photos) for _ in levels]
         next_ones = [next(photos)]
         shutil.rmtree(dataset)
@@ -168,11 +168,11 @@ def test_photos_are_decoded_once_and_the_files_are_not_needed_again(dataset: Pat
 
 def test_cache_has_no_name_and_the_thread_ends_with_the_stream(dataset: Path, cache: Path) -> None:
     views = load_views(dataset)
-    with PhotoStream(views, [Look()] * 40, 0, 1, cache) as photos:
+    with PhotoStream.over(views, [Look()] * 40, 0, 1, cache) as photos:
         for _ in range(20):
             next(photos)
             assert not list(cache.iterdir())
-    with pytest.raises(KeyboardInterrupt), PhotoStream(views, [Look()] * 40, 0, 1, cache) as photos:
+    with pytest.raises(KeyboardInterrupt), PhotoStream.over(views, [Look()] * 40, 0, 1, cache) as photos:
         next(photos)
         raise KeyboardInterrupt
     assert not list(cache.iterdir())
@@ -224,7 +224,7 @@ def test_full_disk_is_told_with_what_to_do(dataset: Path, cache: Path) -> None:
         streamed(load_views(dataset), cache, [0] * 30)
     assert "Make room" in failure.value.hint
     with pytest.raises(MachineError, match="No such file"):
-        PhotoStream([], [], 0, 1, cache / "gone")
+        PhotoStream.over([], [], 0, 1, cache / "gone")
 
 
 def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_and_that_is_told(
@@ -236,7 +236,7 @@ def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_and_that_is_told(
     for room, warnings in ((30_000, 1), (0, 1), (1 << 20, 0)):
         monkeypatch.setattr(photo_cache, "SHARE_OF_FREE", room / free)
         recorder = tiny_scene.Recorder()
-        with PhotoStream(views, [Look()] * 30, 0, 1, cache) as photos:
+        with PhotoStream.over(views, [Look()] * 30, 0, 1, cache) as photos:
             photos.tell(recorder)
             assert all(same(one, other) for one, other in zip(photos, usual, strict=True))
         assert len(recorder.warnings) == warnings
@@ -244,9 +244,9 @@ def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_and_that_is_told(
 
 def test_photos_wanted_once_are_not_stored(dataset: Path, cache: Path) -> None:
     views = load_views(dataset)
-    with PhotoStream(views, [Look()] * len(views), 0, 1, cache) as photos:
+    with PhotoStream.over(views, [Look()] * len(views), 0, 1, cache) as photos:
         assert photos.wanted_bytes() == 0
-    with PhotoStream(views, [Look(1)] * len(views) + [Look()] * (len(views) + 2), 0, 1, cache) as photos:
+    with PhotoStream.over(views, [Look(1)] * len(views) + [Look()] * (len(views) + 2), 0, 1, cache) as photos:
         pages = -(-3 * tiny_scene.WIDTH * tiny_scene.HEIGHT // 4096) * 4096
         half = -(-3 * tiny_scene.WIDTH * tiny_scene.HEIGHT // 4 // 4096) * 4096
         unmasked, masked = len(views) - 1, 2 * 4096  # one more byte a pixel with a mask

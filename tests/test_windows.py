@@ -17,7 +17,7 @@ from splatpipe.pipeline.splat.panorama import STEP_PX
 from splatpipe.pipeline.train import looks
 from splatpipe.pipeline.train.looks import Frame, Look, windows_of
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.visits import Visits
+from splatpipe.pipeline.train.visits import PhotoVisits
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -35,7 +35,7 @@ def views(tmp_path: Path) -> list[View]:
 def streamed(
     views: list[View], cache: Path, looks: list[Look], first: int = 1, fill: bool = False
 ) -> list[TrainingPhoto]:
-    with PhotoStream(views, looks, 0, first, cache) as photos:
+    with PhotoStream.over(views, looks, 0, first, cache) as photos:
         if fill:
             photos.fill(tiny_scene.Recorder())
         return list(photos)
@@ -78,7 +78,7 @@ def test_what_fits_is_whole_and_what_can_not_be_divided_so_far_is_divided_as_far
 def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own() -> None:
     cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
     rounds, windows = 6, len(windows_of(720, 540, 70_000))
-    visits = Visits(cameras, [Look(1)] * 9 + [Look(0, 70_000)] * (9 * windows * rounds), 0)
+    visits = PhotoVisits(cameras, [Look(1)] * 9 + [Look(0, 70_000)] * (9 * windows * rounds), 0)
     seen: dict[int, list[Frame]] = {view: [] for view in range(9)}
     for iteration in range(10, len(visits) + 1):
         visit = visits.at(iteration)
@@ -89,7 +89,7 @@ def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own()
             assert sorted(map(str, frames[begin : begin + windows])) == sorted(map(str, windows_of(720, 540, 70_000)))
             orders.add(tuple(map(str, frames[begin : begin + windows])))
     assert len(orders) > 0.9 * 9 * rounds
-    other = Visits(cameras, [Look(0, 70_000)] * 90, 1)
+    other = PhotoVisits(cameras, [Look(0, 70_000)] * 90, 1)
     assert [visits.at(number + 9).window for number in range(1, 91)] != [other.at(n).window for n in range(1, 91)]
 
 
@@ -130,7 +130,7 @@ def test_one_decode_fills_all_levels_and_is_told(views: list[View], tmp_path: Pa
     asked = [Look(2)] * 9 + [Look(1, 400)] * 18 + [Look(0, PIXELS)] * 18
     usual = streamed(views, tmp_path, asked)
     recorder = tiny_scene.Recorder()
-    with PhotoStream(views, asked, 0, 1, tmp_path) as photos:
+    with PhotoStream.over(views, asked, 0, 1, tmp_path) as photos:
         photos.fill(recorder)
         assert recorder.steps == [(done, 9) for done in range(1, 10)]
         for view in views:

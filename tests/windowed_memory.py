@@ -27,7 +27,7 @@ def main(picture: str, cache: str, window_pixels: str, more_bytes: str) -> None:
     camera = Camera("photo", width, height, width, width, width / 2, height / 2, np.eye(4))
     views = [View(replace(camera, name=str(number)), Path(picture), None) for number in range(3)]
     warm_up = [Look(3)] * FIRST
-    with PhotoStream(views, warm_up + [Look(0, int(window_pixels))] * MORE, 0, 1, Path(cache)) as photos:
+    with PhotoStream.over(views, warm_up + [Look(0, int(window_pixels))] * MORE, 0, 1, Path(cache)) as photos:
         for _ in views:  # by then each is decoded and stored
             next(photos)
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

@@ -87,6 +87,14 @@ class Gaussians:
         """The Gaussians of an index or a mask, in its order, copied."""
         return self._map(lambda tensor: tensor[index])
 
+    def first(self, count: int) -> Gaussians:
+        """The first so many, not copied."""
+        return self._map(lambda tensor: tensor[:count])
+
+    def after(self, count: int) -> Gaussians:
+        """Those after the first so many, not copied."""
+        return self._map(lambda tensor: tensor[count:])
+
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
         """One after another; all of one SH degree.

@@ -55,7 +55,7 @@ def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
     magnitudes = now.is_observed and state.density.magnitudes
     settings = techniques.settings(render_options(plan, now, magnitudes), state.gaussians, photo.camera, now)
     probe = state.screen_probe() if now.is_observed else None
-    model = techniques.before_render(state.gaussians, now)
+    model = techniques.before_render(state.drawn, now)
     rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     # Show.
     shot = Shot(photo, rendered, settings, now)
@@ -69,9 +69,10 @@ def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
     loss.backward()  # type: ignore[no-untyped-call]
     # Step.
     with torch.no_grad():
-        state.step(rendered.visible, now, plan)
+        own = state.of_trained(rendered)
+        state.step(own.visible, now, plan)
         if probe is not None and probe.grad is not None:
-            state.density.observe(rendered, probe.grad, plan.schedule.density, photo)
+            state.density.observe(own, probe.grad[: len(state.gaussians)], plan.schedule.density, photo)
         techniques.after_step(shot)
     state.history.add_loss(photometric.detach())
 

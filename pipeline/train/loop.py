@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,9 +12,10 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.plan_area import read_model_area
-from splatpipe.pipeline.photos.dataset import load_split, load_views
+from splatpipe.pipeline.photos.dataset import View, load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
 from splatpipe.pipeline.train.brightness import decided_exposure
@@ -24,6 +25,7 @@ from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
 from splatpipe.pipeline.train.iteration import curve_facts, iterate
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
 from splatpipe.pipeline.train.planning import Scene, under_budgets
@@ -33,12 +35,40 @@ from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
+from splatpipe.pipeline.train.visits import PhotoVisits, Visits
 
 CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
 REPORT_EVERY = 10  # iterations
 CUDA_REPORT_EVERY = 50  # the same where telling the loss waits for the device
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a training goes through.
+
+    Attributes:
+        plan: What it does.
+        device: What it is computed on.
+        views: To train on.
+        visits: What of them the iterations up to the last one look at.
+        techniques: Makes the plan's, nothing of them trained.
+        start: Makes the Gaussians that it begins with.
+        frozen: Gaussians that are drawn besides and stay as they are; None for none.
+    """
+
+    plan: Plan
+    device: Device
+    views: Sequence[View]
+    visits: Callable[[int], Visits]
+    techniques: Callable[[], Techniques]
+    start: Callable[[], Gaussians]
+    frozen: Gaussians | None = None
+
+
+Fit = Callable[[Plan, Scene, Step, Reporter], Plan]
+"""Fits a plan to its scene, before the first iteration."""
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -48,6 +78,25 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         SplatpipeError: if nothing is left to train on.
         MachineError: if the device asked for is not there.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
+    """
+    _, summary = train_whole(config, inputs, out, report, under_budgets)
+    return summary
+
+
+def train_whole(
+    config: TrainConfig, inputs: Inputs, out: Path, report: Reporter, fit: Fit
+) -> tuple[TrainState, Summary]:
+    """Train the whole scene as ``run`` does, by another plan.
+
+    Args:
+        config: The options.
+        inputs: Those of the stage.
+        out: Takes the files.
+        report: Takes what people want to know.
+        fit: Makes the plan from one without budgets.
+
+    Raises:
+        SplatpipeError, MachineError, KeyboardInterrupt: as ``run``.
     """
     device = choose_device(inputs.machine.device, config.unfit_for_cuda(), report.note)
     dataset = inputs["undistort.dataset"]
@@ -65,7 +114,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
 
     def make() -> Plan:
         decided = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
-        return under_budgets(free.of(decided), replace(scene, config=decided, sky=sky), step, report)
+        return fit(free.of(decided), replace(scene, config=decided, sky=sky), step, report)
 
     limit = device.memory_limit(config.max_memory_bytes)
     with same_bits(inputs.machine.threads), device.one_order(), limit:
@@ -75,31 +124,55 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         if budgeted(plan) or plan.options.iterations == "auto":
             report.note(plan.described())
 
-        def techniques() -> Techniques:
-            return make_techniques(plan, sky, trained_on, dataset, device.tensors, area)
+        def visits(last: int) -> Visits:
+            cameras = [view.camera for view in trained_on]
+            return PhotoVisits(cameras, plan.schedule.looks_to(last), plan.options.seed, plan.megapixels)
 
-        state = resume(out / CHECKPOINT, plan, techniques, device, report)
-        first, flat_at, seconds = 1, 0, 0.0
-        if state is not None:
-            first, flat_at, seconds = state.iteration + 1, state.history.flat_at, state.seconds
-        clock, looks = Clock(seconds), plan.schedule.looks_to(ends_at(plan, flat_at))
-        stream = PhotoStream(trained_on, looks, plan.options.seed, first, out, plan.megapixels)
-        with stream.to(device.tensors) as photos:
-            photos.tell(report)
-            photos.fill(report)  # before there is a model, if it is not there already: both want memory
-            if state is None:
-                begun = start.within(plan.options.max_gaussians)
-                state = TrainState.begin(begun.to(device.tensors), plan, techniques())
-            optimise(Training(state, plan, device, out / CHECKPOINT, clock), photos, report)
-        if (flat_at := state.history.flat_at) > 0:
-            report.note(
-                f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.schedule.iterations:,}"
-            )
+        course = Course(
+            plan,
+            device,
+            trained_on,
+            visits,
+            techniques=lambda: make_techniques(plan, sky, trained_on, dataset, device.tensors, area),
+            start=lambda: start.within(plan.options.max_gaussians),
+        )
+        state = go_through(course, out, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     (out / "history.json").write_text(state.whole_history().to_json(), encoding="utf-8")
     write_side_models(out, state.techniques)
-    return {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
+    return state, {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
+
+
+def go_through(course: Course, out: Path, report: Reporter) -> TrainState:
+    """Train from the start, or from the checkpoint that a killed run left, to the end.
+
+    Args:
+        course: Of the training.
+        out: Has the checkpoint, and the decoded photos meanwhile.
+        report: Takes what people want to know.
+
+    Raises:
+        MachineError, KeyboardInterrupt: as ``run``.
+    """
+    plan, device = course.plan, course.device
+    state = resume(out / CHECKPOINT, course, report)
+    first, flat_at, seconds = 1, 0, 0.0
+    if state is not None:
+        first, flat_at, seconds = state.iteration + 1, state.history.flat_at, state.seconds
+    clock, visits = Clock(seconds), course.visits(ends_at(plan, flat_at))
+    with PhotoStream(course.views, visits, first, out).to(device.tensors) as photos:
+        photos.tell(report)
+        photos.fill(report)  # before there is a model, if it is not there already: both want memory
+        if state is None:
+            begun = course.start().to(device.tensors)
+            state = TrainState.begin(begun, plan, course.techniques(), course.frozen)
+        optimise(Training(state, plan, device, out / CHECKPOINT, clock), photos, report)
+    if (flat_at := state.history.flat_at) > 0:
+        report.note(
+            f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.schedule.iterations:,}"
+        )
+    return state
 
 
 def write_side_models(out: Path, techniques: Techniques) -> None:
@@ -198,21 +271,18 @@ class Training:
         return self.state.iteration % every == 0 or self.state.iteration == self.last
 
 
-def resume(
-    path: Path, plan: Plan, make: Callable[[], Techniques], device: Device, report: Reporter
-) -> TrainState | None:
+def resume(path: Path, course: Course, report: Reporter) -> TrainState | None:
     """The state that a killed run left, or None; a broken one is told and ignored.
 
     Args:
         path: The checkpoint.
-        plan: The training's.
-        make: Its techniques, untrained.
-        device: What it goes on on, whatever it was begun on.
+        course: The training's; it goes on on its device, whatever it was begun on.
         report: Takes warnings.
     """
+    device = course.device
     try:
-        checkpoint = load_checkpoint(path, plan.digest())
-        state = TrainState.restore(checkpoint, plan, make(), device.tensors)
+        checkpoint = load_checkpoint(path, course.plan.digest())
+        state = TrainState.restore(checkpoint, course.plan, course.techniques(), device.tensors, course.frozen)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.device import CPU, take_rows
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers
+from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint, HostArrays
@@ -52,6 +52,8 @@ class TrainState:
         seconds: Spent so far, over all runs; of no influence.
         buffers: Memory of the gradients.
         techniques: What takes part besides the Gaussians.
+        whole: What is drawn where frozen Gaussians are: leaves of autograd, whose first rows are those of
+            ``gaussians``, in the same memory; None where there are none.
     """
 
     gaussians: Gaussians
@@ -62,15 +64,17 @@ class TrainState:
     seconds: float = 0.0
     buffers: GradientBuffers = field(default_factory=GradientBuffers)
     techniques: Techniques = field(default_factory=Techniques)
+    whole: Gaussians | None = None
 
     @staticmethod
-    def begin(start: Gaussians, plan: Plan, techniques: Techniques) -> TrainState:
+    def begin(start: Gaussians, plan: Plan, techniques: Techniques, frozen: Gaussians | None = None) -> TrainState:
         """The state before the first iteration.
 
         Args:
             start: The Gaussians to start with, as ``Start.within`` the plan's cap, where they are trained.
             plan: The training's.
             techniques: The plan's, nothing of them trained.
+            frozen: Gaussians of the plan's degree that are drawn besides and stay as they are; None for none.
         """
         columns = coefficient_count(plan.options.sh_degree)
         sh = torch.zeros(len(start), columns, 3, device=start.sh.device)
@@ -78,18 +82,42 @@ class TrainState:
         sh[:, :shared] = start.sh[:, :shared]
         model = start.clone()
         model.sh = sh
-        gaussians = model.requires_grad_()
-        return TrainState.of(gaussians, plan, History(), techniques)
+        return TrainState.of(model, plan, History(), techniques, frozen)
 
     @staticmethod
-    def of(gaussians: Gaussians, plan: Plan, history: History, techniques: Techniques) -> TrainState:
+    def of(
+        gaussians: Gaussians, plan: Plan, history: History, techniques: Techniques, frozen: Gaussians | None = None
+    ) -> TrainState:
         """Gaussians with everything that the plan wants beside them, nothing of it trained."""
         density = Density(len(gaussians), plan.options.density == "absolute", gaussians.means.device)
-        return TrainState(gaussians, Adam(gaussians.tensors()), density, history, techniques=techniques)
+        state = TrainState(gaussians, Adam(gaussians.tensors()), density, history, techniques=techniques)
+        state._draw(gaussians, frozen)
+        return state
+
+    def _draw(self, trained: Gaussians, frozen: Gaussians | None) -> None:
+        """Take these for what is trained and drawn."""
+        if frozen is None or len(frozen) == 0:
+            self.gaussians, self.whole = trained.requires_grad_(), None
+            return
+        self.whole = Gaussians.concat([trained.detach(), frozen.detach()]).requires_grad_()
+        self.gaussians = self.whole.detach().first(len(trained))
+
+    @property
+    def drawn(self) -> Gaussians:
+        """What is rendered: the Gaussians that are trained, then the frozen ones."""
+        return self.gaussians if self.whole is None else self.whole
+
+    def of_trained(self, rendered: Render) -> Render:
+        """A render of ``drawn`` with what it says of the Gaussians that are trained alone."""
+        if self.whole is None:
+            return rendered
+        count = len(self.gaussians)
+        return replace(rendered, visible=rendered.visible[:count], radii=rendered.radii[:count])
 
     def screen_probe(self) -> Float[Tensor, "n 2"]:
-        """Zeros whose gradient is that of the Gaussians' places on the screen, once the parameters are stepped."""
-        return torch.zeros(len(self.gaussians), 2, device=self.gaussians.means.device, requires_grad=True)
+        """Zeros whose gradient is that of what is drawn by its places on the screen, once the parameters are stepped:
+        those of the Gaussians that are trained come first."""
+        return torch.zeros(len(self.drawn), 2, device=self.gaussians.means.device, requires_grad=True)
 
     def step(self, gradient_rows: Bool[Tensor, " n"], now: Moment, plan: Plan) -> None:
         """Step the parameters against their gradients, which are dropped; those that ``buffers`` hold, too.
@@ -109,16 +137,31 @@ class TrainState:
             "sh": sh_rates(self.gaussians.sh.shape[1], colour, colour / given.sh_rest_divisor),
         }
         limits = {"log_scales": (math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))}
+        self._hand_gradients()
         tensors = self.gaussians.tensors()
         self.adam.step(tensors, rates, gradient_rows if given.sparse else None, buffers=self.buffers, limits=limits)
-        for tensor in tensors.values():
+        self._drop_gradients()
+
+    def _hand_gradients(self) -> None:
+        """Give the Gaussians that are trained their part of the gradients of all that was drawn."""
+        if self.whole is None:
+            return
+        unfinished = self.buffers.take_unfinished()
+        if unfinished is not None:
+            unfinished.finish(self.whole.tensors())
+        drawn = self.whole.tensors()
+        for name, tensor in self.gaussians.tensors().items():
+            gradient = drawn[name].grad
+            tensor.grad = None if gradient is None else gradient[: len(tensor)]
+
+    def _drop_gradients(self) -> None:
+        for tensor in (*self.gaussians.tensors().values(), *self.drawn.tensors().values()):
             tensor.grad = None
 
     def begin_again(self) -> None:
         """Forget an iteration that did not come to its step, and what its backward pass has left, whole or not."""
         self.buffers = GradientBuffers()
-        for tensor in self.gaussians.tensors().values():
-            tensor.grad = None
+        self._drop_gradients()
         self.techniques.begin_again()
 
     def control_density(self, plan: Plan, iteration: int) -> None:
@@ -191,11 +234,12 @@ class TrainState:
     def _become(self, growth: Growth) -> None:
         """Take the rows of a growth, with their moments; one tensor after the other, for memory is tight."""
         self.buffers = GradientBuffers()
+        frozen = None if self.whole is None else self.whole.detach().after(len(self.gaussians)).clone()
         rest = {name: getattr(self.gaussians, name).detach() for name in ("quats", "sh")}
-        self.gaussians = Gaussians.empty(0, 0)  # only `rest` holds the old ones now
+        self.gaussians, self.whole = Gaussians.empty(0, 0), None  # only `rest` holds the old ones now
         take_rows(rest, growth.source)
         grown = Gaussians(growth.means, growth.log_scales, rest["quats"], growth.opacity_logits, rest["sh"])
-        self.gaussians = grown.requires_grad_()
+        self._draw(grown, frozen)
         self.adam.select(growth.source)
         self.adam.zero_state(rows=growth.fresh)
         self.density.restart(len(grown))
@@ -227,7 +271,13 @@ class TrainState:
         return Checkpoint(HostArrays(tensors), facts)
 
     @staticmethod
-    def restore(checkpoint: Checkpoint, plan: Plan, techniques: Techniques, device: torch.device = CPU) -> TrainState:
+    def restore(
+        checkpoint: Checkpoint,
+        plan: Plan,
+        techniques: Techniques,
+        device: torch.device = CPU,
+        frozen: Gaussians | None = None,
+    ) -> TrainState:
         """The inverse of ``checkpoint``.
 
         Args:
@@ -235,6 +285,7 @@ class TrainState:
             plan: The training's.
             techniques: The plan's, which take what the checkpoint has of them; not to be used where that fails.
             device: Where it goes on, whatever it was written on.
+            frozen: As it was begun with, on the device.
 
         Raises:
             BrokenCheckpointError: if something is missing or does not fit.
@@ -243,10 +294,10 @@ class TrainState:
         try:
             tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
             model = Gaussians.from_tensors({name: tensors[name] for name in PARAMETERS})
-            gaussians = model.to(device).requires_grad_()
+            gaussians = model.to(device)
             if gaussians.sh.shape[1] != coefficient_count(plan.options.sh_degree):
                 raise ValueError("another degree of spherical harmonics")
-            state = TrainState.of(gaussians, plan, History(**checkpoint.facts["history"]), techniques)
+            state = TrainState.of(gaussians, plan, History(**checkpoint.facts["history"]), techniques, frozen)
             state.adam.load_state_dict(_under(_ADAM, tensors))
             state.iteration, state.seconds = int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"])
             state.density.load(_under(_DENSITY, tensors))

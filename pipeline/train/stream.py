@@ -20,7 +20,7 @@ from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_view, reduced
 from splatpipe.pipeline.train.looks import Frame, Look
 from splatpipe.pipeline.train.photo_cache import PhotoCache, stored_bytes
 from splatpipe.pipeline.train.upload import Upload, Uploader
-from splatpipe.pipeline.train.visits import Visit, Visits
+from splatpipe.pipeline.train.visits import PhotoVisits, Visit, Visits
 
 EVERYWHERE = (slice(None), slice(None))  # rows and columns
 READ_AHEAD = 3  # photos in flight: hides a slow decode behind an iteration
@@ -70,9 +70,6 @@ class _Sent:
 class PhotoStream:
     """Iterates over the photos of training, from one iteration to the last.
 
-    The photo of an iteration, and its window where it does not fit in one, depend on the views, the looks, the seed and
-    the iteration alone. Windows go by rounds: each once, in an order of the round's own.
-
     Photos are decoded once, for all the levels that are wanted of them, into a file without a name that is gone with
     the stream or its process; memory holds the windows in flight and no more. A photo that is wanted only once is not
     stored. Where the disk has no room for all, those that fit are stored and the others decoded each time: slower, with
@@ -80,11 +77,9 @@ class PhotoStream:
 
     Args:
         views: The photos to train on.
-        looks: What each iteration looks at of its photo, ``looks[i]`` for iteration ``i`` + 1.
-        seed: Of the order; each epoch has its own.
+        visits: What each iteration looks at of them.
         first: The first iteration, from 1.
         cache: Folder on whose disk the decoded photos lie meanwhile.
-        max_megapixels: The photos are first reduced to this size; None: they are as the dataset has them.
 
     Raises:
         MachineError: if the folder cannot be written; from ``next``, if the disk is full all the same.
@@ -94,21 +89,31 @@ class PhotoStream:
     def __init__(
         self,
         views: Sequence[View],
+        visits: Visits,
+        first: int,
+        cache: Path,
+    ) -> None:
+        self._views = views
+        self._next = first
+        self._uploader = Uploader(torch.device("cpu"))
+        self._pending: deque[Future[_Sent]] = deque()
+        self._visits = visits
+        self._unread = visits.levels_wanted(first)
+        self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
+        self._cache = PhotoCache(cache)
+
+    @staticmethod
+    def over(
+        views: Sequence[View],
         looks: Sequence[Look],
         seed: int,
         first: int,
         cache: Path,
         max_megapixels: float | None = None,
-    ) -> None:
-        self._views = views
-        self._next = first
-        self._max_megapixels = max_megapixels
-        self._uploader = Uploader(torch.device("cpu"))
-        self._pending: deque[Future[_Sent]] = deque()
-        self._visits = Visits([view.camera for view in views], looks, seed, max_megapixels)
-        self._unread = self._visits.levels_wanted(first)
-        self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
-        self._cache = PhotoCache(cache)
+    ) -> PhotoStream:
+        """All that the photos show; arguments as of the stream and of ``PhotoVisits``."""
+        visits = PhotoVisits([view.camera for view in views], looks, seed, max_megapixels)
+        return PhotoStream(views, visits, first, cache)
 
     def to(self, device: torch.device) -> PhotoStream:
         """Itself, with photos on a device; before the first of them."""
@@ -171,7 +176,7 @@ class PhotoStream:
         fitting = [level for level in levels if self._cache.has_room(self._visits.camera(index, level), has_mask)]
         if not fitting:
             return
-        for level, decoded in zip(fitting, reduced_views(view, self._max_megapixels, fitting), strict=True):
+        for level, decoded in zip(fitting, reduced_views(view, self._visits.max_megapixels, fitting), strict=True):
             self._cache.put((index, level), *decoded)
 
     def _photo(self, iteration: int) -> _Sent:
@@ -196,7 +201,7 @@ class PhotoStream:
         key = (visit.view, visit.level)
         if key in self._cache:
             return *self._cache.get(key, cut), self._cache.counted(key)
-        _, pixels, mask = reduced_view(self._views[visit.view], self._max_megapixels, visit.level)
+        _, pixels, mask = reduced_view(self._views[visit.view], self._visits.max_megapixels, visit.level)
         part = (slice(cut.top, cut.bottom), slice(cut.left, cut.right))
         if mask is None:
             return pixels[part], None, pixels.shape[0] * pixels.shape[1]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -33,8 +34,31 @@ class Visit:
     window: Frame
 
 
-class Visits:
-    """The visits of a training: they depend on the cameras, the looks, the seed and the iteration alone.
+@runtime_checkable
+class Visits(Protocol):
+    """The visits of a training.
+
+    Attributes:
+        max_megapixels: The photos are first reduced to this size; None: they are as the dataset has them.
+    """
+
+    max_megapixels: float | None
+
+    def __len__(self) -> int:
+        """How many iterations there are."""
+
+    def at(self, iteration: int) -> Visit:
+        """The visit of an iteration, from 1."""
+
+    def camera(self, view: int, level: int) -> Camera:
+        """A photo's camera at a level."""
+
+    def levels_wanted(self, first: int) -> dict[int, list[int]]:
+        """The levels of each photo that is looked at more than once from an iteration on, finest first."""
+
+
+class PhotoVisits(Visits):
+    """Visits of all that photos show: they depend on the cameras, the looks, the seed and the iteration alone.
 
     Photos go by epochs, each once; the windows of a photo at a level go by rounds, each once; every epoch and every
     round has an order of its own.
@@ -49,7 +73,7 @@ class Visits:
     def __init__(
         self, cameras: Sequence[Camera], looks: Sequence[Look], seed: int, max_megapixels: float | None = None
     ) -> None:
-        self._cameras, self._looks, self._seed, self._max_megapixels = cameras, looks, seed, max_megapixels
+        self._cameras, self._looks, self._seed, self.max_megapixels = cameras, looks, seed, max_megapixels
         photos = len(cameras)
         epochs = [permutation(seed, epoch, photos) for epoch in range(-(-len(looks) // max(1, photos)))]
         self._views = np.concatenate(epochs)[: len(looks)] if epochs else np.zeros(0, np.int64)
@@ -82,13 +106,67 @@ class Visits:
 
     def camera(self, view: int, level: int) -> Camera:
         """A photo's camera at a level."""
-        return reduced_camera(self._cameras[view], self._max_megapixels, level)
+        return reduced_camera(self._cameras[view], self.max_megapixels, level)
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo that is looked at more than once from an iteration on, finest first."""
-        times: Counter[int] = Counter()
-        levels: defaultdict[int, set[int]] = defaultdict(set)
-        for view, look in zip(self._views[first - 1 :].tolist(), self._looks[first - 1 :], strict=True):
-            times[view] += 1
-            levels[view].add(look.level)
-        return {view: sorted(levels[view]) for view in sorted(times) if times[view] > 1}
+        return _wanted_again(self._views[first - 1 :].tolist(), self._looks[first - 1 :])
+
+
+class PartVisits(Visits):
+    """Visits of some windows of photos: they depend on these, the looks, the seed and the iteration alone.
+
+    The windows of a level go by rounds, each once, whatever photo they are of; every round has an order of its own.
+
+    Args:
+        cameras: Of the photos.
+        looks: Of each iteration, ``looks[i]`` for iteration ``i`` + 1.
+        seed: Of the orders.
+        max_megapixels: As for ``PhotoVisits``.
+        parts: By the level, each a photo's number and a window of it at that level; at least one where a look wants it.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        looks: Sequence[Look],
+        seed: int,
+        max_megapixels: float | None,
+        parts: Mapping[int, Sequence[tuple[int, Frame]]],
+    ) -> None:
+        self._cameras, self._looks, self.max_megapixels, self._parts = cameras, looks, max_megapixels, parts
+        levels = np.array([look.level for look in looks], np.int64)
+        self._rows = np.zeros(len(looks), np.int64)  # of the level's parts
+        for level in np.unique(levels).tolist():
+            wanted, count = np.flatnonzero(levels == level), len(parts[level])
+            rounds = [permutation(seed, turn, count) for turn in range(-(-len(wanted) // count))]
+            self._rows[wanted] = np.concatenate(rounds)[: len(wanted)]
+
+    def __len__(self) -> int:
+        """How many iterations there are."""
+        return len(self._looks)
+
+    def at(self, iteration: int) -> Visit:
+        """The visit of an iteration, from 1."""
+        level = self._looks[iteration - 1].level
+        view, window = self._parts[level][int(self._rows[iteration - 1])]
+        return Visit(view, level, self.camera(view, level), window)
+
+    def camera(self, view: int, level: int) -> Camera:
+        """A photo's camera at a level."""
+        return reduced_camera(self._cameras[view], self.max_megapixels, level)
+
+    def levels_wanted(self, first: int) -> dict[int, list[int]]:
+        """The levels of each photo that is looked at more than once from an iteration on, finest first."""
+        looks, rows = self._looks[first - 1 :], self._rows[first - 1 :].tolist()
+        return _wanted_again([self._parts[look.level][row][0] for look, row in zip(looks, rows, strict=True)], looks)
+
+
+def _wanted_again(views: Sequence[int], looks: Sequence[Look]) -> dict[int, list[int]]:
+    """Of some iterations' photos those that are looked at more than once, with their levels."""
+    times: Counter[int] = Counter()
+    levels: defaultdict[int, set[int]] = defaultdict(set)
+    for view, look in zip(views, looks, strict=True):
+        times[view] += 1
+        levels[view].add(look.level)
+    return {view: sorted(levels[view]) for view in sorted(times) if times[view] > 1}
