@@ -1,8 +1,7 @@
-"""The sky by the CUDA backend's kernels, through the harness and on a device, beside torch on the CPU."""
+"""The sky by the CUDA backend's kernels, through the harness and on a device, beside the CPU's."""
 
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +78,7 @@ def composed(camera: Camera, mask: Tensor | None, device: torch.device = CPU) ->
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [False, True])
-def test_sky_and_its_gradients_are_those_of_torch(device: torch.device, size: tuple[int, int], masked: bool) -> None:
+def test_sky_and_its_gradients_are_those_of_the_cpu(device: torch.device, size: tuple[int, int], masked: bool) -> None:
     camera = skies.look(heading_deg=160.0, pitch_deg=15.0).scaled(*size)
     mask = None
     if masked:
@@ -107,7 +106,7 @@ def test_gradients_of_the_nodes_have_the_same_bits_in_every_order_of_threads(ker
     assert all(torch.equal(one, other) for one, other in zip(found[0], found[2], strict=True))
 
 
-def test_sky_is_trained_by_the_kernels_as_without_them(kernels: CudaKernels) -> None:
+def test_sky_is_trained_as_on_the_cpu(kernels: CudaKernels) -> None:
     camera = skies.look(pitch_deg=30.0).scaled(40, 30)
     mask = np.zeros((30, 40), bool)
     mask[:15] = True
@@ -129,16 +128,16 @@ def test_sky_is_trained_by_the_kernels_as_without_them(kernels: CudaKernels) -> 
 
 def test_nodes_that_do_not_reach_the_last_pixel_are_refused(kernels: CudaKernels) -> None:
     colour, alpha = torch.zeros(20, 20, 3), torch.zeros(20, 20)
-    behind = Behind(8, BACKGROUND)
     for rows, step in ((3, 8), (20, 9)):
-        with pytest.raises(Exception, match="argument"):
-            laid_over_nodes(kernels, colour, alpha, torch.zeros(rows, 4, 3), replace(behind, step=step))
+        with use_kernels(kernels), pytest.raises(Exception, match="argument"):
+            laid_over_nodes(colour, alpha, torch.zeros(rows, 4, 3), Behind(BACKGROUND, step=step))
 
 
 def test_nothing_beyond_the_nodes_is_looked_at(kernels: CudaKernels) -> None:
     colour, alpha = torch.zeros(17, 9, 3), torch.zeros(17, 9)  # the last nodes lie at the last pixels
     guarded = torch.full((4, 2, 3), torch.nan)
     guarded[:3] = torch.rand(3, 2, 3, generator=torch.Generator().manual_seed(2))
-    picture = laid_over_nodes(kernels, colour, alpha, guarded[:3], Behind(8, (0.0, 0.0, 0.0)))
+    with use_kernels(kernels):
+        picture = laid_over_nodes(colour, alpha, guarded[:3], Behind((0.0, 0.0, 0.0)))
     torch.testing.assert_close(picture[::8, ::8], guarded[:3], rtol=0, atol=1e-6)
     assert bool(picture.isfinite().all())

@@ -114,3 +114,16 @@ def adam_step(
     `rates` holds the rate of every value of a row; `visible` is uint8 (n,); `options` are beta1, beta2, epsilon and the
     step, counted from 1.
     """
+
+def lay_over(sky: tuple[Any, ...], colour: Tensor, out: Tensor) -> None:
+    """A float32 (h, w, 3) render with something else behind it than its background, to `out`.
+
+    `sky`: alpha (h, w), nodes (rows, columns, 3); nodes elsewhere or None; uint8 (h, w) or None: zero where those are
+    seen; uint8 (h, w) or None: zero where `nodes` have no gradient; pixels from node to node; background.
+
+    Raises:
+        ValueError: if sizes do not fit or the nodes do not reach the last pixel.
+    """
+
+def lay_over_backward(sky: tuple[Any, ...], upstream: Tensor, by_alpha: Tensor, by_nodes: Tensor | None) -> None:
+    """Gradients by the opacity and the nodes, from the one by the result."""

@@ -10,8 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import CudaKernels
+from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.cuda_api import SplatSky
+from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.splat.panorama import STEP_PX, between_nodes, laid_over
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,68 +21,107 @@ class Behind:
     """What is to be behind a render, interpolated from nodes as ``splat.panorama.between_nodes`` does.
 
     Attributes:
-        step: Pixels from node to node.
         background: What the render has behind it.
         elsewhere: Seen instead of the nodes where ``around`` does not hold, of their shape; None: nowhere.
         around: As said; None without ``elsewhere``.
         mask: Where the nodes have a gradient; None: nowhere.
+        step: Pixels from node to node.
     """
 
-    step: int
     background: tuple[float, float, float]
     elsewhere: Float[Tensor, "rows columns 3"] | None = None
     around: Bool[Tensor, "h w"] | None = None
     mask: Bool[Tensor, "h w"] | None = None
+    step: int = STEP_PX
 
 
 def laid_over_nodes(
-    kernels: CudaKernels,
-    colour: Float[Tensor, "h w 3"],
-    alpha: Float[Tensor, "h w"],
-    nodes: Float[Tensor, "rows columns 3"],
-    behind: Behind,
+    colour: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], nodes: Float[Tensor, "rows columns 3"], behind: Behind
 ) -> Float[Tensor, "h w 3"]:
-    """A render over something else than its background; the render and the nodes get gradients.
+    """A render over something else than its background: ``laid_over_nodes_reference``, by kernels for float32.
+
+    Those of the CPU give the same bits for any number of threads, and on any device nothing is added in another order.
+    The render and the nodes get gradients.
 
     Args:
-        kernels: Of the tensors' device.
-        colour: Rendered over ``behind.background``, float32 as all are.
+        colour: Rendered over ``behind.background``.
         alpha: The render's.
         nodes: What is behind it.
         behind: How.
     """
+    kernels = kernels_of(colour.device)
+    fits = kernels is not None or colour.device.type == "cpu"
+    if not fits or any(tensor.dtype != torch.float32 for tensor in (colour, alpha, nodes)):
+        return laid_over_nodes_reference(colour, alpha, nodes, behind)
     result: Tensor = _LaidOver.apply(kernels, colour, alpha, nodes, behind)  # type: ignore[no-untyped-call]
     return result
 
 
+def laid_over_nodes_reference(
+    colour: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], nodes: Float[Tensor, "rows columns 3"], behind: Behind
+) -> Float[Tensor, "h w 3"]:
+    """The same by its definition, in any dtype and on any device."""
+    height, width = alpha.shape
+    moving = between_nodes(nodes, height, width, behind.step)
+    shown = moving.detach()
+    if behind.mask is not None:
+        shown = torch.where(behind.mask[:, :, None], moving, shown)
+    if behind.elsewhere is not None and behind.around is not None:
+        other = between_nodes(behind.elsewhere, height, width, behind.step)
+        shown = torch.where(behind.around[:, :, None], shown, other)
+    return laid_over(colour, alpha, behind.background, shown)
+
+
 class _LaidOver(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, kernels: CudaKernels, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: Behind) -> Tensor:
+    def forward(
+        ctx: Any, kernels: CudaKernels | None, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: Behind
+    ) -> Tensor:
         ctx.kernels, ctx.behind = kernels, behind
-        tensors = [tensor.detach().contiguous() for tensor in (colour, alpha, nodes)]
-        ctx.save_for_backward(*tensors)
-        sky, _kept = _sky(kernels, tensors, behind)
-        out = torch.empty_like(tensors[0])
+        colour, alpha, nodes = (tensor.detach().contiguous() for tensor in (colour, alpha, nodes))
+        ctx.save_for_backward(colour, alpha, nodes)
+        out = torch.empty_like(colour)
+        if kernels is None:
+            _native.lay_over(_sky(alpha, nodes, behind), colour, out)
+            return out
+        sky, _kept = _cuda_sky(kernels, colour, alpha, nodes, behind)
         kernels.call("splat_sky", ctypes.byref(sky), kernels.at(out))
         return out
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[None, Tensor, Tensor, Tensor | None, None]:
-        given = upstream[0].contiguous()
-        _, alpha, nodes = ctx.saved_tensors
-        sky, _kept = _sky(ctx.kernels, ctx.saved_tensors, ctx.behind)
+        kernels, behind, given = ctx.kernels, ctx.behind, upstream[0].contiguous()
+        colour, alpha, nodes = ctx.saved_tensors
         by_alpha = torch.empty_like(alpha)
-        by_nodes = torch.empty_like(nodes) if ctx.behind.mask is not None and ctx.needs_input_grad[3] else None
-        gradients = (ctx.kernels.at(by_alpha), ctx.kernels.at(by_nodes))
-        ctx.kernels.call("splat_sky_backward", ctypes.byref(sky), ctx.kernels.at(given), *gradients)
+        by_nodes = torch.empty_like(nodes) if behind.mask is not None and ctx.needs_input_grad[3] else None
+        if kernels is None:
+            _native.lay_over_backward(_sky(alpha, nodes, behind), given, by_alpha, by_nodes)
+        else:
+            sky, _kept = _cuda_sky(kernels, colour, alpha, nodes, behind)
+            gradients = (kernels.at(by_alpha), kernels.at(by_nodes))
+            kernels.call("splat_sky_backward", ctypes.byref(sky), kernels.at(given), *gradients)
         return None, given, by_alpha, by_nodes, None
 
 
-def _sky(kernels: CudaKernels, tensors: Any, behind: Behind) -> tuple[SplatSky, list[Tensor | None]]:
-    """The call's argument, and what has to live as long as it does."""
-    colour, alpha, nodes = tensors
+def _contiguous(behind: Behind) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Nodes elsewhere, what is around and the mask, as kernels read them."""
     elsewhere = None if behind.elsewhere is None else behind.elsewhere.detach().contiguous()
-    masks = [None if mask is None else mask.contiguous().view(torch.uint8) for mask in (behind.around, behind.mask)]
+    around, mask = (
+        None if mask is None else mask.contiguous().view(torch.uint8) for mask in (behind.around, behind.mask)
+    )
+    return elsewhere, around, mask
+
+
+def _sky(alpha: Tensor, nodes: Tensor, behind: Behind) -> tuple[Any, ...]:
+    """The argument of the CPU's kernels."""
+    return alpha, nodes, *_contiguous(behind), behind.step, behind.background
+
+
+def _cuda_sky(
+    kernels: CudaKernels, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: Behind
+) -> tuple[SplatSky, tuple[Tensor | None, ...]]:
+    """The argument of a device's kernels, and what has to live as long as it does."""
+    elsewhere, around, mask = kept = _contiguous(behind)
     sky = SplatSky(
         width=colour.shape[1],
         height=colour.shape[0],
@@ -92,7 +133,7 @@ def _sky(kernels: CudaKernels, tensors: Any, behind: Behind) -> tuple[SplatSky, 
         alpha=kernels.at(alpha),
         nodes=kernels.at(nodes),
         elsewhere=kernels.at(elsewhere),
-        around=kernels.at(masks[0]),
-        mask=kernels.at(masks[1]),
+        around=kernels.at(around),
+        mask=kernels.at(mask),
     )
-    return sky, [elsewhere, *masks]
+    return sky, kept

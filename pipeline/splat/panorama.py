@@ -88,7 +88,7 @@ class Look:
         self, colours: Float[Tensor, "cells 3"], background: tuple[float, float, float]
     ) -> Float[Tensor, "h w 3"]:
         """What the camera sees of some cells' colours, and below the horizon of the background."""
-        return between_nodes(self.at_nodes(colours, background), self.camera)
+        return between_nodes(self.at_nodes(colours, background), self.camera.height, self.camera.width)
 
     def at_nodes(
         self, colours: Float[Tensor, "cells 3"], background: tuple[float, float, float]
@@ -97,6 +97,13 @@ class Look:
         below = rgb_beside(background, colours)
         seen = self.cells.mixed(colours).reshape(*self.share.shape[:2], 3)
         return self.share * seen + (1.0 - self.share) * below
+
+    def flat_at_nodes(
+        self, colour: tuple[float, float, float], background: tuple[float, float, float]
+    ) -> Float[Tensor, "rows columns 3"]:
+        """The same of cells of one colour."""
+        everywhere, below = (rgb_beside(rgb, self.share) for rgb in (colour, background))
+        return self.share * everywhere + (1.0 - self.share) * below
 
 
 @dataclass(frozen=True)
@@ -187,15 +194,23 @@ def laid_over(
     return colour + (1.0 - alpha)[:, :, None] * (behind - rgb_beside(background, behind))
 
 
-def between_nodes(values: Float[Tensor, "rows columns 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
-    """Interpolate bilinearly from the nodes to every pixel."""
+def between_nodes(
+    values: Float[Tensor, "rows columns 3"], height: int, width: int, step: int = STEP_PX
+) -> Float[Tensor, "h w 3"]:
+    """Interpolate bilinearly from nodes to every pixel.
+
+    Args:
+        values: Of the nodes: one at every ``step``-th pixel of every ``step``-th row, from the first on.
+        height: Of the picture.
+        width: Of the picture.
+        step: Pixels from node to node.
+    """
     down, right = (
-        _between(size, count, values)
-        for size, count in ((camera.height, values.shape[0]), (camera.width, values.shape[1]))
+        _between(size, count, step, values) for size, count in ((height, values.shape[0]), (width, values.shape[1]))
     )
     across = right @ values.transpose(0, 1).reshape(values.shape[1], -1)  # two plain products: a fifth of batched ones
-    lines = across.reshape(camera.width, -1, 3).transpose(0, 1).reshape(values.shape[0], -1)
-    return (down @ lines).reshape(camera.height, camera.width, 3)
+    lines = across.reshape(width, -1, 3).transpose(0, 1).reshape(values.shape[0], -1)
+    return (down @ lines).reshape(height, width, 3)
 
 
 def cover(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"]) -> Float32[np.ndarray, "*shape"]:
@@ -271,8 +286,8 @@ def nodes_along(size: int) -> int:
     return -((1 - size) // STEP_PX) + 1
 
 
-def _between(size: int, count: int, like: Tensor) -> Float[Tensor, "size count"]:
-    """Weights of the nodes for each pixel along one side: multiples of 1 / STEP_PX, exact in any type."""
-    place = torch.arange(size, dtype=like.dtype, device=like.device) / STEP_PX
+def _between(size: int, count: int, step: int, like: Tensor) -> Float[Tensor, "size count"]:
+    """Weights of the nodes for each pixel along one side."""
+    place = torch.arange(size, dtype=like.dtype, device=like.device) / step
     nodes = torch.arange(count, dtype=like.dtype, device=like.device)
     return (1.0 - (place[:, None] - nodes).abs()).clamp(min=0.0)

@@ -23,12 +23,10 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points
 from splatpipe.pipeline.photos.images import reduced_sky
 from splatpipe.pipeline.photos.small_views import small_view
-from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, STEP_PX, Panorama, between_nodes, cells_of, laid_over
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
-from splatpipe.pipeline.splat.upload import rgb_beside
 from splatpipe.pipeline.train.draws import ELSEWHERE
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.seen_sky import PhotoSkies, SeenSky
@@ -149,21 +147,11 @@ class SkyModel(SideModel, Technique):
             background: Stays behind everything below the horizon.
             elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
         """
-        look, colours = self.panorama.look(camera), self.panorama.colours
-        nodes, flat = look.at_nodes(colours, background), None
+        look = self.panorama.look(camera)
+        nodes, how = look.at_nodes(self.panorama.colours, background), Behind(background)
         if seen is not None:
-            flat = look.at_nodes(rgb_beside(elsewhere, colours).expand_as(colours), background)
-        kernels = kernels_of(colours.device)
-        if kernels is not None:
-            masks = (None, None) if seen is None else (seen.around, seen.mask)
-            how = Behind(STEP_PX, background, flat, *masks)
-            return laid_over_nodes(kernels, rendered.colour, rendered.alpha, nodes, how)
-        behind = between_nodes(nodes, camera)
-        if seen is None or flat is None:
-            return laid_over(rendered.colour, rendered.alpha, background, behind.detach())
-        behind = torch.where(seen.mask[:, :, None], behind, behind.detach())
-        behind = torch.where(seen.around[:, :, None], behind, between_nodes(flat, camera))
-        return laid_over(rendered.colour, rendered.alpha, background, behind)
+            how = Behind(background, look.flat_at_nodes(elsewhere, background), seen.around, seen.mask)
+        return laid_over_nodes(rendered.colour, rendered.alpha, nodes, how)
 
     def loss(
         self, alpha: Float[Tensor, "h w"], seen: SeenSky | None, inside: tuple[slice, slice] = EVERYWHERE

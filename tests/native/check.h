@@ -61,4 +61,5 @@ void test_raster();
 void test_gradients();
 void test_loss();
 void test_colour();
+void test_sky();
 void test_adam();

@@ -51,6 +51,7 @@ int main() {
     test_gradients();
     test_loss();
     test_colour();
+    test_sky();
     test_adam();
     std::printf("%d passed, %d failed\n", passed, failed);
     return failed ? 1 : 0;

@@ -14,6 +14,7 @@ using namespace nb::literals;
 
 void bind_raster(nb::module_& m);
 void bind_loss(nb::module_& m);
+void bind_sky(nb::module_& m);
 
 namespace {
 
@@ -41,4 +42,5 @@ NB_MODULE(_native, m) {
     splat::set_isa("auto");
     bind_raster(m);
     bind_loss(m);
+    bind_sky(m);
 }

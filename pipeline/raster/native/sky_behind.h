@@ -1,0 +1,18 @@
+// A whole render laid over the sky, and back: threads around the kernels. Not for kernel files.
+#pragma once
+
+#include "sky.h"
+
+namespace splat {
+
+// Whether a job's nodes reach the last pixel, and it has what else it needs.
+bool is_sound(const SkyJob& job);
+
+// To `out`, (height, width, 3).
+void lay_over(const SkyJob& job, float* out);
+
+// dL/d(alpha) and, unless null, dL/d(nodes) from dL/d(out); the same bits for any number of threads. dL/d(colour) is
+// dL/d(out).
+void lay_over_backward(const SkyJob& job, const float* upstream, float* alpha_gradient, float* node_gradient);
+
+}  // namespace splat
