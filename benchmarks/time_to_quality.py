@@ -36,7 +36,9 @@ from splatpipe.pipeline.render.rendering import render_pixels
 from splatpipe.pipeline.render.view_measures import measure
 from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.flatness import ends_at
+from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.iteration import iterate
+from splatpipe.pipeline.train.loop import looks_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.sky import SkyModel
@@ -44,6 +46,7 @@ from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
+from splatpipe.pipeline.train.visits import PhotoVisits
 from splatpipe.stages.options import LineConfig
 
 COLUMNS = {
@@ -104,15 +107,22 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     trained_on = [view for view in views if view.camera.name in kept]
     options = decided_exposure(config.train, trained_on, dataset, arguments.threads, SilentReporter())
     room = start.within(options.max_gaussians)
-    plan = make_plan(options, views, split, len(room))
-    looks = plan.schedule.looks_to(plan.schedule.iterations)
+    whole = plan = make_plan(options, views, split, len(room))
+
+    def visits(history: History) -> PhotoVisits:
+        return PhotoVisits([view.camera for view in trained_on], looks_of(whole, history), plan.options.seed)
+
     with same_bits(arguments.threads):
         clocks.start()
         sky = begin_sky(options, trained_on, dataset, arguments.threads, SilentReporter())
         state = TrainState.begin(room, plan, make_techniques(plan, sky, trained_on, dataset))
-        with PhotoStream.over(trained_on, looks, plan.options.seed, 1, dataset) as photos:
+        with PhotoStream(trained_on, visits(state.history), 1, dataset) as photos:
             for photo in photos:
                 iterate(state, plan, photo)
+                ended = state.history.sizes_ended
+                if state.iteration in ended[-1:]:
+                    plan = whole.after(ended)
+                    photos.go_on(visits(state.history), state.iteration + 1)
                 last = state.iteration == ends_at(plan, state.history.flat_at)
                 if clocks.cpu_now() < due and not last:
                     continue

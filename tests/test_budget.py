@@ -171,7 +171,7 @@ def test_a_size_whose_parts_would_be_seen_too_seldom_loses_to_the_one_before() -
         assert 0.9 * task.seconds <= choice.forecast_s <= SCHEDULE_SHARE * task.seconds
         level, count = lengths_of(choice.options, task.footage(size))[-1]
         assert level == 0 and count >= 0.99 * PART_VISITS * task.footage(size).parts(0)
-        assert choice.options.stop_when_flat == 0.0  # there was more to be had: the time is spent
+        assert not choice.is_most  # the time is spent, even where the loss is flat
 
 
 def test_no_cost_is_below_zero_whatever_was_measured() -> None:

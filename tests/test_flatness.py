@@ -24,6 +24,7 @@ import tiny_scene
 
 FEW = tiny_scene.plain(iterations=200, densify=False, exposure="affine", dropout=0.1)
 FLAT = FEW.model_copy(update={"stop_when_flat": 0.9})  # so much that any curve is flat
+SIZES = FLAT.model_copy(update={"coarse_levels": 1, "sh_degree": 1})  # half of the iterations are at half the size
 PARTS = ("model.ply", "history.json", "exposures.json", "plan.json")
 
 
@@ -69,6 +70,40 @@ def test_nothing_is_judged_before_density_control_all_degrees_and_full_size() ->
     unchanging = replace(schedule, sh_degree=1, density=replace(longer.density, on=False))
     assert flatness.settled_from(unchanging) == 200
     assert flatness.settled_from(replace(schedule, stretches=(Stretch(1, 0, 900), Stretch(0, 0, 1000)))) == 900
+
+
+def test_before_the_finest_size_losses_count_since_growth_begins_and_opacities_were_reset() -> None:
+    schedule = replace(make_plan(1000, 0.1).schedule, stretches=(Stretch(1, 0, 700), Stretch(0, 0, 1000)))
+    assert flatness.judged_from(schedule, 650, []) == schedule.density.first > 0
+    assert flatness.judged_from(schedule, 650, [300, 500]) == 500
+    three = replace(schedule, stretches=(Stretch(2, 0, 600), *schedule.stretches))
+    assert flatness.judged_from(three, 650, [300]) == 600
+    assert flatness.judged_from(three, 701, [300]) == flatness.settled_from(three)
+
+
+def test_a_size_is_flat_where_all_iterations_that_are_left_would_gain_too_little() -> None:
+    plan = make_plan(7000, 0.05)
+    sizes = (Stretch(1, 0, 6000), Stretch(0, 0, 7000))
+    plan = replace(plan, schedule=replace(plan.schedule, stretches=sizes))
+    assert flatness.is_flat(power_law(-0.1), plan, 5000) == (1.0 - (7000 / 4950) ** -0.1 < 0.05)
+    assert flatness.is_flat(power_law(-0.1, until=5950), plan, 5900)
+    assert not flatness.is_flat(power_law(0.0, until=6050), plan, 6000)  # it ends here anyway
+
+
+def test_what_a_size_spares_goes_to_the_finest_by_its_pixels() -> None:
+    plan = make_plan(10_000, 0.1, last=15_000)
+    sizes = (Stretch(2, 0, 4000), Stretch(1, 0, 6000), Stretch(0, 0, 10_000))
+    schedule = replace(plan.schedule, stretches=sizes, density=replace(plan.schedule.density, reset_until=4000))
+    plan = replace(plan, schedule=schedule, sizes=((400, 400, 2),))
+    assert plan.after([]) is plan
+    sooner = plan.after([2000])
+    assert sooner.schedule.stretches == (Stretch(2, 0, 2000), Stretch(1, 0, 4000), Stretch(0, 0, 8125))
+    assert sooner.schedule.iterations == 8125 and sooner.last_iteration == 13_125
+    assert sooner.schedule.density.last == 4000 + 4125 // 2 and sooner.schedule.density.reset_until == 2000
+    twice = plan.after([2000, 3000])
+    assert twice.schedule.stretches[1:] == (Stretch(1, 0, 3000), Stretch(0, 0, 7375))
+    assert twice.schedule.density.reset_until == 2000
+    assert twice.schedule.looks_to(3000) == sooner.schedule.looks_to(3000)
 
 
 def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None:
@@ -121,11 +156,30 @@ def test_a_training_that_gains_goes_on_to_its_end_with_the_same_bits(scene: Path
         assert (tmp_path / "on" / part).read_bytes() == (tmp_path / "off" / part).read_bytes()
 
 
-@pytest.mark.parametrize("before_end", [25, 3, 0])
+def test_a_size_whose_loss_is_flat_gives_way_to_larger_photos_at_once(scene: Path, tmp_path: Path) -> None:
+    summary, recorder = trained(scene, tmp_path, SIZES)
+    assert summary["sizes_ended"] == [6 * flatness.FEWEST_EPOCHS]
+    assert any("flat after 48 iterations: goes on with larger photos, to 161" in note for note in recorder.notes)
+    history = json.loads((tmp_path / "history.json").read_text())
+    assert {point["width"] for point in history["curve"]} == {tiny_scene.WIDTH}  # from iteration 50 on
+    assert history["sizes_ended"] == [48] and history["flat_at"] == summary["flat_at"] == 96
+    assert summary["iterations"] == 106 and recorder.steps[-1] == (106, 106)
+
+
+def test_a_training_that_may_not_end_early_ends_its_smaller_sizes_all_the_same(scene: Path, tmp_path: Path) -> None:
+    trained(scene, tmp_path / "any", SIZES)
+    (tmp_path / "planned").mkdir()
+    plan = replace(Plan.from_json((tmp_path / "any/plan.json").read_text()), ends_when_flat=False)
+    (tmp_path / "planned/plan.json").write_text(plan.to_json())
+    summary, _ = trained(scene, tmp_path / "planned", SIZES)
+    assert summary["sizes_ended"] == [48] and "flat_at" not in summary and summary["iterations"] == 161
+
+
+@pytest.mark.parametrize(("config", "before_end"), [(FLAT, 25), (FLAT, 3), (FLAT, 0), (SIZES, 58), (SIZES, 20)])
 def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
-    scene: Path, tmp_path: Path, before_end: int
+    scene: Path, tmp_path: Path, config: TrainConfig, before_end: int
 ) -> None:
-    whole, _ = trained(scene, tmp_path / "whole", FLAT)
+    whole, _ = trained(scene, tmp_path / "whole", config)
     step = loop.iterate
 
     def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
@@ -137,8 +191,8 @@ def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
         patch.setattr(loop, "iterate", dying)
-        trained(scene, tmp_path / "killed", FLAT)
-    resumed, _ = trained(scene, tmp_path / "killed", FLAT)
+        trained(scene, tmp_path / "killed", config)
+    resumed, _ = trained(scene, tmp_path / "killed", config)
     assert resumed["iterations"] == whole["iterations"] and resumed["flat_at"] == whole["flat_at"]
     for part in PARTS:
         assert (tmp_path / "killed" / part).read_bytes() == (tmp_path / "whole" / part).read_bytes()

@@ -22,6 +22,7 @@ from splatpipe.pipeline.photos.images import load_colour, load_mask, reduced_cam
 from splatpipe.pipeline.train import photo_cache
 from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
+from splatpipe.pipeline.train.visits import PhotoVisits
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -164,6 +165,22 @@ def test_photos_are_decoded_once_and_the_files_are_not_needed_again(dataset: Pat
     again = {(photo.camera.name, photo.camera.width): photo for photo in next_ones}
     assert len(first) == len(next_ones) == len(again)
     assert all(same(photo, again[photo.camera.name, photo.camera.width]) for photo in first)
+
+
+@pytest.mark.parametrize("begun", [1, 12])
+def test_a_stream_that_goes_on_with_other_looks_is_as_one_begun_with_them(
+    dataset: Path, cache: Path, begun: int
+) -> None:
+    views = load_views(dataset)
+    planned, later = [2] * 20 + [1] * 20, [2] * 12 + [1] * 5 + [0] * 13
+    expected = streamed(views, cache, later)
+    with PhotoStream.over(views, [Look(level) for level in planned], 0, begun, cache) as photos:
+        photos.fill(tiny_scene.Recorder())
+        seen = [next(photos) for _ in range(begun, 13)]
+        photos.go_on(PhotoVisits([view.camera for view in views], [Look(level) for level in later], 0), 13)
+        seen += photos
+    assert len(seen) == len(expected[begun - 1 :])
+    assert all(same(one, other) for one, other in zip(seen, expected[begun - 1 :], strict=True))
 
 
 def test_cache_has_no_name_and_the_thread_ends_with_the_stream(dataset: Path, cache: Path) -> None:

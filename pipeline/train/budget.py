@@ -176,12 +176,14 @@ class Choice:
         iterations: The same as a number.
         seconds: When the training ends, done or not.
         forecast_s: When the schedule should be done.
+        is_most: Neither larger photos nor more Gaussians were to be had.
     """
 
     options: TrainConfig
     iterations: int
     seconds: float
     forecast_s: float
+    is_most: bool
 
     @property
     def last_iteration(self) -> int:
@@ -194,7 +196,8 @@ def choose(task: Task) -> Choice:
 
     Photos grow to the dataset's size first, as long as ``wanted_iterations`` and room for the first growth fit: a size
     whose parts would be seen too seldom loses to the one before. Then the cap grows; what is over goes into iterations,
-    up to ``LONGEST``. Only where nothing more was to be had may a flat loss end the training before its time.
+    up to ``LONGEST``. Only where nothing more was to be had may a flat loss end the training before its time;
+    elsewhere it ends a size, and larger photos come earlier.
     """
     most = task.config.max_gaussians
     first = min(most, max(FEWEST_GAUSSIANS, int(FIRST_GROWTH * task.sparse)))
@@ -212,9 +215,8 @@ def choose(task: Task) -> Choice:
         cap = _largest(least, first, lambda gaussians: _fits(task, size, gaussians, FEWEST))
     iterations = _largest(FEWEST, max(LONGEST, iterations), lambda count: _fits(task, size, cap, count))
     options = planned_options(task, size, cap, iterations)
-    if size < task.megapixels or cap < most:
-        options = options.model_copy(update={"stop_when_flat": 0.0})
-    return Choice(options, iterations, task.left(cap), task.takes(options, size))
+    is_most = size >= task.megapixels and cap >= most
+    return Choice(options, iterations, task.left(cap), task.takes(options, size), is_most)
 
 
 def sizes(megapixels: float) -> list[float]:

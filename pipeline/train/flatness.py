@@ -1,5 +1,6 @@
-"""Early end: where the loss on the training photos is flat, the rest of the schedule is run down quickly.
+"""Early end: where the loss on the training photos is flat, larger photos come at once, or the schedule is run down.
 
+A size is flat where training on with it, for all iterations that are left, would take too little off its loss.
 Epochs are compared, in which every photo counts once, by a straight line through the logarithms of their mean losses
 over the logarithm of the iteration. Such a power law has no unit, and it foretells too much gain rather than too
 little, for a real curve bends towards its floor: on four captures it was 1.5 to 2 times what came. Learning rates that
@@ -14,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.schedule import Schedule, tail_of
 
@@ -30,6 +32,24 @@ def settled_from(schedule: Schedule) -> int:
     """
     density = schedule.density.last if schedule.density.on else 0
     return max(density, schedule.finest_from, schedule.sh_degree * schedule.sh_every)
+
+
+def judged_from(schedule: Schedule, iteration: int, resets: Sequence[int]) -> int:
+    """Iteration since which losses tell whether the size that is trained on at one has more to give.
+
+    Before the finest size growth has to have begun only: what it adds later, it adds to larger photos as well.
+
+    Args:
+        schedule: The training's.
+        iteration: Now.
+        resets: Iterations after which opacities were reset.
+    """
+    number = schedule.stretch_at(iteration)
+    if number == len(schedule.stretches) - 1:
+        return settled_from(schedule)
+    begun = schedule.stretches[number - 1].until if number else 0
+    grown = schedule.density.first if schedule.density.on else 0
+    return max(begun, grown, *resets[-1:])
 
 
 def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
@@ -54,19 +74,40 @@ def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
 
 
 def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> bool:
-    """Whether `stop_when_flat` ends the training after a tail that begins here.
+    """Whether `stop_when_flat` ends the size that is trained on here, or the training after a tail that begins here.
 
     Args:
-        epochs: Middle iteration and mean loss of all since ``settled_from``.
+        epochs: Middle iteration and mean loss of all since ``judged_from``.
         plan: The training's.
         iteration: Now, the last one of an epoch.
     """
     scheduled = plan.schedule.iterations
     recent = [epoch for epoch in epochs if epoch[0] > (1.0 - WINDOW_SHARE) * iteration]
     recent = list(epochs[-max(FEWEST_EPOCHS, len(recent)) :])
-    if len(recent) < FEWEST_EPOCHS or iteration + tail_of(iteration) >= scheduled:
+    number = plan.schedule.stretch_at(iteration)
+    is_finest = number == len(plan.schedule.stretches) - 1
+    end = iteration + tail_of(iteration) if is_finest else iteration
+    if len(recent) < FEWEST_EPOCHS or end >= plan.schedule.stretches[number].until:
         return False
     return expected_gain(recent, scheduled) < plan.options.stop_when_flat
+
+
+def end_epoch(history: History, plan: Plan, iteration: int) -> None:
+    """Close an epoch, and note where its loss ends a size or begins the training's tail.
+
+    Args:
+        history: Changed in place.
+        plan: The training's, as it is by now.
+        iteration: The last one of an epoch.
+    """
+    photos, since = len(plan.train_views), judged_from(plan.schedule, iteration, history.resets)
+    history.end_epoch(iteration - photos // 2, iteration - photos >= since)
+    if history.flat_at or not is_flat([each for each in history.epochs if each[0] > since], plan, iteration):
+        return
+    if plan.schedule.stretch_at(iteration) < len(plan.schedule.stretches) - 1:
+        history.sizes_ended.append(iteration)
+    elif plan.ends_when_flat:
+        history.flat_at = iteration
 
 
 def ends_at(plan: Plan, flat_at: int) -> int:

@@ -34,6 +34,7 @@ class History:
         epochs: With `stop_when_flat`, middle iteration and mean loss of those to judge by.
         epoch_sum: Of the losses in the epoch that runs.
         epoch_count: How many those are.
+        sizes_ended: Iterations after which larger photos came before their time because the loss was flat.
         flat_at: Iteration after which the schedule was run down because the loss was flat; 0 where it was not.
     """
 
@@ -47,6 +48,7 @@ class History:
     epochs: list[tuple[int, float]] = field(default_factory=list)
     epoch_sum: float = 0.0
     epoch_count: int = 0
+    sizes_ended: list[int] = field(default_factory=list)
     flat_at: int = 0
 
     def __post_init__(self) -> None:
@@ -122,12 +124,14 @@ class History:
             "epochs": self.epochs,
             "epoch_sum": self.epoch_sum,
             "epoch_count": self.epoch_count,
+            "sizes_ended": self.sizes_ended,
             "flat_at": self.flat_at,
         }
 
     def to_json(self) -> str:
         """The text of `history.json`."""
         kept = {name: value for name, value in self.state().items() if not name.startswith(("loss_", "epoch"))}
-        if not self.flat_at:
-            del kept["flat_at"]
+        for name in ("sizes_ended", "flat_at"):
+            if not kept[name]:
+                del kept[name]
         return json.dumps(kept, indent=1, allow_nan=False) + "\n"

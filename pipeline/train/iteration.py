@@ -12,7 +12,7 @@ import torch
 
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
-from splatpipe.pipeline.train.flatness import ends_at, is_flat, settled_from
+from splatpipe.pipeline.train.flatness import end_epoch, ends_at
 from splatpipe.pipeline.train.hooks import Shot
 from splatpipe.pipeline.train.memory import over_memory
 from splatpipe.pipeline.train.plan import Plan
@@ -28,7 +28,7 @@ def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
 
     Args:
         state: Changed in place; afterwards it is of the next iteration.
-        plan: The training's.
+        plan: The training's, as it is by now.
         photo: What to compare with.
     """
     now = plan.schedule.at(state.iteration + 1, state.history.flat_at)
@@ -98,9 +98,7 @@ def close(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
         history.growth_ended = now.iteration if on_cpu and over_memory(plan.options) else 0
     state.iteration = now.iteration
     if plan.options.stop_when_flat > 0.0 and now.iteration % photos == 0:
-        history.end_epoch(now.iteration - photos // 2, now.iteration - photos >= settled_from(plan.schedule))
-        if not history.flat_at and is_flat(history.epochs, plan, now.iteration):
-            history.flat_at = now.iteration
+        end_epoch(history, plan, now.iteration)
     is_last = now.iteration == ends_at(plan, history.flat_at)
     history.end_iteration(now.iteration, is_last, curve_facts(state, plan, photo))
 

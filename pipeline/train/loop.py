@@ -22,9 +22,11 @@ from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.exposure import Exposure, exposures_json
 from splatpipe.pipeline.train.flatness import ends_at
+from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
 from splatpipe.pipeline.train.iteration import curve_facts, iterate
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
@@ -52,7 +54,7 @@ class Course:
         plan: What it does.
         device: What it is computed on.
         views: To train on.
-        visits: What of them the iterations up to the last one look at.
+        visits: What iterations with such looks look at of them.
         techniques: Makes the plan's, nothing of them trained.
         start: Makes the Gaussians that it begins with.
         frozen: Gaussians that are drawn besides and stay as they are; None for none.
@@ -61,7 +63,7 @@ class Course:
     plan: Plan
     device: Device
     views: Sequence[View]
-    visits: Callable[[int], Visits]
+    visits: Callable[[Sequence[Look]], Visits]
     techniques: Callable[[], Techniques]
     start: Callable[[], Gaussians]
     frozen: Gaussians | None = None
@@ -124,9 +126,9 @@ def train_whole(
         if budgeted(plan) or plan.options.iterations == "auto":
             report.note(plan.described())
 
-        def visits(last: int) -> Visits:
+        def visits(looks: Sequence[Look]) -> Visits:
             cameras = [view.camera for view in trained_on]
-            return PhotoVisits(cameras, plan.schedule.looks_to(last), plan.options.seed, plan.megapixels)
+            return PhotoVisits(cameras, looks, plan.options.seed, plan.megapixels)
 
         course = Course(
             plan,
@@ -157,21 +159,20 @@ def go_through(course: Course, out: Path, report: Reporter) -> TrainState:
     """
     plan, device = course.plan, course.device
     state = resume(out / CHECKPOINT, course, report)
-    first, flat_at, seconds = 1, 0, 0.0
+    first, history, seconds = 1, History(), 0.0
     if state is not None:
-        first, flat_at, seconds = state.iteration + 1, state.history.flat_at, state.seconds
-    clock, visits = Clock(seconds), course.visits(ends_at(plan, flat_at))
+        first, history, seconds = state.iteration + 1, state.history, state.seconds
+    clock, visits = Clock(seconds), course.visits(looks_of(plan, history))
     with PhotoStream(course.views, visits, first, out).to(device.tensors) as photos:
         photos.tell(report)
         photos.fill(report)  # before there is a model, if it is not there already: both want memory
         if state is None:
             begun = course.start().to(device.tensors)
             state = TrainState.begin(begun, plan, course.techniques(), course.frozen)
-        optimise(Training(state, plan, device, out / CHECKPOINT, clock), photos, report)
+        optimise(Training(state, course, out / CHECKPOINT, clock), photos, report)
     if (flat_at := state.history.flat_at) > 0:
-        report.note(
-            f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {plan.schedule.iterations:,}"
-        )
+        planned = plan.after(state.history.sizes_ended).schedule.iterations
+        report.note(f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {planned:,}")
     return state
 
 
@@ -195,9 +196,22 @@ def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
     }
     if plan.options.sky != "off":
         found["sky_photos"] = 0
+    if state.history.sizes_ended:
+        found["sizes_ended"] = list(state.history.sizes_ended)
     if state.history.flat_at:
         found["flat_at"] = state.history.flat_at
     return found | state.techniques.summary()
+
+
+def looks_of(plan: Plan, history: History) -> list[Look]:
+    """What every iteration looks at, as far as is known by now.
+
+    Args:
+        plan: The training's, as it was made.
+        history: Of the training.
+    """
+    now = plan.after(history.sizes_ended)
+    return now.schedule.looks_to(ends_at(now, history.flat_at))
 
 
 def budgeted(plan: Plan) -> bool:
@@ -244,30 +258,33 @@ class Training:
 
     Attributes:
         state: Changed in place.
-        plan: What it does.
-        device: What it is computed on.
+        course: What it goes through.
         path: Of its checkpoint.
         clock: Its time.
     """
 
     state: TrainState
-    plan: Plan
-    device: Device
+    course: Course
     path: Path
     clock: Clock
 
     def save(self) -> None:
         """Leave a checkpoint."""
-        save_checkpoint(self.path, self.plan.digest(), self.state.checkpoint(self.device.kernels))
+        save_checkpoint(self.path, self.course.plan.digest(), self.state.checkpoint(self.course.device.kernels))
+
+    @property
+    def now(self) -> Plan:
+        """The plan, as it is by now."""
+        return self.course.plan.after(self.state.history.sizes_ended)
 
     @property
     def last(self) -> int:
         """Its last iteration, as far as is known by now."""
-        return ends_at(self.plan, self.state.history.flat_at)
+        return ends_at(self.now, self.state.history.flat_at)
 
     def is_told(self) -> bool:
         """Whether it is reported how far it is."""
-        every = REPORT_EVERY if self.device.name == "cpu" else CUDA_REPORT_EVERY
+        every = REPORT_EVERY if self.course.device.name == "cpu" else CUDA_REPORT_EVERY
         return self.state.iteration % every == 0 or self.state.iteration == self.last
 
 
@@ -304,13 +321,18 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
         KeyboardInterrupt: when asked to end, after a checkpoint.
         MachineError: if a device's memory is too small for it.
     """
-    state, plan, clock = training.state, training.plan, training.clock
+    state, plan, clock = training.state, training.now, training.clock
     with deferred_interrupts() as interrupt:
         for photo in photos:
             iterate_within_memory(iterate, state, plan, photo, report)
             state.seconds = clock.seconds()
             if state.history.growth_ended == state.iteration:
                 tell_growth_ended(state, plan, report)
+            if state.iteration in state.history.sizes_ended[-1:]:
+                plan = training.now
+                visits = training.course.visits(looks_of(training.course.plan, state.history))
+                photos.go_on(visits, state.iteration + 1)
+                tell_larger_photos(state, plan, report)
             if interrupt.requested:
                 break
             if clock.is_up(plan):
@@ -336,6 +358,13 @@ def tell_growth_ended(state: TrainState, plan: Plan, report: Reporter) -> None:
         f"so no Gaussian is added after iteration {state.iteration:,}.",
         hint=f"{'Give more with --max-memory' if limited else 'Lower train.max_gaussians'}, "
         "or smaller photos with train.max_megapixels.",
+    )
+
+
+def tell_larger_photos(state: TrainState, plan: Plan, report: Reporter) -> None:
+    """Say that a size ended before its time, and what that leaves to do."""
+    report.note(
+        f"flat after {state.iteration:,} iterations: goes on with larger photos, to {plan.schedule.iterations:,} in all"
     )
 
 

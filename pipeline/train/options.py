@@ -91,8 +91,8 @@ class TrainConfig(StageConfig):
     """Moving things: up to about this share of all pixels, a quarter of a photo at most, is left out of the loss where
     a photo differs, visit after visit, from what the others agree on; 0: none. Tried: 0.05."""
     stop_when_flat: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-    """Where going on would take off less than this share of the training photos' loss, the schedule is run down within
-    a tenth of the iterations done; 0 for never. The presets have 0.1."""
+    """Where going on would take off less than this share of the training photos' loss, larger photos come at once; at
+    the largest size the schedule is run down within a tenth of the iterations done. 0 for never; presets have 0.1."""
 
     def unfit_for_cuda(self) -> str:
         """Why these options do not train on a CUDA device; empty where they do."""

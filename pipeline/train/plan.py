@@ -48,6 +48,7 @@ class Plan:
         forecast_seconds: When it should be done; 0 where nothing was measured.
         sizes: Width and height of the dataset's training photos, and how many have them; none where they do not matter.
         window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
+        ends_when_flat: Whether `stop_when_flat` ends the training, or no more than the sizes before the finest.
     """
 
     options: TrainConfig
@@ -64,6 +65,7 @@ class Plan:
     forecast_seconds: float = 0.0
     sizes: tuple[tuple[int, int, int], ...] = ()
     window_pixels: int = 0
+    ends_when_flat: bool = True
 
     def to_json(self) -> str:
         """The plan as canonical JSON."""
@@ -107,6 +109,19 @@ class Plan:
     def within_windows(self, pixels: int) -> Plan:
         """The same training with windows of at most so many pixels."""
         return replace(self, window_pixels=pixels).of(self.options)
+
+    def after(self, sizes_ended: Sequence[int]) -> Plan:
+        """The plan once sizes ended before their time: the finest has what they spare, counted by pixels.
+
+        Args:
+            sizes_ended: As the history says.
+        """
+        schedule, footage = self.schedule, self.footage
+        for iteration in sizes_ended:
+            pixels = footage.pixels(schedule.look_at(iteration))
+            schedule = schedule.without_rest(iteration, min(1.0, pixels / footage.pixels(schedule.finest)))
+        spared = self.schedule.iterations - schedule.iterations
+        return replace(self, schedule=schedule, last_iteration=self.last_iteration - spared) if sizes_ended else self
 
     @property
     def footage(self) -> Footage:

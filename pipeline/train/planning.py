@@ -110,6 +110,7 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
         last_iteration=choice.last_iteration,
         train_seconds=max(0.01, round(choice.seconds, 2)),
         forecast_seconds=round(choice.forecast_s, 2),
+        ends_when_flat=choice.is_most,
     )
 
 

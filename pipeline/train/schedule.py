@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
 from splatpipe.pipeline.train.draws import BACKGROUND, uniform
-from splatpipe.pipeline.train.lengths import Footage, Length, Stretch, growth_until, lengths_of, stretches
+from splatpipe.pipeline.train.lengths import UNTIL, Footage, Length, Stretch, growth_until, lengths_of, stretches
 from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
@@ -129,7 +129,35 @@ class Schedule:
 
     def look_at(self, iteration: int) -> Look:
         """What an iteration (from 1) looks at of its photo."""
-        return next((each for each in self.stretches if iteration <= each.until), self.stretches[-1]).look
+        return self.stretches[self.stretch_at(iteration)].look
+
+    def stretch_at(self, iteration: int) -> int:
+        """The number of the stretch that an iteration (from 1) is in."""
+        untils = (number for number, each in enumerate(self.stretches) if iteration <= each.until)
+        return next(untils, len(self.stretches) - 1)
+
+    def without_rest(self, iteration: int, worth: float) -> Schedule:
+        """The schedule where the next stretch begins after this iteration; the last one gets what that spares.
+
+        Args:
+            iteration: In any stretch but the last.
+            worth: Iterations of the last stretch that one of this costs as much as.
+        """
+        number = self.stretch_at(iteration)
+        spared = self.stretches[number].until - iteration
+        changed = [
+            *self.stretches[:number],
+            *(replace(each, until=each.until - spared) for each in self.stretches[number:]),
+        ]
+        total = self.iterations - spared + int(worth * spared)
+        changed[-1] = replace(changed[-1], until=total)
+        finest_from, resets = changed[-2].until, self.density.reset_until
+        density = replace(
+            self.density,
+            last=max(1, finest_from + int(UNTIL * (total - finest_from))),
+            reset_until=resets - spared if resets > iteration else resets,
+        )
+        return replace(self, iterations=total, stretches=tuple(changed), density=density)
 
     def looks_to(self, last: int) -> list[Look]:
         """``look_at`` for every iteration up to the last."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,13 +94,27 @@ class PhotoStream:
         cache: Path,
     ) -> None:
         self._views = views
-        self._next = first
         self._uploader = Uploader(torch.device("cpu"))
         self._pending: deque[Future[_Sent]] = deque()
-        self._visits = visits
-        self._unread = visits.levels_wanted(first)
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
+        self.go_on(visits, first)
+
+    def go_on(self, visits: Visits, first: int) -> None:
+        """Go on with other visits, as if the stream had been begun with them; what was read ahead is dropped.
+
+        Args:
+            visits: Of all iterations from 1.
+            first: The next iteration.
+        """
+        for each in self._pending:
+            each.cancel()
+        wait(self._pending)  # the reader uses what changes now
+        self._pending.clear()
+        self._visits, self._next = visits, first
+        wanted = visits.levels_wanted(first).items()
+        unread = {view: [level for level in levels if (view, level) not in self._cache] for view, levels in wanted}
+        self._unread = {view: levels for view, levels in unread.items() if levels}
 
     @staticmethod
     def over(

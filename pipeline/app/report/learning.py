@@ -171,8 +171,11 @@ def _last(curve: Mapping[float, float]) -> float | None:
 
 
 def _why_earlier(summary: Mapping[str, Any]) -> str:
-    flat = summary.get("flat_at")
-    return f": the loss was flat after {count(flat)}" if flat else ""
+    flat, before = summary.get("flat_at"), summary.get("sizes_ended") or []
+    told = [f"of smaller photos after {count(iteration)}" for iteration in before] + (
+        [f"after {count(flat)}"] if flat else []
+    )
+    return f": the loss was flat {', '.join(told)}" if told else ""
 
 
 def _seed(holdings: Holdings) -> str:
