@@ -110,7 +110,9 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     whole = plan = make_plan(options, views, split, len(room))
 
     def visits(history: History) -> PhotoVisits:
-        return PhotoVisits([view.camera for view in trained_on], looks_of(whole, history), plan.options.seed)
+        return PhotoVisits(
+            [view.camera for view in trained_on], looks_of(whole, history), whole.options.seed, whole.megapixels
+        )
 
     with same_bits(arguments.threads):
         clocks.start()
