@@ -57,7 +57,7 @@ class Course:
         visits: What iterations with such looks look at of them.
         techniques: Makes the plan's, nothing of them trained.
         start: Makes the Gaussians that it begins with.
-        frozen: Gaussians that are drawn besides and stay as they are; None for none.
+        frozen: Makes those that are drawn besides and stay as they are; None for none.
     """
 
     plan: Plan
@@ -66,7 +66,12 @@ class Course:
     visits: Callable[[Sequence[Look]], Visits]
     techniques: Callable[[], Techniques]
     start: Callable[[], Gaussians]
-    frozen: Gaussians | None = None
+    frozen: Callable[[], Gaussians | None] = lambda: None
+
+    def placed_frozen(self) -> Gaussians | None:
+        """The frozen ones on the device."""
+        frozen = self.frozen()
+        return None if frozen is None else frozen.to(self.device.tensors)
 
 
 Fit = Callable[[Plan, Scene, Step, Reporter], Plan]
@@ -168,7 +173,7 @@ def go_through(course: Course, out: Path, report: Reporter) -> TrainState:
         photos.fill(report)  # before there is a model, if it is not there already: both want memory
         if state is None:
             begun = course.start().to(device.tensors)
-            state = TrainState.begin(begun, plan, course.techniques(), course.frozen)
+            state = TrainState.begin(begun, plan, course.techniques(), course.placed_frozen())
         optimise(Training(state, course, out / CHECKPOINT, clock), photos, report)
     if (flat_at := state.history.flat_at) > 0:
         planned = plan.after(state.history.sizes_ended).schedule.iterations
@@ -299,7 +304,8 @@ def resume(path: Path, course: Course, report: Reporter) -> TrainState | None:
     device = course.device
     try:
         checkpoint = load_checkpoint(path, course.plan.digest())
-        state = TrainState.restore(checkpoint, course.plan, course.techniques(), device.tensors, course.frozen)
+        frozen = course.placed_frozen()
+        state = TrainState.restore(checkpoint, course.plan, course.techniques(), device.tensors, frozen)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:

@@ -197,7 +197,18 @@ def resolve_schedule(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedul
         config: The options.
         footage: The photos that are trained on.
     """
-    each, pace = lengths_of(config, footage), Pace.of(config, footage)
+    return schedule_of(config, footage, lengths_of(config, footage))
+
+
+def schedule_of(config: TrainConfig, footage: Footage, each: list[Length]) -> Schedule:
+    """The same for sizes and iterations that are given.
+
+    Args:
+        config: The options.
+        footage: The photos that are trained on.
+        each: Levels and their iterations, the first one first.
+    """
+    pace = Pace.of(config, footage)
     few = FEW_DROPOUT * share_of_few(footage.photos)
     return Schedule(
         iterations=sum(count for _level, count in each),

@@ -37,26 +37,29 @@ class PhotoSkies:
 
     Args:
         masks: By the photos' names; those without sky may be left out.
+
+    Attributes:
+        masks: Those with sky.
     """
 
     def __init__(self, masks: Mapping[str, SkyMask]) -> None:
-        self._masks = {name: mask for name, mask in masks.items() if mask.any()}
+        self.masks: Mapping[str, SkyMask] = {name: mask for name, mask in masks.items() if mask.any()}
         self._bits: dict[str, UInt8[Tensor, " n"]] = {}  # on a device, where photos are trained on one
 
     def __len__(self) -> int:
         """In how many photos there is sky."""
-        return len(self._masks)
+        return len(self.masks)
 
     def on(self, device: torch.device) -> PhotoSkies:
         """The same for training on a device: the masks, an eighth of a byte a pixel, are kept there."""
-        moved = PhotoSkies(self._masks)
+        moved = PhotoSkies(self.masks)
         if device.type != "cpu":
-            moved._bits = {name: torch.from_numpy(mask.bits).to(device) for name, mask in self._masks.items()}
+            moved._bits = {name: torch.from_numpy(mask.bits).to(device) for name, mask in self.masks.items()}
         return moved
 
     def seen(self, camera: Camera) -> SeenSky | None:
         """The sky of a photo at the size of ``camera``; None where it shows none."""
-        found = self._masks.get(camera.name)
+        found = self.masks.get(camera.name)
         if found is None:
             return None
         bits = self._bits.get(camera.name)

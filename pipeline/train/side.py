@@ -23,16 +23,26 @@ class SideModel:
     Attributes:
         tensors: (n, ...) each; changed in place.
         adam: Their optimiser.
+        is_given: They take part as they are; nothing of them is trained.
     """
+
+    is_given = False
 
     def __init__(self, tensors: Mapping[str, Tensor], epsilon: float = 1e-15) -> None:
         self.tensors = {name: tensor.detach().clone().requires_grad_() for name, tensor in tensors.items()}
         self.adam = Adam(self.tensors, epsilon=epsilon)
 
+    def give(self) -> None:
+        """From now on nothing of them is trained: they were, elsewhere."""
+        self.is_given = True
+        for tensor in self.tensors.values():
+            tensor.requires_grad_(False)
+
     def move_to(self, device: torch.device) -> None:
         """Take the tensors, nothing of them trained, to where they are trained."""
         if any(tensor.device != device for tensor in self.tensors.values()):
-            self.tensors = {name: tensor.detach().to(device).requires_grad_() for name, tensor in self.tensors.items()}
+            moved = {name: tensor.detach().to(device) for name, tensor in self.tensors.items()}
+            self.tensors = {name: tensor.requires_grad_(not self.is_given) for name, tensor in moved.items()}
             self.adam = Adam(self.tensors, epsilon=self.adam.epsilon)
 
     def descend(self, rates: Mapping[str, Rate], rows: Bool[Tensor, " n"] | None = None) -> None:

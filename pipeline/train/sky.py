@@ -86,6 +86,18 @@ class SkyModel(SideModel, Technique):
         """In how many photos there is sky."""
         return len(self._skies)
 
+    @property
+    def masks(self) -> Mapping[str, SkyMask]:
+        """The skies, by the names of the photos that have one."""
+        return self._skies.masks
+
+    @staticmethod
+    def given(panorama: Panorama, masks: Mapping[str, SkyMask]) -> SkyModel:
+        """A panorama that was trained elsewhere, of which nothing is trained."""
+        found = SkyModel(panorama.up, panorama.colours.detach().cpu().numpy(), masks)
+        found.give()
+        return found
+
     @staticmethod
     def begin(views: Sequence[View], dataset: Path, threads: int) -> SkyModel | None:
         """Find the sky in photos and start with the colours that it has there; None where none of them shows any.
@@ -127,7 +139,8 @@ class SkyModel(SideModel, Technique):
 
     def after_step(self, shot: Shot) -> None:
         """Step the colours."""
-        self.step(shot.now.share)
+        if not self.is_given:
+            self.step(shot.now.share)
 
     def summary(self) -> dict[str, int | float]:
         """In how many photos it is."""

@@ -110,6 +110,10 @@ class Techniques:
         """The one of a kind; None where it is off."""
         return next((technique for technique in self.each if isinstance(technique, kind)), None)
 
+    def with_given(self, given: Technique) -> Techniques:
+        """The same with another one in the place of that of its kind."""
+        return Techniques(tuple(given if type(given) is type(each) else each for each in self.each))
+
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
         """How to render."""
         for technique in self.each:

@@ -1,0 +1,97 @@
+"""The coarse pass: the whole scene at its first size, in the memory of one block.
+
+It is what is drawn around blocks and outside of all of them, what they start from, and what they see their photos
+through: its sky and exposures are theirs, so that no two blocks differ in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.train.blocks.lengths import coarse_lengths
+from splatpipe.pipeline.train.blocks.outlook import footage_on
+from splatpipe.pipeline.train.blocks.schedules import coarse_schedule
+from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.train.loop import train_whole
+from splatpipe.pipeline.train.measure import Step
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.planning import Scene
+from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.sky_file import write_skies
+from splatpipe.pipeline.train.start import started
+
+SKIES = "skies.npz"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What keeps a training to its memory.
+
+    Attributes:
+        gaussians: At most.
+        window_pixels: Of a photo, that an iteration looks at at most.
+    """
+
+    gaussians: int
+    window_pixels: int
+
+
+def train_coarse(config: TrainConfig, inputs: Inputs, limits: Limits, out: Path, report: Reporter) -> Summary:
+    """Write what the stage `train` does, of the whole scene at its first size, and the photos' skies.
+
+    Args:
+        config: The options of the whole training; a time budget is nothing to it.
+        inputs: Those of the stage `train`.
+        limits: Of this pass.
+        out: Takes the files, and has its checkpoint meanwhile.
+        report: Takes what people want to know.
+
+    Raises:
+        SplatpipeError, MachineError, KeyboardInterrupt: as ``loop.run``.
+    """
+
+    def fit(plan: Plan, scene: Scene, _step: Step, _report: Reporter) -> Plan:
+        return coarse_plan(plan, scene, limits)
+
+    unhurried = config.model_copy(update={"time_budget_s": 0.0})
+    state, summary = train_whole(unhurried, inputs, out, report, fit)
+    sky = state.techniques.find(SkyModel)
+    write_skies(out / SKIES, {} if sky is None else sky.masks)
+    return summary
+
+
+def coarse_iterations(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> int:
+    """Those of the pass.
+
+    Args:
+        config: The options of the whole training.
+        cameras: Of the photos trained on.
+        window_pixels: Of a photo, that an iteration looks at at most.
+    """
+    footage, _most = footage_on(config, cameras, window_pixels)
+    return sum(count for _level, count in coarse_lengths(config, footage))
+
+
+def coarse_plan(plan: Plan, scene: Scene, limits: Limits) -> Plan:
+    """That of the coarse pass.
+
+    Args:
+        plan: Of the whole training.
+        scene: What is trained.
+        limits: Of the pass.
+    """
+    options = plan.options.model_copy(update={"max_gaussians": limits.gaussians})
+    plan = plan.within_windows(limits.window_pixels).of(options)
+    schedule = coarse_schedule(options, plan.footage)
+    return replace(
+        plan,
+        schedule=schedule,
+        last_iteration=schedule.iterations,
+        train_megapixels=round(1e-6 * plan.footage.pixels(Look(schedule.finest.level)), 4),
+        initial_gaussians=started(scene.start.sparse, scene.start.swept, limits.gaussians),
+    )

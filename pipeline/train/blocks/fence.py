@@ -1,0 +1,64 @@
+"""A block's Gaussians stay in its cell and margin, and each of the two gets no more of them than its share."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.partition import Partition
+from splatpipe.pipeline.train.densify import DensitySchedule
+from splatpipe.pipeline.train.hooks import Technique
+
+
+class Fence(Technique):
+    """Keeps a block's Gaussians where they belong: what they could stand for elsewhere is another block's, or frozen.
+
+    Args:
+        partition: The cells.
+        block: Whose.
+        share: Gaussians that its cell gets at most; the cap's rest is the margin's.
+        density: The training's schedule of density control; its steps are when it looks, and goes on to.
+    """
+
+    name = "fence"
+
+    def __init__(self, partition: Partition, block: int, share: int, density: DensitySchedule) -> None:
+        self._partition, self._block, self._share, self._density = partition, block, share, density
+
+    def ranked(
+        self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
+    ) -> Float[Tensor, " n"]:
+        """The same, but 0 for those that would be more than cell or margin have room for."""
+        score = score.clone()
+        for inside, most in self._shares(gaussians):
+            room = max(0, most - int(inside.sum()))
+            wanted = torch.nonzero(inside & (score > schedule.gradient)).flatten()
+            best = torch.argsort(score[wanted], descending=True, stable=True)
+            score[wanted[best[room:]]] = 0.0
+        return score
+
+    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+        """Those that left cell and margin, and the least opaque of what is too many; None between two looks."""
+        due = iteration >= self._density.first and iteration % self._density.every == 0
+        return ~self.kept(gaussians) if due and self._density.on else None
+
+    def kept(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
+        """Which Gaussians of a model are the block's to leave."""
+        kept = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+        for inside, most in self._shares(gaussians):
+            rows = torch.nonzero(inside).flatten()
+            order = torch.argsort(gaussians.opacity_logits.detach()[rows], descending=True, stable=True)
+            kept[rows[order[:most]]] = True
+        return kept
+
+    def _shares(self, gaussians: Gaussians) -> list[tuple[Bool[Tensor, " n"], int]]:
+        """Which Gaussians are in the cell and which in the margin, and how many each may have."""
+        means = gaussians.means.detach()
+        points = means.double().cpu().numpy()
+        cell = self._partition.cells[self._block].contains(self._partition.plan.places(points))
+        margin = self._partition.trained_by(self._block, points) & ~cell
+        masks = (torch.from_numpy(np.ascontiguousarray(mask)).to(means.device) for mask in (cell, margin))
+        return list(zip(masks, (self._share, max(0, self._density.cap - self._share)), strict=True))

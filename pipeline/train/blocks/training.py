@@ -1,0 +1,254 @@
+"""One block of a scene, trained: its own Gaussians on the windows that show its cell, before all else as it was.
+
+It goes on where the coarse pass ended (``schedules.py``), with that pass's sky and exposures. What it leaves is of its
+cell and margin alone; ``merging.py`` puts the cells together.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.stage import JSON, Machine, Reporter, Summary
+from splatpipe.pipeline.photos.dataset import View, load_split, load_views
+from splatpipe.pipeline.raster.device import Device, choose_device
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import read_panorama
+from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
+from splatpipe.pipeline.train.blocks.coarse import SKIES
+from splatpipe.pipeline.train.blocks.fence import Fence
+from splatpipe.pipeline.train.blocks.outlook import Cut, Parts
+from splatpipe.pipeline.train.blocks.partition import Partition
+from splatpipe.pipeline.train.blocks.prospect import Surveyor
+from splatpipe.pipeline.train.blocks.schedules import block_schedule
+from splatpipe.pipeline.train.clearing import Clearing, free_space_of
+from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.train.history import History
+from splatpipe.pipeline.train.hooks import Technique
+from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.train.loop import Course, go_through, summary_of
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, footage_of, load_or_write_plan, make_plan
+from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.sky_file import read_skies
+from splatpipe.pipeline.train.techniques import Techniques, make_techniques
+from splatpipe.pipeline.train.visits import PartVisits, Visits
+
+
+@dataclass(frozen=True, eq=False)
+class SiteParts:
+    """What all blocks of a scene share.
+
+    Attributes:
+        dataset: The photos and the sparse points.
+        split: Which photos are trained on.
+        coarse: The folder that the coarse pass left.
+        partition: The cells.
+    """
+
+    dataset: Path
+    split: Path
+    coarse: Path
+    partition: Partition
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """What is one block's.
+
+    Attributes:
+        number: Of its cell.
+        share: Gaussians that its cell gets at most.
+        trained: Gaussians that it trains at most, with those of the margin.
+        frozen: Gaussians that it draws besides at most.
+        window_pixels: Of a photo, that an iteration looks at at most.
+    """
+
+    number: int
+    share: int
+    trained: int
+    frozen: int
+    window_pixels: int
+
+
+def train_block(
+    config: TrainConfig, parts: SiteParts, task: BlockTask, machine: Machine, out: Path, report: Reporter
+) -> Summary:
+    """Write what the block trained, its history and its plan; go on from a checkpoint where a killed run left one.
+
+    Args:
+        config: The options, as for ``train_coarse``.
+        parts: The scene.
+        task: The block.
+        machine: Changes only speed.
+        out: Takes the files, and has checkpoint and decoded photos meanwhile.
+        report: Takes what people want to know.
+
+    Raises:
+        SplatpipeError: if a file is missing or broken.
+        MachineError: if the device asked for is not there, or memory is short.
+        KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
+    """
+    device = choose_device(machine.device, config.unfit_for_cuda(), report.note)
+    with same_bits(machine.threads), device.one_order(), device.memory_limit(config.max_memory_bytes):
+        block = Block.of(config, parts, task, device)
+        windows = block.surveyor.parts(out, report)
+        plan = load_or_write_plan(out / "plan.json", lambda: block.plan(windows))
+        if plan.schedule.iterations == 0:
+            report.note(f"block {task.number}: there is nothing to train")
+            return _leave(block, plan, out, (block.start(), History())) | device.facts()
+        report.note(f"block {task.number}: {len(plan.train_views)} photos, {plan.described()}")
+        state = go_through(block.course(plan, windows, out), out, report)
+        left = _leave(block, plan, out, (state.finished(), state.whole_history()))
+    return summary_of(state, plan) | left | device.facts()
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A block and its scene.
+
+    Attributes:
+        parts: The scene's files.
+        task: Which block.
+        device: What it is computed on.
+        whole: The plan of the whole scene, with the block's options.
+        surveyor: Knows its windows and surroundings.
+        exposures: The photos' maps, as `exposures.json` has them.
+    """
+
+    parts: SiteParts
+    task: BlockTask
+    device: Device
+    whole: Plan
+    surveyor: Surveyor
+    exposures: Mapping[str, list[list[float]]]
+
+    @staticmethod
+    def of(config: TrainConfig, parts: SiteParts, task: BlockTask, device: Device) -> Block:
+        """One with its scene's files read.
+
+        Raises:
+            SplatpipeError: if a file is missing or broken.
+        """
+        views, split = load_views(parts.dataset), load_split(parts.split)
+        kept = set(split.train)
+        trained_on = [view for view in views if view.camera.name in kept]
+        exposures = _read_exposures(parts.coarse / "exposures.json")
+        exposure = "affine" if exposures else "off"
+        decided = {"max_gaussians": task.trained, "time_budget_s": 0.0, "exposure": exposure}
+        whole = make_plan(config.model_copy(update=decided), views, split, 0, task.window_pixels)
+        cut = Cut.of(whole.options, whole.footage, whole.megapixels)
+        surveyor = Surveyor(
+            parts.dataset, parts.coarse, parts.partition, task.number, trained_on, cut, task.frozen, device
+        )
+        return Block(parts, task, device, whole, surveyor, exposures)
+
+    def start(self) -> Gaussians:
+        """What it begins with."""
+        return self.surveyor.start(self.task.trained)
+
+    def views(self, windows: Parts) -> list[View]:
+        """The photos that it sees, in the order of all."""
+        return [self.surveyor.views[row] for row in rows_of(windows)]
+
+    def plan(self, windows: Parts) -> Plan:
+        """What it does; no iterations where it sees nothing, or has nothing to train."""
+        options, cameras = self.whole.options, [view.camera for view in self.views(windows)]
+        counted = Counter((camera.width, camera.height) for camera in cameras)
+        sizes = tuple((*size, counted[size]) for size in sorted(counted))
+        count = len(self.start())
+        planned = replace(
+            self.whole,
+            train_views=tuple(camera.name for camera in cameras),
+            initial_gaussians=count,
+            sizes=sizes,
+            last_iteration=0,
+        )
+        if not cameras or not count:
+            return replace(planned, schedule=replace(planned.schedule, iterations=0))
+        seen = footage_of(sizes, self.whole.megapixels, self.whole.window_pixels)
+        pieces = {level: len(pairs) for level, pairs in windows.items()}
+        schedule = block_schedule(options, self.whole.footage, seen, pieces)
+        size = round(1e-6 * seen.pixels(Look(schedule.finest.level)), 4)
+        return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
+
+    def course(self, plan: Plan, windows: Parts, out: Path) -> Course:
+        """What it goes through.
+
+        Args:
+            plan: Its plan.
+            windows: That it trains on.
+            out: Has its surroundings.
+        """
+        views, place = self.views(windows), {row: place for place, row in enumerate(rows_of(windows))}
+        cut, every = self.surveyor.cut, self.surveyor.views
+        pieces = {
+            level: [(place[row], cut.frames(every[row].camera, level)[window]) for row, window in pairs.tolist()]
+            for level, pairs in windows.items()
+        }
+
+        def visits(looks: Sequence[Look]) -> Visits:
+            cameras = [view.camera for view in views]
+            return PartVisits(cameras, looks, plan.options.seed, plan.megapixels, pieces)
+
+        return Course(
+            plan,
+            self.device,
+            views,
+            visits,
+            techniques=lambda: self.techniques(plan, views),
+            start=self.start,
+            frozen=lambda: self.surveyor.frozen(out),
+        )
+
+    def techniques(self, plan: Plan, views: Sequence[View]) -> Techniques:
+        """Those of the options; sky and exposures are the coarse pass's.
+
+        Args:
+            plan: Its plan.
+            views: The photos that it sees.
+        """
+        names, where = set(plan.train_views), self.device.tensors
+        panorama = read_panorama(self.parts.coarse / "sky.npz")
+        sky = None if panorama is None else SkyModel.given(panorama, read_skies(self.parts.coarse / SKIES, names))
+        made = make_techniques(plan, sky, views, device=where)
+        if plan.options.exposure == "affine":
+            exposure = Exposure.given({name: self.exposures[name] for name in plan.train_views})
+            exposure.move_to(where)
+            made = made.with_given(exposure)
+        more: list[Technique] = [self.fence(plan)]
+        if plan.options.prune_free_space:
+            more.append(Clearing(free_space_of(self.surveyor.views, self.parts.dataset), plan.schedule))
+        return Techniques((*made, *more))
+
+    def fence(self, plan: Plan) -> Fence:
+        """What keeps its Gaussians to cell and margin."""
+        return Fence(self.parts.partition, self.task.number, self.task.share, plan.schedule.density)
+
+
+def rows_of(windows: Parts) -> list[int]:
+    """The photos of some windows, ascending."""
+    return sorted({row for pairs in windows.values() for row in pairs[:, 0].tolist()})
+
+
+def _leave(block: Block, plan: Plan, out: Path, trained: tuple[Gaussians, History]) -> dict[str, JSON]:
+    """Write the outcome: of the Gaussians those that are the block's to leave."""
+    gaussians, history = trained
+    gaussians = gaussians.select(block.fence(plan).kept(gaussians))
+    write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
+    (out / "history.json").write_text(history.to_json(), encoding="utf-8")
+    return {"gaussians": len(gaussians), "photos": len(plan.train_views)}
+
+
+def _read_exposures(path: Path) -> dict[str, list[list[float]]]:
+    """The photos' maps; none where exposure was not modelled."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["views"]
+        return {str(name): [[float(value) for value in row] for row in rows] for name, rows in found.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error

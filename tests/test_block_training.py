@@ -1,0 +1,183 @@
+"""Training one block: only its Gaussians change, on the windows that show it, with the same bits however it is run."""
+
+import hashlib
+import json
+import os
+import signal
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.raster.device import cpu
+from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
+from splatpipe.pipeline.train.blocks.partition import Cell, Partition
+from splatpipe.pipeline.train.blocks.training import Block, BlockTask, SiteParts, train_block
+from splatpipe.pipeline.train.checkpoint import load_checkpoint
+from splatpipe.pipeline.train.lengths import PART_VISITS
+from splatpipe.pipeline.train.looks import windows_of
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.stages import initialize
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+WINDOW = 1000  # of 72 × 54 pixels: four windows a photo, and one at half the size
+CELLS = (Cell((-3.0, -1.5), (0.0, 3.0)), Cell((0.0, -1.5), (3.0, 3.0)))
+PARTITION = Partition(GroundPlan(np.array([[1.0, 0, 0], [0, 0, 1.0]]), np.array([0, -1.0, 0])), CELLS, 0.25)
+CONFIG = TrainConfig(iterations=120, sh_degree=1, prune_free_space=2, exposure="affine", max_gaussians=400)
+TASK = BlockTask(0, share=160, trained=230, frozen=120, window_pixels=WINDOW)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> SiteParts:
+    """A scene with its coarse pass."""
+    folder = tmp_path_factory.mktemp("site")
+    tiny_scene.write_dataset(folder / "dataset", masked="flight 1/photo_5.png")
+    parts = {"undistort.dataset": folder / "dataset"}
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    parts |= {"initialize.splat": folder / "init.ply", **tiny_scene.split_part(folder / "dataset", 4)}
+    (folder / "coarse").mkdir()
+    inputs = Inputs(parts, folder, machine=Machine("cpu", 1))
+    train_coarse(CONFIG, inputs, Limits(150, WINDOW), folder / "coarse", tiny_scene.Recorder())
+    return SiteParts(folder / "dataset", parts["split.views"], folder / "coarse", PARTITION)
+
+
+def trained(site: SiteParts, out: Path, threads: int = 1) -> Path:
+    out.mkdir(exist_ok=True)
+    train_block(CONFIG, site, TASK, Machine("cpu", threads), out, tiny_scene.Recorder())
+    return out
+
+
+@pytest.fixture(scope="module")
+def undisturbed(site: SiteParts, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(site, tmp_path_factory.mktemp("undisturbed"))
+
+
+def digest(out: Path) -> str:
+    return hashlib.sha256(b"".join((out / name).read_bytes() for name in ("model.ply", "history.json"))).hexdigest()
+
+
+def test_coarse_pass_trains_whole_photos_at_the_first_size(site: SiteParts) -> None:
+    plan = Plan.from_json((site.coarse / "plan.json").read_text())
+    assert [(stretch.level, stretch.window_pixels) for stretch in plan.schedule.stretches] == [(1, 0)]
+    assert len(read_splat(site.coarse / "model.ply")) <= 150 == plan.options.max_gaussians
+    assert {path.name for path in site.coarse.iterdir()} == {
+        *("model.ply", "sky.npz", "skies.npz", "exposures.json", "rendering.json", "plan.json", "history.json")
+    }
+
+
+def test_outcome_is_of_cell_and_margin_alone_and_keeps_to_its_shares(site: SiteParts, undisturbed: Path) -> None:
+    model = read_splat(undisturbed / "model.ply")
+    points = model.means.double().numpy()
+    assert PARTITION.trained_by(0, points).all()
+    own = int((PARTITION.owners(points) == 0).sum())
+    assert 100 < own <= TASK.share and own < len(model) <= TASK.trained
+    start = read_splat(site.coarse / "model.ply")
+    inside = PARTITION.trained_by(0, start.means.double().numpy())
+    assert len(model) > inside.sum()  # it has grown
+
+
+class Killed(BaseException):
+    """Stands for a kill."""
+
+
+def step_with(patch: pytest.MonkeyPatch, look: Callable[[TrainState, TrainingPhoto], None]) -> None:
+    """Let ``look`` see each iteration before it begins."""
+    step = loop.iterate
+
+    def looking(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+        look(state, photo)
+        step(state, plan, photo)
+
+    patch.setattr(loop, "iterate", looking)
+
+
+def test_frozen_gaussians_stay_to_the_bit_and_others_learn(
+    site: SiteParts, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    around: list[Gaussians] = []
+    frozen = read_splat(undisturbed / "frozen.ply")
+    assert 0 < len(frozen) <= TASK.frozen
+
+    def look(state: TrainState, photo: TrainingPhoto) -> None:
+        whole = state.drawn
+        assert len(whole) == len(state.gaussians) + len(frozen)
+        around.append(whole.detach().after(len(state.gaussians)))
+        assert state.adam.mean["means"].shape == state.gaussians.means.shape
+
+    step_with(monkeypatch, look)
+    trained(site, tmp_path)
+    for name in PARAMETERS:
+        assert all(torch.equal(getattr(drawn, name), getattr(frozen, name)) for drawn in (around[0], around[-1]))
+    curve = json.loads((tmp_path / "history.json").read_text())["curve"]
+    assert curve[-1]["loss"] < curve[0]["loss"]
+    assert digest(tmp_path) == digest(undisturbed)
+
+
+def test_windows_are_those_that_show_the_cell_each_as_often_as_without_blocks(site: SiteParts, tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"iterations": "auto", "least_iterations": 1})
+    looked = []
+    for number in range(2):
+        block = Block.of(config, site, replace(TASK, number=number, window_pixels=400), cpu())
+        windows = block.surveyor.parts(tmp_path, tiny_scene.Recorder())
+        (tmp_path / "seen.npz").unlink()
+        plan = block.plan(windows)
+        visits = block.course(plan, windows, tmp_path).visits(plan.schedule.looks_to(plan.last_iteration))
+        each = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
+        times = Counter((visit.view, visit.level, visit.window) for visit in each)
+        assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2
+        assert {view for view, *_ in times} == set(range(len(plan.train_views)))
+        looked.append({(plan.train_views[view], level, window) for view, level, window in times})
+    # Cameras look along the line between the cells: the left cell is in the left of the picture, about.
+    first, second = looked
+    assert max(window.left for _, level, window in first if level == 0) < 0.75 * tiny_scene.WIDTH
+    assert min(window.right for _, level, window in second if level == 0) > 0.25 * tiny_scene.WIDTH
+    every = {name for name, *_ in first | second}
+    whole = len(windows_of(tiny_scene.WIDTH, tiny_scene.HEIGHT, 400))
+    assert len({part for part in first | second if part[1] == 0}) > 0.9 * whole * len(every)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_killed_block_goes_on_and_ends_with_the_same_bits(
+    site: SiteParts, undisturbed: Path, tmp_path: Path, threads: int
+) -> None:
+    def look(state: TrainState, photo: TrainingPhoto) -> None:
+        if state.iteration == 31:
+            raise Killed
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
+        step_with(patch, look)
+        trained(site, tmp_path)
+    assert (tmp_path / loop.CHECKPOINT).exists()
+    assert digest(trained(site, tmp_path, threads)) == digest(undisturbed)
+    assert digest(trained(site, tmp_path / "whole", threads)) == digest(undisturbed)
+
+
+def test_interrupt_leaves_a_checkpoint(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
+    def look(state: TrainState, photo: TrainingPhoto) -> None:
+        if state.iteration == 9:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        step_with(patch, look)
+        trained(site, tmp_path)
+    plan = Plan.from_json((tmp_path / "plan.json").read_text())
+    assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts["iteration"] == 10
+    assert digest(trained(site, tmp_path)) == digest(undisturbed)
