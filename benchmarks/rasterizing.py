@@ -37,7 +37,7 @@ def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> di
         generator = torch.Generator().manual_seed(index)
         upstream = torch.randn(camera.height, camera.width, 3, generator=generator) / (camera.width * camera.height)
         began, began_cpu = time.perf_counter(), time.process_time()
-        rendered = rasterizer.render(state.gaussians, camera, options, buffers=state.buffers)
+        rendered = rasterizer.render(state.gaussians, camera, options)
         rendered.colour.backward(upstream)  # type: ignore[no-untyped-call]
         took, took_cpu = time.perf_counter() - began, time.process_time() - began_cpu
         for tensor in state.gaussians.tensors().values():

@@ -99,7 +99,8 @@ def test_a_second_backward_pass_adds_up(kernels):
 
 def trained(kernels: CudaKernels | None, sparse: bool, dropout: bool, penalty: float = 0.0, steps: int = 2):
     """The model, its optimiser and the last gradient of the probe after some steps."""
-    scene, buffers = random_scene(0).requires_grad_(), GradientBuffers()
+    scene = random_scene(0).requires_grad_()
+    buffers = None if kernels is None else GradientBuffers()
     optimizer, kept = Adam(scene.tensors()), torch.arange(60) % 4 > 0
     with use_kernels(kernels):
         for _ in range(steps):

@@ -54,22 +54,50 @@ class Frame:
             ValueError: if shapes do not fit.
         """
 
-    def backward(
-        self,
-        parameters: Sequence[Tensor],
-        gradients: Sequence[Tensor | None],
-        outputs: Sequence[Tensor],
-        means2d: Tensor,
-        magnitudes: bool = False,
-    ) -> None:
-        """Gradients of the last forward(); can be repeated.
+    def blend_backward(self, gradients: Sequence[Tensor | None], magnitudes: bool = False) -> None:
+        """From the pictures of the last forward() to the screen.
+
+        Args:
+            gradients: dL/d(colour), dL/d(alpha), dL/d(depth_sum), dL/d(depth_square_sum); None for zero.
+            magnitudes: Of the gradients by the centres, sum the absolute values over the pixels, x and y apart.
+        """
+
+    def project_backward(self, parameters: Sequence[Tensor], outputs: Sequence[Tensor], means2d: Tensor) -> None:
+        """From there to the parameters; can be repeated.
 
         Args:
             parameters: Those that were rendered.
-            gradients: dL/d(colour), dL/d(alpha), dL/d(depth_sum), dL/d(depth_square_sum); None for zero.
             outputs: Written: gradients of the parameters, laid out like them.
             means2d: Written: dL/d(centres on screen), pixels (n, 2).
-            magnitudes: Make that the sum of its absolute values over the pixels, x and y apart.
+        """
+
+    def step(
+        self,
+        parameters: Sequence[Tensor],
+        values: Sequence[Tensor],
+        means: Sequence[Tensor],
+        squares: Sequence[Tensor],
+        rates: Sequence[Tensor],
+        options: tuple[float, float, float, int],
+        log_scale_limits: tuple[float, float],
+        logit_gain: Tensor | None,
+        means2d: Tensor | None,
+    ) -> int:
+        """The same, and a step of Adam of the visible rows at once; no others are touched.
+
+        Args:
+            parameters: Those that were rendered.
+            values: Those to step, the same or, of the logits, what the rendered ones were made from.
+            means: Adam's first moments.
+            squares: The second ones.
+            rates: As of ``adam_step``.
+            options: The same.
+            log_scale_limits: The stepped log-scales are held within them.
+            logit_gain: The derivative of the rendered logits by those that are stepped; None where they are the same.
+            means2d: Written where visible: dL/d(centres on screen), pixels (n, 2); None where not wanted.
+
+        Returns:
+            Rows that were left out for their gradients.
         """
 
     @property

@@ -1,21 +1,97 @@
-"""The native rasterizer under torch's autograd."""
+"""The native rasterizer under torch's autograd, and what is left of its backward pass for the optimiser."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
-from splatpipe.pipeline.raster.gradients import GradientBuffers
+from splatpipe.pipeline.raster.gradients import GradientBuffers, add_gradients, can_wait
 from splatpipe.pipeline.raster.isa import _native
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+
+_LOGITS = PARAMETERS.index("opacity_logits")
+
+
+@dataclass(frozen=True, eq=False)
+class UnfinishedRender:
+    """A backward pass that stopped at the screen.
+
+    Attributes:
+        frame: That was rendered, with what each of its Gaussians has there.
+        parameters: What was rendered, in the order of ``PARAMETERS``.
+        visible: The Gaussians that it showed.
+        probe: Gets its gradient when the pass is finished.
+        logits_are_leaf: False where a function of the model's logits was rendered; those have the derivative of the
+            rendered ones by them for a gradient, until the pass is finished.
+    """
+
+    frame: _native.Frame
+    parameters: tuple[Tensor, ...]
+    visible: Bool[Tensor, " n"]
+    probe: Float[Tensor, "n 2"] | None
+    logits_are_leaf: bool
+
+    def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
+        """Whether a step can be made with it at once: of what was seen of the render, and by no other gradient."""
+        if tuple(parameters) != PARAMETERS or visible is None or visible.data_ptr() != self.visible.data_ptr():
+            return False
+        rendered = dict(zip(PARAMETERS, self.parameters, strict=True))
+        stepped = [name for name in PARAMETERS if self.logits_are_leaf or name != "opacity_logits"]
+        same = all(parameters[name].data_ptr() == rendered[name].data_ptr() for name in stepped)
+        return same and all(parameters[name].grad is None for name in stepped)
+
+    def step(
+        self,
+        values: Mapping[str, Tensor],
+        moments: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
+        rates: Mapping[str, Tensor],
+        options: tuple[float, float, float, int],
+        log_scale_limits: tuple[float, float],
+    ) -> int:
+        """Finish the pass and step the visible rows of the parameters; the probe gets its gradient.
+
+        Args:
+            values: The parameters.
+            moments: Adam's, the first and the second.
+            rates: Of every value of a row.
+            options: As of ``_native.adam_step``.
+            log_scale_limits: The scales of these rows are held within them.
+
+        Returns:
+            How many rows were left out for their gradients.
+        """
+        means2d = None if self.probe is None else torch.zeros(self.probe.shape)
+        skipped = self.frame.step(
+            self.parameters,
+            [values[name].detach() for name in PARAMETERS],
+            [moments[0][name] for name in PARAMETERS],
+            [moments[1][name] for name in PARAMETERS],
+            [rates[name] for name in PARAMETERS],
+            options,
+            log_scale_limits,
+            None if self.logits_are_leaf else values["opacity_logits"].grad,
+            means2d,
+        )
+        if self.probe is not None:
+            self.probe.grad = means2d
+        return skipped
+
+    def finish(self, parameters: Mapping[str, Tensor]) -> None:
+        """Finish the pass: add what it gives to the parameters' gradients, as any backward pass does."""
+        gradients, means2d = _project_backward(self.frame, self.parameters)
+        add_gradients(parameters, gradients, self.logits_are_leaf)
+        if self.probe is not None:
+            self.probe.grad = means2d
 
 
 def render_native(
@@ -47,10 +123,10 @@ class _Rasterize(torch.autograd.Function):
         camera: Camera,
         options: RenderOptions,
         buffers: GradientBuffers | None,
-        _means2d_probe: Tensor | None,
-        *parameters: Tensor,
+        probe: Tensor | None,
+        *leaves: Tensor,
     ) -> tuple[Tensor, ...]:
-        parameters = tuple(tensor.detach().contiguous() for tensor in parameters)
+        parameters = tuple(tensor.detach().contiguous() for tensor in leaves)
         n, h, w = len(parameters[0]), camera.height, camera.width
         colour = torch.empty(h, w, 3)
         alpha = torch.empty(h, w)
@@ -76,9 +152,9 @@ class _Rasterize(torch.autograd.Function):
             median_depth, visible, radii, *(() if options.depth else (depth_sum, depth_square_sum))
         )
         if any(ctx.needs_input_grad):
-            ctx.frame = frame
+            ctx.frame, ctx.visible, ctx.buffers, ctx.probe = frame, visible, buffers, probe
             ctx.magnitudes = options.magnitudes
-            ctx.buffers = buffers
+            ctx.leaves = [tensor.is_leaf for tensor in leaves]
             ctx.save_for_backward(*parameters)
         return colour, alpha, depth_sum, depth_square_sum, median_depth, visible, radii
 
@@ -94,17 +170,30 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         upstream = (colour, alpha, depth_sum, depth_square_sum)
         pictures = tuple(None if grad is None else grad.contiguous() for grad in upstream)
-        parameters = ctx.saved_tensors
-        # New memory a pass where none was given: a second pass must not write over the gradients of the first.
-        gradients = (ctx.buffers or GradientBuffers()).like(parameters)
-        means2d = torch.empty(len(parameters[0]), 2)
+        parameters = ctx.saved_tensors  # raises where one was changed since
+        wanted = ctx.needs_input_grad[3:]
         try:
-            ctx.frame.backward(parameters, pictures, gradients, means2d, ctx.magnitudes)
+            ctx.frame.blend_backward(pictures, ctx.magnitudes)
         except MemoryError as error:
             _refuse(error, len(parameters[0]))
-        wanted = ctx.needs_input_grad[3:]
+        if ctx.buffers is not None and can_wait(wanted[1:], ctx.leaves, ctx.probe):
+            is_leaf = ctx.leaves[_LOGITS]
+            gain = None if is_leaf else torch.ones_like(parameters[_LOGITS])
+            ctx.buffers.unfinished = UnfinishedRender(ctx.frame, parameters, ctx.visible, ctx.probe, is_leaf)
+            return (None,) * 4 + tuple({"opacity_logits": gain}.get(name) for name in PARAMETERS)
+        gradients, means2d = _project_backward(ctx.frame, parameters)
         asked = (grad if needs else None for grad, needs in zip((means2d, *gradients), wanted, strict=True))
         return (None, None, None, *asked)
+
+
+def _project_backward(
+    frame: _native.Frame, parameters: Sequence[Tensor]
+) -> tuple[tuple[Tensor, ...], Float[Tensor, "n 2"]]:
+    """From what a frame has on the screen to the gradients of its parameters, and of the centres there."""
+    gradients = tuple(torch.empty_like(tensor) for tensor in parameters)
+    means2d = torch.empty(len(parameters[0]), 2)
+    frame.project_backward(parameters, gradients, means2d)
+    return gradients, means2d
 
 
 def _refuse(error: Exception, gaussians: int) -> NoReturn:

@@ -25,7 +25,7 @@ from splatpipe.pipeline.raster.cuda_api import (
 )
 from splatpipe.pipeline.raster.cuda_forecast import FrameSize
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
-from splatpipe.pipeline.raster.gradients import GradientBuffers
+from splatpipe.pipeline.raster.gradients import GradientBuffers, add_gradients, can_wait
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 
 TILE_PX = 16  # a tile's side
@@ -183,13 +183,7 @@ class UnfinishedBackward:
     def finish(self, parameters: Mapping[str, Tensor]) -> None:
         """Finish the pass: add what it gives to the parameters' gradients, as any backward pass does."""
         gradients, means2d = self.frame.project_backward(self.back)
-        for name, gradient in zip(PARAMETERS, gradients, strict=True):
-            before = parameters[name].grad
-            if name == "opacity_logits" and not self.logits_are_leaf:
-                assert before is not None
-                parameters[name].grad = gradient * before
-            else:
-                parameters[name].grad = gradient if before is None else before + gradient
+        add_gradients(parameters, gradients, self.logits_are_leaf)
         if self.probe is not None:
             self.probe.grad = means2d
 
@@ -271,7 +265,7 @@ class _Rasterize(torch.autograd.Function):
         wanted = ctx.needs_input_grad[4:]
         upstream = (colour, alpha, depth_sum, depth_square_sum)
         back = frame.blend_backward([None if grad is None else grad.contiguous() for grad in upstream])
-        if ctx.buffers is not None and _can_wait(wanted[1:], ctx.leaves, ctx.probe):
+        if ctx.buffers is not None and can_wait(wanted[1:], ctx.leaves, ctx.probe):
             logits_are_leaf = ctx.leaves[PARAMETERS.index("opacity_logits")]
             means2d = None if ctx.probe is None else torch.empty_like(ctx.probe)
             gain = None if logits_are_leaf else torch.ones_like(frame.parameters[PARAMETERS.index("opacity_logits")])
@@ -281,12 +275,6 @@ class _Rasterize(torch.autograd.Function):
         gradients, means2d = frame.project_backward(back)
         asked = (grad if needs else None for grad, needs in zip((means2d, *gradients), wanted, strict=True))
         return (None, None, None, None, *asked)
-
-
-def _can_wait(wanted: Sequence[bool], leaves: Sequence[bool], probe: Tensor | None) -> bool:
-    """Whether the parameters' gradients can be left to the optimiser: all are the model's own, but for the logits."""
-    own = (leaf for name, leaf in zip(PARAMETERS, leaves, strict=True) if name != "opacity_logits")
-    return all(wanted) and all(own) and (probe is None or probe.is_leaf)
 
 
 def shot_of(camera: Camera, options: RenderOptions, sh_count: int) -> SplatShot:

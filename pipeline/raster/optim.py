@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from splatpipe.pipeline.raster.autograd import UnfinishedRender
 from splatpipe.pipeline.raster.cuda import AdamRows, kernels_of
 from splatpipe.pipeline.raster.cuda_api import SplatStep
 from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward
@@ -64,6 +65,7 @@ class Adam:
         self.mean = {name: _zeros(tensor.shape, tensor.device) for name, tensor in parameters.items()}
         self.square = {name: _zeros(tensor.shape, tensor.device) for name, tensor in parameters.items()}
         self._skipped = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._held: Limits | None = None  # within these all rows are: those that nobody steps stay so
 
     def __len__(self) -> int:
         return next((tensor.shape[0] for tensor in self.mean.values()), 0)
@@ -107,12 +109,18 @@ class Adam:
         if unfinished is not None and not fuses:
             unfinished.finish(parameters)  # before anything is changed: it wants memory
         self.step_count += 1
-        if unfinished is not None and fuses:
+        if isinstance(unfinished, UnfinishedBackward) and fuses:
             self._step_fused(parameters, rates, unfinished, visible is not None, limits)
             return
-        self._step_rows(parameters, rates, visible)
-        for name, (least, most) in (limits or {}).items():
-            parameters[name].detach().clamp_(least, most)
+        if isinstance(unfinished, UnfinishedRender) and fuses:
+            self._step_seen(parameters, rates, unfinished, limits)
+        else:
+            self._step_rows(parameters, rates, visible)
+            self._held = None
+        if self._held != limits:
+            for name, (least, most) in (limits or {}).items():
+                parameters[name].detach().clamp_(least, most)
+            self._held = limits
 
     def take_skipped(self) -> int:
         """How many visible rows were left out for their gradients since this was last asked; waits for the device."""
@@ -140,6 +148,22 @@ class Adam:
         else:
             moments = (rows.means, rows.squares)
             self._skipped += _native.adam_step(rows.values, rows.gradients, *moments, rows.rates, rows.visible, options)
+
+    def _step_seen(
+        self,
+        parameters: Mapping[str, Tensor],
+        rates: Mapping[str, Rate],
+        unfinished: UnfinishedRender,
+        limits: Limits | None,
+    ) -> None:
+        """Finish a backward pass of the CPU and step what it showed at once."""
+        self._skipped += unfinished.step(
+            parameters,
+            (self.mean, self.square),
+            {name: _columns(rates[name], parameters[name]) for name in PARAMETERS},
+            (*self.betas, self.epsilon, self.step_count),
+            (limits or {}).get("log_scales", (-math.inf, math.inf)),
+        )
 
     def _step_fused(
         self,
@@ -191,11 +215,13 @@ class Adam:
 
     def select(self, index: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> None:
         """Keep the rows of an index or a mask, in its order; one tensor after the other, for memory is tight."""
+        self._held = None
         for moments in (self.mean, self.square):
             take_rows(moments, index)
 
     def append(self, count: int) -> None:
         """Add rows of zero moments."""
+        self._held = None
         self._each(lambda tensor: torch.cat([tensor, _zeros((count, *tensor.shape[1:]), tensor.device)]))
 
     def zero_state(
@@ -232,7 +258,7 @@ class Adam:
             given.append(moments)
         if len({tensor.shape[0] for part in given for tensor in part.values()}) > 1 or _STEP not in state:
             raise ValueError("the state's moments differ in their number of rows, or its step is missing")
-        device = self.device
+        device, self._held = self.device, None
         for moments, part in zip((self.mean, self.square), given, strict=True):
             for name, tensor in part.items():
                 moments[name] = _zeros((0,), device)  # frees the old ones first: a device may not hold both

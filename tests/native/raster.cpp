@@ -81,6 +81,43 @@ void a_frame_is_used_again() {
         }
 }
 
+// Beside the picture, before the near plane, far from the origin: the cheap test rules out nothing that is visible.
+void candidates_are_all_that_is_visible() {
+    const splat::ProjectKernels& kernels = SPLAT_KERNELS(project_kernels);
+    for (const float log_scale : {-6.0f, -3.0f, -1.0f, 1.0f, 4.0f})
+        for (std::uint64_t seed = 0; seed < 12; ++seed) {
+            const float far = seed % 3 == 0 ? 0.0f : seed % 3 == 1 ? 300.0f : 1e5f;
+            Scene scene = seed % 4 == 3 ? hostile_scene(seed, 2001, 1) : random_scene(seed, 2001, 1, log_scale);
+            splat::View view = view_of(70 + 40 * static_cast<int>(seed % 2), 33, 1, {0, seed % 2 == 0});
+            for (std::size_t i = 0; i < scene.means.size(); ++i) scene.means[i] += far;
+            for (int row = 0; row < 3; ++row)
+                for (int axis = 0; axis < 3; ++axis) view.translation[row] -= view.rotation[3 * row + axis] * far;
+            const splat::Parameters in = scene.parameters();
+            const std::size_t n = static_cast<std::size_t>(in.count);
+            std::vector<std::int32_t> all(n), found(n);
+            for (std::size_t i = 0; i < n; ++i) all[i] = static_cast<std::int32_t>(i);
+            std::vector<splat::Splat> splats(n);
+            std::vector<std::uint32_t> keys(n);
+            std::vector<splat::Touched> touched(n + 1);
+            std::vector<float> radii(n);
+            std::vector<std::uint8_t> visible(n), kept(n);
+            splat::FrameData frame{};
+            frame.rows = all.data(), frame.splats = splats.data(), frame.keys = keys.data();
+            frame.touched = touched.data();
+            kernels.project(view, in, 0, in.count, frame, radii.data(), visible.data());
+            const std::int64_t count = kernels.find_candidates(view, in, 0, in.count, found.data());
+            for (std::int64_t i = 0; i < count; ++i)
+                kept[static_cast<std::size_t>(found[static_cast<std::size_t>(i)])] = 1;
+            std::int64_t seen = 0;
+            for (std::size_t i = 0; i < n; ++i) {
+                check(kept[i] || !visible[i], "row " + std::to_string(i) + " of scene " + std::to_string(seed));
+                seen += visible[i];
+            }
+            const std::string what = std::to_string(count) + " candidates for " + std::to_string(seen);
+            if (seed % 4 != 3 && far == 0.0f && log_scale < 0.0f) check(count < 1.3 * seen + 50, what);
+        }
+}
+
 // Threads that render, each with a borrowed frame, while another one changes the number of threads.
 void renders_at_once() {
     splat::set_threads(2);
@@ -128,6 +165,7 @@ void test_raster() {
     test_each_isa("any number of Gaussians", counts);
     test_each_isa("opaque layers, huge and tiny splats", opaque_layers_and_huge_splats);
     test_each_isa("many Gaussians", many_gaussians);
+    test_each_isa("candidates are all that is visible", candidates_are_all_that_is_visible);
     test_each_isa("a frame is used again", a_frame_is_used_again);
     test_each_isa("renders at once", renders_at_once);
     test("frames are borrowed and returned anywhere", frames_are_borrowed_and_returned_anywhere);

@@ -130,16 +130,13 @@ Outcome evaluate(splat::RasterFrame& frame, const Scene& scene, const splat::Vie
     out.sh = blank(scene.sh.size()), out.means2d = blank(2 * n), out.magnitudes = blank(2 * n);
     const splat::PictureGradients pictures = {colour.data(), alpha.data(), depth ? depth_sum.data() : nullptr,
                                               depth ? squares.data() : nullptr};
-    splat::ParameterGradients gradients = {out.means.data(),
-                                           out.log_scales.data(),
-                                           out.quats.data(),
-                                           out.opacity_logits.data(),
-                                           out.sh.data(),
-                                           out.magnitudes.data(),
-                                           true};
-    frame.backward(scene.parameters(), pictures, gradients);
-    gradients.means2d = out.means2d.data(), gradients.magnitudes = false;
-    frame.backward(scene.parameters(), pictures, gradients);
+    splat::ParameterGradients gradients = {out.means.data(),          out.log_scales.data(), out.quats.data(),
+                                           out.opacity_logits.data(), out.sh.data(),         out.magnitudes.data()};
+    frame.blend_backward(pictures, true);
+    frame.project_backward(scene.parameters(), gradients);
+    gradients.means2d = out.means2d.data();
+    frame.blend_backward(pictures, false);
+    frame.project_backward(scene.parameters(), gradients);
     return out;
 }
 

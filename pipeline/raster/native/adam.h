@@ -36,6 +36,9 @@ struct AdamKernels {
     // Steps rows [from, to), at most kAdamTaskRows; a row with a gradient that is not finite is left as it is.
     // Returns how many of those there were.
     std::int64_t (*rows)(const AdamJob& job, std::int64_t from, std::int64_t to);
+    // The same for `count` rows, wherever they lie, -1 for one to leave out. gradients[t]: theirs of each tensor, one
+    // behind the other, instead of the job's; read to whole vectors.
+    std::int64_t (*some)(const AdamJob& job, const std::int32_t* rows, int count, const float* const* gradients);
 };
 
 }  // namespace splat

@@ -130,8 +130,83 @@ std::int64_t adam_rows(const AdamJob& job, std::int64_t from, std::int64_t to) {
     return skipped;
 }
 
+// Rows of one tensor that lie apart, at most kAdamBlock of them: each by itself where it is whole vectors, else through
+// a copy of all.
+void step_apart(const AdamTensor& tensor, const float* gradient, const std::int32_t* rows, int count,
+                const AdamConstants& c, unsigned stepping) {
+    const int width = tensor.width;
+    if (width % kLanes == 0) {
+        for (int i = 0; i < count; ++i) {
+            if (!(stepping >> i & 1u)) continue;
+            const std::int64_t at = std::int64_t{rows[i]} * width;
+            const Block row{tensor.values + at, tensor.mean + at, tensor.square + at, gradient + i * width,
+                            tensor.rates};
+            for (int j = 0; j < width; j += kLanes) step_lanes(row, j, c, nullptr);
+        }
+        return;
+    }
+    constexpr int kRoom = kAdamBlock * kAdamWidth;
+    float values[kRoom], mean[kRoom], square[kRoom];
+    const auto copy = [width](float* to, const float* from) {
+        __builtin_memcpy(to, from, static_cast<std::size_t>(width) * sizeof(float));
+    };
+    for (int i = 0; i < count; ++i) {
+        const std::int64_t at = std::int64_t{rows[i] < 0 ? 0 : rows[i]} * width;
+        copy(values + i * width, tensor.values + at), copy(mean + i * width, tensor.mean + at);
+        copy(square + i * width, tensor.square + at);
+    }
+    const Block block{values, mean, square, gradient, tensor.rates};
+    for (int j = 0; j < count * width; j += kLanes) step_lanes(block, j, c, nullptr);
+    for (int i = 0; i < count; ++i) {
+        if (!(stepping >> i & 1u)) continue;
+        const std::int64_t at = std::int64_t{rows[i]} * width;
+        copy(tensor.values + at, values + i * width), copy(tensor.mean + at, mean + i * width);
+        copy(tensor.square + at, square + i * width);
+    }
+}
+
+// Which of at most kAdamBlock rows that lie apart step, as bits; counts those that would but for their gradients.
+unsigned stepping_apart(const AdamJob& job, const std::int32_t* rows, int count, const float* const* gradients,
+                        std::int64_t* skipped) {
+    unsigned stepping = 0;
+    for (int i = 0; i < count; ++i) {
+        if (rows[i] < 0) continue;
+        bool finite = true;
+        for (int t = 0; t < job.tensor_count; ++t) {
+            const int width = job.tensors[t].width;
+            finite = finite && all_finite(gradients[t] + i * width, width);
+        }
+        stepping |= unsigned(finite) << i;
+        *skipped += !finite;
+    }
+    return stepping;
+}
+
+std::int64_t adam_some(const AdamJob& job, const std::int32_t* rows, int count, const float* const* gradients) {
+    const AdamConstants c = adam_constants(job.beta1, job.beta2, job.epsilon, job.inverse_root_correction);
+    std::int64_t skipped = 0;
+    for (int from = 0; from < count; from += kAdamBlock) {
+        const int here = count - from < kAdamBlock ? count - from : kAdamBlock;
+        const float* of[kAdamTensors];
+        for (int t = 0; t < job.tensor_count; ++t) of[t] = gradients[t] + from * job.tensors[t].width;
+        const unsigned stepping = stepping_apart(job, rows + from, here, of, &skipped);
+        const bool is_block =
+            here == kAdamBlock && stepping == kAllRows && rows[from + kAdamBlock - 1] - rows[from] == kAdamBlock - 1;
+        for (int t = 0; t < job.tensor_count && stepping; ++t) {
+            const AdamTensor& tensor = job.tensors[t];
+            const std::int64_t at = std::int64_t{rows[from]} * tensor.width;
+            if (is_block)
+                step_block({tensor.values + at, tensor.mean + at, tensor.square + at, of[t], tensor.rates}, tensor, c,
+                           stepping);
+            else
+                step_apart(tensor, of[t], rows + from, here, c, stepping);
+        }
+    }
+    return skipped;
+}
+
 }  // namespace
 
-extern const AdamKernels adam_kernels = {adam_rows};
+extern const AdamKernels adam_kernels = {adam_rows, adam_some};
 
 }  // namespace splat::SPLAT_ISA_NAMESPACE

@@ -11,6 +11,8 @@
 #include <memory>
 #include <optional>
 #include <tuple>
+#include <type_traits>
+#include <vector>
 
 #include "raster_cpu.h"
 #include "view.h"
@@ -46,6 +48,10 @@ using OutputArrays = std::tuple<Cube<float>, Grid<float>, std::optional<DepthArr
 // colour, alpha, depth_sum, depth_square_sum
 using PictureGradientArrays = std::tuple<std::optional<Cube<const float>>, std::optional<Grid<const float>>,
                                          std::optional<Grid<const float>>, std::optional<Grid<const float>>>;
+// of each parameter, the rate of every value of a row
+using RateArrays = std::array<Line<const float>, 5>;
+// beta1, beta2, epsilon; the step, from 1
+using AdamTuple = std::tuple<double, double, double, int64_t>;
 
 template <class T>
 T* checked(const Grid<T>& array, size_t rows, size_t columns, const char* name) {
@@ -96,6 +102,28 @@ splat::View view_of(const CameraTuple& camera, const std::optional<WindowArray>&
     return view;
 }
 
+splat::AdamRows adam_rows_of(float* values, float* mean, float* square, const Line<const float>& rates, size_t width) {
+    return {values, nullptr, mean, square, checked(rates, width, "rates"), static_cast<int>(width)};
+}
+
+std::vector<splat::AdamRows> adam_rows(const ParameterArrays<float>& values, const ParameterArrays<float>& means,
+                                       const ParameterArrays<float>& squares, const RateArrays& rates, size_t n,
+                                       size_t sh_count) {
+    const auto grid = [&](auto which, size_t width) {
+        constexpr size_t k = decltype(which)::value;
+        return adam_rows_of(checked(std::get<k>(values), n, width, "values"),
+                            checked(std::get<k>(means), n, width, "means"),
+                            checked(std::get<k>(squares), n, width, "squares"), rates[k], width);
+    };
+    return {grid(std::integral_constant<size_t, 0>{}, 3), grid(std::integral_constant<size_t, 1>{}, 3),
+            grid(std::integral_constant<size_t, 2>{}, 4),
+            adam_rows_of(checked(std::get<3>(values), n, "values"), checked(std::get<3>(means), n, "means"),
+                         checked(std::get<3>(squares), n, "squares"), rates[3], 1),
+            adam_rows_of(checked(std::get<4>(values), n, sh_count, "values"),
+                         checked(std::get<4>(means), n, sh_count, "means"),
+                         checked(std::get<4>(squares), n, sh_count, "squares"), rates[4], 3 * sh_count)};
+}
+
 // A render and what its backward pass needs.
 class Frame {
   public:
@@ -116,45 +144,81 @@ class Frame {
         float* radii_out = checked(radii, n, "radii");
         uint8_t* visible_out = checked(visible, n, "visible");
         nb::gil_scoped_release release;
-        count_ = -1;
+        count_ = -1, is_blended_back_ = false;
         frame_->forward(view_, in, out, radii_out, visible_out);
         count_ = in.count;
     }
 
-    void backward(const ParameterArrays<const float>& arrays, const PictureGradientArrays& gradients,
-                  const ParameterArrays<float>& outputs, const Grid<float>& means2d, bool magnitudes) {
-        const splat::Parameters in = parameters_of(arrays);
-        const size_t n = in.count, k = view_.sh_count, h = view_.height, w = view_.width;
-        if (in.count != count_ || std::get<4>(arrays).shape(1) != k)
-            throw nb::value_error("not what forward() rendered");
+    void blend_backward(const PictureGradientArrays& gradients, bool magnitudes) {
+        require_render();
+        const size_t h = view_.height, w = view_.width;
         const auto& [colour, alpha, depth_sum, depth_square_sum] = gradients;
         const splat::PictureGradients pictures = {
             colour ? checked(*colour, h, w, "colour") : nullptr, alpha ? checked(*alpha, h, w, "alpha") : nullptr,
             depth_sum ? checked(*depth_sum, h, w, "depth_sum") : nullptr,
             depth_square_sum ? checked(*depth_square_sum, h, w, "depth_square_sum") : nullptr};
-        const auto& [means, log_scales, quats, opacity_logits, sh] = outputs;
-        const splat::ParameterGradients out = {checked(means, n, 3, "means"),
-                                               checked(log_scales, n, 3, "log_scales"),
-                                               checked(quats, n, 4, "quats"),
-                                               checked(opacity_logits, n, "opacity_logits"),
-                                               checked(sh, n, k, "sh"),
-                                               checked(means2d, n, 2, "means2d"),
-                                               magnitudes};
         nb::gil_scoped_release release;
-        frame_->backward(in, pictures, out);
+        is_blended_back_ = false;
+        frame_->blend_backward(pictures, magnitudes);
+        is_blended_back_ = true;
+    }
+
+    void project_backward(const ParameterArrays<const float>& arrays, const ParameterArrays<float>& outputs,
+                          const Grid<float>& means2d) {
+        const splat::Parameters in = rendered(arrays);
+        const size_t n = in.count;
+        const auto& [means, log_scales, quats, opacity_logits, sh] = outputs;
+        const splat::ParameterGradients out = {
+            checked(means, n, 3, "means"),        checked(log_scales, n, 3, "log_scales"),
+            checked(quats, n, 4, "quats"),        checked(opacity_logits, n, "opacity_logits"),
+            checked(sh, n, view_.sh_count, "sh"), checked(means2d, n, 2, "means2d")};
+        nb::gil_scoped_release release;
+        frame_->project_backward(in, out);
+    }
+
+    int64_t step(const ParameterArrays<const float>& arrays, const ParameterArrays<float>& values,
+                 const ParameterArrays<float>& means, const ParameterArrays<float>& squares, const RateArrays& rates,
+                 const AdamTuple& options, const std::array<float, 2>& limits,
+                 const std::optional<Line<const float>>& logit_gain, const std::optional<Grid<float>>& means2d) {
+        const splat::Parameters in = rendered(arrays);
+        const size_t n = in.count;
+        splat::FrameStep step{};
+        step.tensors = adam_rows(values, means, squares, rates, n, view_.sh_count);
+        const auto [beta1, beta2, epsilon, number] = options;
+        step.options = {beta1, beta2, epsilon, number};
+        if (!splat::are_adam_options(step.options)) throw nb::value_error("options");
+        step.log_scale_min = limits[0], step.log_scale_max = limits[1];
+        step.logit_gain = logit_gain ? checked(*logit_gain, n, "logit_gain") : nullptr;
+        step.means2d = means2d ? checked(*means2d, n, 2, "means2d") : nullptr;
+        nb::gil_scoped_release release;
+        is_blended_back_ = false;  // the parameters are others now
+        return frame_->step(in, step);
     }
 
     int64_t pairs() const { return frame_->pairs(); }
 
     int64_t contributing_pairs() const {
-        if (count_ < 0) throw nb::value_error("nothing is rendered yet");
+        require_render();
         return frame_->contributions();
     }
 
   private:
+    void require_render() const {
+        if (count_ < 0) throw nb::value_error("nothing is rendered yet");
+    }
+
+    // What forward() rendered and blend_backward() carried back to the screen.
+    splat::Parameters rendered(const ParameterArrays<const float>& arrays) const {
+        const splat::Parameters in = parameters_of(arrays);
+        if (!is_blended_back_ || in.count != count_ || std::get<4>(arrays).shape(1) != size_t(view_.sh_count))
+            throw nb::value_error("not what forward() rendered");
+        return in;
+    }
+
     std::shared_ptr<splat::RasterFrame> frame_ = splat::borrow_frame();
     splat::View view_{};
     int64_t count_ = -1;  // Gaussians of the render it holds, or none
+    bool is_blended_back_ = false;
 };
 
 }  // namespace
@@ -165,8 +229,12 @@ void bind_raster(nb::module_& m) {
         .def(nb::init<>())
         .def("forward", &Frame::forward, nb::arg("parameters").noconvert(), nb::arg("camera").noconvert(), "options"_a,
              nb::arg("outputs").noconvert(), "window"_a = nb::none())
-        .def("backward", &Frame::backward, nb::arg("parameters").noconvert(), nb::arg("gradients").noconvert(),
-             nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert(), "magnitudes"_a = false)
+        .def("blend_backward", &Frame::blend_backward, nb::arg("gradients").noconvert(), "magnitudes"_a = false)
+        .def("project_backward", &Frame::project_backward, nb::arg("parameters").noconvert(),
+             nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert())
+        .def("step", &Frame::step, nb::arg("parameters").noconvert(), nb::arg("values").noconvert(),
+             nb::arg("means").noconvert(), nb::arg("squares").noconvert(), nb::arg("rates").noconvert(), "options"_a,
+             "log_scale_limits"_a, nb::arg("logit_gain").noconvert().none(), nb::arg("means2d").noconvert().none())
         .def_prop_ro("pairs", &Frame::pairs)
         .def("contributing_pairs", &Frame::contributing_pairs, nb::call_guard<nb::gil_scoped_release>());
 }

@@ -1,6 +1,7 @@
 // What the rasterizer's kernels (compiled per ISA) and its driver (raster_cpu.cpp) share. Plain structs, no std.
 //
-// Names: a Gaussian is one in space, a splat its image on the screen. A pair is a splat in a tile it touches; a slot is
+// Names: a Gaussian is one in space, a splat its image on the screen. Candidates are the Gaussians that a cheap test
+// does not rule out; whatever a frame keeps, it keeps of them alone. A pair is a splat in a tile it touches; a slot is
 // where the gradient of a pair goes. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
 #pragma once
 
@@ -57,12 +58,13 @@ struct Parameters {
     const float *means, *log_scales, *quats, *opacity_logits, *sh;
 };
 
-// Their gradients, laid out alike; every row is written.
+// Their gradients, laid out alike.
 struct ParameterGradients {
     float *means, *log_scales, *quats, *opacity_logits, *sh;
-    float* means2d;   // (n, 2), pixels
-    bool magnitudes;  // means2d is the sum of each pixel's |dL/d(mean2D)|, not of dL/d(mean2D)
+    float* means2d;  // (n, 2), pixels; with magnitudes the sum of each pixel's |dL/d(mean2D)|, not of dL/d(mean2D)
 };
+
+constexpr int kBackRows = 32;  // candidates whose gradients are made at a time, whole vectors: they stay in the cache
 
 // A Gaussian on the screen. In the whitened offset from its centre,
 //   u = a dx + b dy,   v = c dy,   alpha = 2^(log2_opacity - u^2 - v^2):
@@ -95,9 +97,10 @@ struct Touched {
 
 // Where a frame's results live; all of these are owned by the driver.
 struct FrameData {
-    Splat* splats;     // (n); meaningful where visible
-    uint32_t* keys;    // (n): bits of the depth, or kCulled
-    Touched* touched;  // (n + 1)
+    const int32_t* rows;  // (candidates): their Gaussians, ascending
+    Splat* splats;        // (candidates); meaningful where visible
+    uint32_t* keys;       // (candidates): bits of the depth, or kCulled
+    Touched* touched;     // (candidates + 1)
     Span* spans;
     int64_t* tile_begin;  // (tiles + 1): each tile's pairs, near to far
     int32_t* pair_splat;  // (pairs): index of the splat
@@ -120,15 +123,18 @@ struct PictureGradients {
 };
 
 struct ProjectKernels {
-    // Gaussians begin..end-1: fills splats, keys, rows of touched, radii and visible.
+    // Appends those of Gaussians begin..end-1 that may be visible to `rows`; returns how many.
+    int64_t (*find_candidates)(const View&, const Parameters&, int64_t begin, int64_t end, int32_t* rows);
+    // Candidates begin..end-1: fills splats, keys and rows of touched, and radii and visible of those that are.
     void (*project)(const View&, const Parameters&, int64_t begin, int64_t end, const FrameData&, float* radii,
                     uint8_t* visible);
     // The tiles that each splat touches in each of its tile rows, exactly, to the spans from `first_span` on. Returns
     // how many; slots are counted from 0.
     int64_t (*find_spans)(const View&, int64_t begin, int64_t end, const FrameData&, int64_t first_span);
-    // Sums the slots of Gaussians begin..end-1 and carries them back to the parameters.
+    // Sums the slots of candidates begin..end-1, at most kBackRows, and carries them back to the parameters: row by row
+    // from the first of `out`, which has room for whole vectors.
     void (*project_backward)(const View&, const Parameters&, int64_t begin, int64_t end, const FrameData&,
-                             const ParameterGradients&);
+                             bool magnitudes, const ParameterGradients& out);
 };
 
 struct BlendKernels {

@@ -6,15 +6,18 @@
 #include <utility>
 #include <vector>
 
+#include "adam_tables.h"
 #include "threads.h"
+#include "view.h"
 
 namespace splat {
 namespace {
 
-constexpr int64_t kGaussiansATask = 1024;  // of the projection: some 100 µs
-constexpr int64_t kSplatsAChunk = 4096;    // of the binning, at least: each chunk has a counter a tile
-constexpr int64_t kKeysAChunk = 8192;      // of the sort, at least: each chunk has 2048 counters
-constexpr int kAhead = 8;                  // splats fetched in advance
+constexpr int64_t kGaussiansATask = 8192;   // of the search for candidates: some 20 µs
+constexpr int64_t kCandidatesATask = 1024;  // of the projection: some 100 µs
+constexpr int64_t kSplatsAChunk = 4096;     // of the binning, at least: each chunk has a counter a tile
+constexpr int64_t kKeysAChunk = 8192;       // of the sort, at least: each chunk has 2048 counters
+constexpr int kAhead = 8;                   // splats fetched in advance
 constexpr int64_t kMaxPairs = std::numeric_limits<int32_t>::max();
 constexpr std::size_t kKeptFrames = 2;
 
@@ -22,12 +25,70 @@ int64_t divide_up(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
 int tile_count(const View& view) { return view.tiles_x * view.tiles_y; }
 
-// body(task, begin, end) in parallel for Gaussians begin..end-1.
+// body(task, begin, end) in parallel for begin..end-1, at most `size` of them a task.
 template <class Body>
-void for_tasks(int64_t count, const Body& body) {
-    parallel_for(divide_up(count, kGaussiansATask), [&](int64_t task) {
-        body(task, task * kGaussiansATask, std::min(count, (task + 1) * kGaussiansATask));
-    });
+void for_tasks(int64_t count, int64_t size, const Body& body) {
+    parallel_for(divide_up(count, size),
+                 [&](int64_t task) { body(task, task * size, std::min(count, (task + 1) * size)); });
+}
+
+// The gradients of a few candidates, row by row.
+struct BackRows {
+    float means[3 * kBackRows], log_scales[3 * kBackRows], quats[4 * kBackRows], opacity_logits[kBackRows];
+    float sh[3 * kMaxShCount * kBackRows], means2d[2 * kBackRows];
+
+    ParameterGradients gradients() { return {means, log_scales, quats, opacity_logits, sh, means2d}; }
+};
+
+// body(gradients, widths) of each of them and its floats a row.
+template <class Body>
+void for_gradients(const ParameterGradients& all, int sh_row, const Body& body) {
+    body(all.means, 3), body(all.log_scales, 3), body(all.quats, 4), body(all.opacity_logits, 1);
+    body(all.sh, sh_row), body(all.means2d, 2);
+}
+
+void zero_rows(const ParameterGradients& out, int sh_row, int64_t begin, int64_t end) {
+    for_gradients(out, sh_row, [&](float* to, int width) { std::fill(to + begin * width, to + end * width, 0.0f); });
+}
+
+void copy_row(const ParameterGradients& from, int64_t from_row, int sh_row, int64_t row, const ParameterGradients& to) {
+    const auto copy = [&](float* out, const float* in, int width) {
+        std::copy_n(in + from_row * width, width, out + row * width);
+    };
+    copy(to.means, from.means, 3), copy(to.log_scales, from.log_scales, 3), copy(to.quats, from.quats, 4);
+    copy(to.opacity_logits, from.opacity_logits, 1), copy(to.sh, from.sh, sh_row), copy(to.means2d, from.means2d, 2);
+}
+
+// What is between gradients and their step: those by the logits that were rendered, and what density control wants.
+void end_gradients(const FrameStep& step, const int32_t* rows, int count, BackRows* back) {
+    for (int i = 0; i < count; ++i) {
+        if (rows[i] < 0) continue;
+        if (step.logit_gain) back->opacity_logits[i] *= step.logit_gain[rows[i]];
+        if (step.means2d) std::copy_n(back->means2d + 2 * i, 2, step.means2d + 2 * int64_t{rows[i]});
+    }
+}
+
+void hold_scales(const FrameStep& step, const int32_t* rows, int count) {
+    float* const values = step.tensors[1].values;
+    for (int i = 0; i < count; ++i)
+        for (int axis = 0; axis < 3 && rows[i] >= 0; ++axis) {
+            float& value = values[3 * int64_t{rows[i]} + axis];  // a NaN stays one
+            value = value < step.log_scale_min ? step.log_scale_min : value;
+            value = value > step.log_scale_max ? step.log_scale_max : value;
+        }
+}
+
+// Rows that are stepped soon: a CPU does not foresee where they lie.
+void fetch_moments(const AdamJob& job, const int32_t* rows, int count) {
+    constexpr int kLineFloats = 16;
+    for (int t = 0; t < job.tensor_count; ++t) {
+        const AdamTensor& tensor = job.tensors[t];
+        for (int i = 0; i < count; ++i)
+            for (int f = 0; f < tensor.width; f += kLineFloats) {
+                __builtin_prefetch(tensor.mean + int64_t{rows[i]} * tensor.width + f, 1);
+                __builtin_prefetch(tensor.square + int64_t{rows[i]} * tensor.width + f, 1);
+            }
+    }
 }
 
 }  // namespace
@@ -38,23 +99,66 @@ void RasterFrame::forward(const View& view, const Parameters& in, const Pictures
     const int tiles = tile_count(view);
     data_.transmittance = transmittance_.reserve(int64_t{tiles} * kTilePixels);
     data_.pixel_end = pixel_end_.reserve(int64_t{tiles} * kTilePixels);
+    find_candidates(in, radii, visible);
     project(in, radii, visible);
-    find_tiles(in.count);
+    find_tiles();
     sort_by_depth();
     bin();
     data_.pair_blocks = pair_blocks_.reserve(pairs_ * blend_->mask_bytes);
     parallel_for(tiles, [&](int64_t tile) { blend_->blend_tile(view_, data_, static_cast<int>(tile), out); });
 }
 
-void RasterFrame::backward(const Parameters& in, const PictureGradients& gradients, const ParameterGradients& out) {
+void RasterFrame::blend_backward(const PictureGradients& gradients, bool magnitudes) {
+    magnitudes_ = magnitudes;
     data_.slot_floats = gradients.depth_sum || gradients.depth_square_sum ? kDepthSlotFloats : kSlotFloats;
     data_.slots = slots_.reserve(pairs_ * data_.slot_floats);
     parallel_for(tile_count(view_), [&](int64_t tile) {
-        blend_->blend_tile_backward(view_, data_, static_cast<int>(tile), gradients, out.magnitudes);
+        blend_->blend_tile_backward(view_, data_, static_cast<int>(tile), gradients, magnitudes);
     });
-    for_tasks(in.count, [&](int64_t, int64_t begin, int64_t end) {
-        project_->project_backward(view_, in, begin, end, data_, out);
+}
+
+void RasterFrame::project_backward(const Parameters& in, const ParameterGradients& out) {
+    const int sh_row = 3 * view_.sh_count;
+    if (candidates_ == 0) zero_rows(out, sh_row, 0, in.count);
+    for_tasks(candidates_, kCandidatesATask, [&](int64_t task, int64_t begin, int64_t end) {
+        BackRows back;
+        const ParameterGradients made = back.gradients();
+        int64_t next = task == 0 ? 0 : data_.rows[begin];  // row to be written
+        for (int64_t first = begin; first < end; first += kBackRows) {
+            const int64_t last = std::min(end, first + kBackRows);
+            project_->project_backward(view_, in, first, last, data_, magnitudes_, made);
+            for (int64_t i = first; i < last; ++i) {
+                const int64_t row = data_.rows[i];
+                zero_rows(out, sh_row, next, row);
+                copy_row(made, i - first, sh_row, row, out);
+                next = row + 1;
+            }
+        }
+        zero_rows(out, sh_row, next, end == candidates_ ? in.count : data_.rows[end]);
     });
+}
+
+int64_t RasterFrame::step(const Parameters& in, const FrameStep& step) {
+    const AdamTables adam(step.tensors, in.count, nullptr, step.options);
+    const AdamKernels& kernels = SPLAT_KERNELS(adam_kernels);
+    std::vector<int64_t> skipped(static_cast<std::size_t>(divide_up(candidates_, kCandidatesATask)));
+    for_tasks(candidates_, kCandidatesATask, [&](int64_t task, int64_t begin, int64_t end) {
+        BackRows back;
+        const float* gradients[] = {back.means, back.log_scales, back.quats, back.opacity_logits, back.sh};
+        for (int64_t first = begin; first < end; first += kBackRows) {
+            const int count = static_cast<int>(std::min(end - first, int64_t{kBackRows}));
+            fetch_moments(adam.job(), data_.rows + first, count);
+            project_->project_backward(view_, in, first, first + count, data_, magnitudes_, back.gradients());
+            int32_t rows[kBackRows];
+            for (int i = 0; i < count; ++i) rows[i] = data_.keys[first + i] == kCulled ? -1 : data_.rows[first + i];
+            end_gradients(step, rows, count, &back);
+            skipped[static_cast<std::size_t>(task)] += kernels.some(adam.job(), rows, count, gradients);
+            hold_scales(step, rows, count);
+        }
+    });
+    int64_t total = 0;
+    for (int64_t part : skipped) total += part;
+    return total;
 }
 
 int64_t RasterFrame::contributions() const {
@@ -63,12 +167,28 @@ int64_t RasterFrame::contributions() const {
     return count;
 }
 
+// The rows of Gaussians that may be visible, ascending; radii and visible say of all that they are not.
+void RasterFrame::find_candidates(const Parameters& in, float* radii, uint8_t* visible) {
+    const int64_t tasks = divide_up(in.count, kGaussiansATask);
+    int64_t* counts = found_counts_.reserve(tasks);
+    int32_t* found = found_rows_.reserve(in.count);
+    for_tasks(in.count, kGaussiansATask, [&](int64_t task, int64_t begin, int64_t end) {
+        counts[task] = project_->find_candidates(view_, in, begin, end, found + begin);
+        std::fill(radii + begin, radii + end, 0.0f), std::fill(visible + begin, visible + end, uint8_t{0});
+    });
+    candidates_ = 0;
+    for (int64_t task = 0; task < tasks; ++task) candidates_ += counts[task];
+    int32_t* rows = candidate_rows_.reserve(candidates_);
+    data_.rows = rows;
+    for (int64_t task = 0; task < tasks; ++task) rows = std::copy_n(found + task * kGaussiansATask, counts[task], rows);
+}
+
 void RasterFrame::project(const Parameters& in, float* radii, uint8_t* visible) {
-    data_.splats = splats_.reserve(in.count);
-    data_.keys = keys_.reserve(in.count);
-    data_.touched = touched_.reserve(in.count + 1);
-    TaskCounts* tasks = tasks_.reserve(divide_up(in.count, kGaussiansATask));
-    for_tasks(in.count, [&](int64_t task, int64_t begin, int64_t end) {
+    data_.splats = splats_.reserve(candidates_);
+    data_.keys = keys_.reserve(candidates_);
+    data_.touched = touched_.reserve(candidates_ + 1);
+    TaskCounts* tasks = tasks_.reserve(divide_up(candidates_, kCandidatesATask));
+    for_tasks(candidates_, kCandidatesATask, [&](int64_t task, int64_t begin, int64_t end) {
         project_->project(view_, in, begin, end, data_, radii, visible);
         TaskCounts counts{0, 0, 0};
         for (int64_t i = begin; i < end; ++i)
@@ -76,33 +196,33 @@ void RasterFrame::project(const Parameters& in, float* radii, uint8_t* visible) 
         tasks[task] = counts;
     });
     visible_ = rows_ = 0;
-    for (int64_t task = 0; task < divide_up(in.count, kGaussiansATask); ++task) {
+    for (int64_t task = 0; task < divide_up(candidates_, kCandidatesATask); ++task) {
         visible_ += std::exchange(tasks[task].visible, visible_);
         rows_ += std::exchange(tasks[task].rows, rows_);
     }
 }
 
-// Each splat's spans and slots, and the visible Gaussians in a row for the sort.
-void RasterFrame::find_tiles(int64_t count) {
+// Each splat's spans and slots, and the visible candidates in a row for the sort.
+void RasterFrame::find_tiles() {
     if (rows_ > kMaxPairs) throw TooManyPairs();
     TaskCounts* tasks = tasks_.data();
     data_.spans = spans_.reserve(rows_);
     uint32_t* keys = sort_keys_.reserve(2 * visible_);
     int32_t* order = sort_order_.reserve(2 * visible_);
-    for_tasks(count, [&](int64_t task, int64_t begin, int64_t end) {
+    for_tasks(candidates_, kCandidatesATask, [&](int64_t task, int64_t begin, int64_t end) {
         tasks[task].pairs = project_->find_spans(view_, begin, end, data_, tasks[task].rows);
         int64_t at = tasks[task].visible;
         for (int64_t i = begin; i < end; ++i)
             if (data_.keys[i] != kCulled) keys[at] = data_.keys[i], order[at++] = static_cast<int32_t>(i);
     });
     pairs_ = 0;
-    for (int64_t task = 0; task < divide_up(count, kGaussiansATask); ++task)
+    for (int64_t task = 0; task < divide_up(candidates_, kCandidatesATask); ++task)
         pairs_ += std::exchange(tasks[task].pairs, pairs_);
     if (pairs_ > kMaxPairs) throw TooManyPairs();
-    for_tasks(count, [&](int64_t task, int64_t begin, int64_t end) {
+    for_tasks(candidates_, kCandidatesATask, [&](int64_t task, int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) data_.touched[i].slots += static_cast<int32_t>(tasks[task].pairs);
     });
-    data_.touched[count].slots = static_cast<int32_t>(pairs_);
+    data_.touched[candidates_].slots = static_cast<int32_t>(pairs_);
 }
 
 // A stable radix sort: of splats at one depth, the one with the lower index is in front. Chunks are counted and placed

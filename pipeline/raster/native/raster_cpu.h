@@ -7,11 +7,13 @@
 #include <memory>
 #include <new>
 #include <stdexcept>
+#include <vector>
 
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
 
+#include "adam_step.h"
 #include "raster.h"
 
 #if defined(__SANITIZE_ADDRESS__)
@@ -66,14 +68,30 @@ class Buffer {
     int64_t capacity_ = 0;
 };
 
+// The step of the optimiser that a backward pass ends with.
+struct FrameStep {
+    std::vector<AdamRows> tensors;  // means, log_scales, quats, opacity_logits, sh, without gradients
+    AdamOptions options;
+    float log_scale_min, log_scale_max;  // of the rows that take part, afterwards
+    const float* logit_gain;             // (n,): of the rendered logits by those that are stepped; null: the same ones
+    float* means2d;                      // as of ParameterGradients, of the rows that take part; null: not wanted
+};
+
 // A view's rasterization, with what its backward pass needs. One render at a time.
 class RasterFrame {
   public:
     // Renders; every pointer in `out` is written. Throws TooManyPairs, std::bad_alloc.
     void forward(const View& view, const Parameters& in, const Pictures& out, float* radii, uint8_t* visible);
 
-    // Gradients of the last forward() call, whose parameters these must be. Can be repeated.
-    void backward(const Parameters& in, const PictureGradients& gradients, const ParameterGradients& out);
+    // From the pictures of the last forward() call to the screen.
+    void blend_backward(const PictureGradients& gradients, bool magnitudes);
+
+    // From there to the parameters, which must be those of the forward() call: every row is written. Can be repeated.
+    void project_backward(const Parameters& in, const ParameterGradients& out);
+
+    // The same, and at once a step of Adam of the visible rows; nothing else is touched. Returns how many were left out
+    // for their gradients.
+    int64_t step(const Parameters& in, const FrameStep& step);
 
     int64_t pairs() const { return pairs_; }
 
@@ -81,13 +99,14 @@ class RasterFrame {
     int64_t contributions() const;
 
   private:
-    // Of kGaussiansATask Gaussians; where their shares begin once they have been summed.
+    // Of kCandidatesATask candidates; where their shares begin once they have been summed.
     struct TaskCounts {
         int64_t visible, rows, pairs;
     };
 
+    void find_candidates(const Parameters& in, float* radii, uint8_t* visible);
     void project(const Parameters& in, float* radii, uint8_t* visible);
-    void find_tiles(int64_t count);
+    void find_tiles();
     void sort_by_depth();
     void bin();
     void prefix_tiles(int chunks, int tiles);
@@ -96,8 +115,11 @@ class RasterFrame {
     const BlendKernels* blend_ = nullptr;
     View view_{};
     FrameData data_{};
-    int64_t visible_ = 0, rows_ = 0, pairs_ = 0;
-    const int32_t* order_ = nullptr;  // visible Gaussians by depth
+    bool magnitudes_ = false;  // of the last blend_backward()
+    int64_t candidates_ = 0, visible_ = 0, rows_ = 0, pairs_ = 0;
+    const int32_t* order_ = nullptr;  // visible candidates by depth
+    Buffer<int64_t> found_counts_;
+    Buffer<int32_t> found_rows_, candidate_rows_;
     Buffer<Splat> splats_;
     Buffer<TaskCounts> tasks_;
     Buffer<Touched> touched_;

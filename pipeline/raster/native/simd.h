@@ -27,14 +27,6 @@ using Mask = __mmask16;
 SPLAT_INLINE Floats fill(float x) { return _mm512_set1_ps(x); }
 SPLAT_INLINE Floats load(const float* p) { return _mm512_loadu_ps(p); }
 SPLAT_INLINE void store(float* p, Floats v) { _mm512_storeu_ps(p, v); }
-// Past the caches, where p is aligned: for what is written whole and not read soon. `streamed` before others read it.
-SPLAT_INLINE void stream(float* p, Floats v) {
-    if ((reinterpret_cast<uintptr_t>(p) & (sizeof v - 1)) == 0)
-        _mm512_stream_ps(p, v);
-    else
-        store(p, v);
-}
-SPLAT_INLINE void streamed() { _mm_sfence(); }
 SPLAT_INLINE Floats fma(Floats a, Floats b, Floats c) { return _mm512_fmadd_ps(a, b, c); }    // ab + c
 SPLAT_INLINE Floats fnma(Floats a, Floats b, Floats c) { return _mm512_fnmadd_ps(a, b, c); }  // c - ab
 SPLAT_INLINE Floats min(Floats a, Floats b) { return _mm512_min_ps(a, b); }                   // b where either is NaN
@@ -284,8 +276,6 @@ SPLAT_INLINE bool any(Mask m) { return bits(m) != 0; }
 #endif
 
 #if !SPLAT_ISA_AVX512
-SPLAT_INLINE void stream(float* p, Floats v) { store(p, v); }
-SPLAT_INLINE void streamed() {}
 SPLAT_INLINE void store_rgb(float* p, Floats red, Floats green, Floats blue) {
     float r[kLanes], g[kLanes], b[kLanes];
     store(r, red), store(g, green), store(b, blue);
@@ -310,7 +300,7 @@ SPLAT_INLINE void store_columns(float* rows, int width, Floats* columns) {
     int column = 0;
     for (; column + kLanes <= width; column += kLanes) {
         transpose(columns + column);
-        for (int i = 0; i < kLanes; ++i) stream(rows + i * width + column, columns[column + i]);
+        for (int i = 0; i < kLanes; ++i) store(rows + i * width + column, columns[column + i]);
     }
     for (; column < width; ++column) {
         float lanes[kLanes];
