@@ -15,6 +15,7 @@ from splatpipe.pipeline.raster.cuda_api import SplatRectangle
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 from splatpipe.pipeline.raster.loss import Rectangle, photo_loss, photo_loss_reference
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.morton import morton_keys
 from splatpipe.pipeline.train.densify import _split_offsets
 from splatpipe.pipeline.train.draws import DROPOUT, SPLIT_POSITION, uniform
 from splatpipe.pipeline.train.dropout import dropped
@@ -290,6 +291,7 @@ def test_morton_keys_interleave_the_places_along_the_axes(kernels: Kernels) -> N
     box = (array.ctypes.data_as(ctypes.c_void_p) for array in (lowest, size))
     called(kernels, kernels.splat_morton, at(means), ctypes.c_int64(300), *box, at(keys))
 
+    assert torch.equal(keys, morton_keys(means, torch.from_numpy(lowest), torch.from_numpy(size)))
     cells = np.array([2**21 / 6.0, 2**21 / 2.5, 0.0], np.float32)
     places = np.nan_to_num((means.numpy() - lowest) * cells, nan=0.0).clip(0, 2**21 - 1).astype(int)
     for place, key in zip(places.tolist(), keys.tolist(), strict=True):

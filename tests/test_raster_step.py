@@ -62,7 +62,8 @@ def trained(start: Gaussians, fused: bool, dropout: bool = False, magnitudes: bo
         torch.stack([picture.square().mean() for picture in pictures if picture.requires_grad]).sum().backward()
         assert (scene.sh.grad is None) == fused
         optimizer.step(scene.tensors(), rates_of(scene), rendered.visible, buffers, LIMITS)
-        probes.append(probe.grad)
+        assert probe.grad.is_sparse == fused
+        probes.append(probe.grad.to_dense())
         for tensor in scene.tensors().values():
             tensor.grad = None
     return [*scene.tensors().values(), *optimizer.mean.values(), *optimizer.square.values(), *probes]
@@ -124,6 +125,29 @@ def test_what_cannot_be_fused_is_done_one_after_the_other(reason: str) -> None:
         rows = {"other rows": torch.arange(60) < 30, "all rows": None}.get(reason, rendered.visible)
         optimizer.step(scene.tensors(), rates_of(scene), rows, buffers)
         found.append([*scene.tensors().values(), *optimizer.mean.values()])
+    assert all(torch.equal(ours, right) for ours, right in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("dropout", [False, True], ids=("whole", "dropout"))
+def test_the_first_rows_alone_can_be_stepped(dropout: bool) -> None:
+    found, count = [], 330
+    for fused in (True, False):
+        whole = spread_scene(500, 3).requires_grad_()
+        scene, buffers = whole.detach().first(count), GradientBuffers() if fused else None
+        optimizer, probe = Adam(scene.tensors()), torch.zeros(1, 2).expand(500, 2).requires_grad_()
+        model = whole
+        if dropout:
+            model = replace(whole, opacity_logits=_Dropped.apply(whole.opacity_logits, torch.arange(500) % 4 > 0, 0.25))
+        rendered = render(model, WIDE, RenderOptions(3, depth=False), means2d_probe=probe, buffers=buffers)
+        rendered.colour.square().mean().backward()
+        for name, tensor in scene.tensors().items():
+            gradient = whole.tensors()[name].grad
+            tensor.grad = None if gradient is None else gradient[:count]
+        optimizer.step(scene.tensors(), rates_of(scene), rendered.visible[:count], buffers, LIMITS)
+        assert 0 < int(rendered.visible[:count].sum()) < int(rendered.visible.sum())
+        rows = probe.grad.to_dense()
+        assert not (fused and bool(rows[count:].any()))
+        found.append([*whole.tensors().values(), *optimizer.mean.values(), *optimizer.square.values(), rows[:count]])
     assert all(torch.equal(ours, right) for ours, right in zip(*found, strict=True))
 
 

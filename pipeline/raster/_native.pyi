@@ -81,20 +81,22 @@ class Frame:
         options: tuple[float, float, float, int],
         log_scale_limits: tuple[float, float],
         logit_gain: Tensor | None,
-        means2d: Tensor | None,
+        seen: tuple[Tensor, Tensor] | None,
     ) -> int:
         """The same, and a step of Adam of the visible rows at once; no others are touched.
 
         Args:
             parameters: Those that were rendered.
-            values: Those to step, the same or, of the logits, what the rendered ones were made from.
+            values: Those to step, the same or, of the logits, what the rendered ones were made from; or the first rows
+                of them alone.
             means: Adam's first moments.
             squares: The second ones.
             rates: As of ``adam_step``.
             options: The same.
             log_scale_limits: The stepped log-scales are held within them.
             logit_gain: The derivative of the rendered logits by those that are stepped; None where they are the same.
-            means2d: Written where visible: dL/d(centres on screen), pixels (n, 2); None where not wanted.
+            seen: Written: the rows that are stepped, ascending, int64 (visible,), and dL/d(their centres on screen),
+                pixels (visible, 2), from the first on; None where not wanted.
 
         Returns:
             Rows that were left out for their gradients.
@@ -103,6 +105,10 @@ class Frame:
     @property
     def pairs(self) -> int:
         """Splat-tile pairs of the render."""
+
+    @property
+    def visible(self) -> int:
+        """Gaussians that the render shows."""
 
     def contributing_pairs(self) -> int:
         """Pairs of a pixel and a splat blended into it; slow, for benchmarks."""

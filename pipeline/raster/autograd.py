@@ -42,7 +42,8 @@ class UnfinishedRender:
     logits_are_leaf: bool
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
-        """Whether a step can be made with it at once: of what was seen of the render, and by no other gradient."""
+        """Whether a step can be made with it at once: of what was seen of the render, or of its first rows, and by no
+        other gradient."""
         if tuple(parameters) != PARAMETERS or visible is None or visible.data_ptr() != self.visible.data_ptr():
             return False
         rendered = dict(zip(PARAMETERS, self.parameters, strict=True))
@@ -58,10 +59,10 @@ class UnfinishedRender:
         options: tuple[float, float, float, int],
         log_scale_limits: tuple[float, float],
     ) -> int:
-        """Finish the pass and step the visible rows of the parameters; the probe gets its gradient.
+        """Finish the pass and step the visible rows of the parameters; the probe gets its gradient, sparse.
 
         Args:
-            values: The parameters.
+            values: The parameters, or their first rows.
             moments: Adam's, the first and the second.
             rates: Of every value of a row.
             options: As of ``_native.adam_step``.
@@ -70,7 +71,8 @@ class UnfinishedRender:
         Returns:
             How many rows were left out for their gradients.
         """
-        means2d = None if self.probe is None else torch.zeros(self.probe.shape)
+        shown = self.frame.visible
+        seen = None if self.probe is None else (torch.empty(shown, dtype=torch.int64), torch.empty(shown, 2))
         skipped = self.frame.step(
             self.parameters,
             [values[name].detach() for name in PARAMETERS],
@@ -80,10 +82,15 @@ class UnfinishedRender:
             options,
             log_scale_limits,
             None if self.logits_are_leaf else values["opacity_logits"].grad,
-            means2d,
+            seen,
         )
-        if self.probe is not None:
-            self.probe.grad = means2d
+        if self.probe is not None and seen is not None:
+            stepped = int(self.visible[: len(values["means"])].sum())
+            rows, means2d = (each[:stepped] for each in seen)
+            shape = self.probe.shape
+            self.probe.grad = torch.sparse_coo_tensor(
+                rows[None], means2d, shape, is_coalesced=True, check_invariants=False
+            )
         return skipped
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:

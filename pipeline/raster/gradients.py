@@ -50,12 +50,12 @@ def add_gradients(parameters: Mapping[str, Tensor], gradients: Sequence[Tensor],
     """Add what a backward pass gives to the parameters' gradients.
 
     Args:
-        parameters: Changed.
+        parameters: Changed; what was rendered, or its first rows.
         gradients: In the order of ``PARAMETERS``.
         logits_are_leaf: False where the model's logits hold the derivative of the rendered ones for a gradient.
     """
     for name, gradient in zip(PARAMETERS, gradients, strict=True):
-        before = parameters[name].grad
+        before, gradient = parameters[name].grad, gradient[: len(parameters[name])]
         if name == "opacity_logits" and not logits_are_leaf:
             assert before is not None
             parameters[name].grad = gradient * before

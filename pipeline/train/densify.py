@@ -19,6 +19,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.morton import morton_keys
 from splatpipe.pipeline.train.draws import SPLIT_POSITION, normal
 
 MIN_AFTER_PRUNE = 1  # a model is never emptied: there would be nothing left to learn from
@@ -110,14 +111,17 @@ def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> Growth:
 def along_curve(growth: Growth) -> Growth:
     """The same rows in the order of their places on a Morton curve: what is near in space is near in memory.
 
-    On a CUDA device, where neighbouring threads then read neighbouring memory; on the CPU as they are.
+    Threads of a CUDA device then read neighbouring memory, and a CPU what a window shows, row after row.
     """
-    kernels = kernels_of(growth.means.device)
-    if kernels is None or len(growth.means) == 0:
+    if len(growth.means) == 0:
         return growth
     lowest = growth.means.amin(dim=0)
     size = growth.means.amax(dim=0) - lowest
-    keys = kernels.morton(growth.means, tuple(lowest.tolist()), tuple(size.tolist()))
+    kernels = kernels_of(growth.means.device)
+    if kernels is None:
+        keys = morton_keys(growth.means, lowest, size)
+    else:
+        keys = kernels.morton(growth.means, tuple(lowest.tolist()), tuple(size.tolist()))
     return growth.select(torch.argsort(keys, stable=True))
 
 
@@ -171,7 +175,22 @@ class DensityStatistics:
             width: Of the whole picture, pixels, times the part in its loss that the render has.
             height: The same.
         """
-        self.add(torch.hypot(gradient_px[:, 0] * (0.5 * width), gradient_px[:, 1] * (0.5 * height)), visible)
+        self.add(_in_ndc(gradient_px, width, height), visible)
+
+    def observe_rows(
+        self, rows: Int64[Tensor, " k"], gradient_px: Float[Tensor, "k 2"], width: float, height: float
+    ) -> None:
+        """The same of the Gaussians that the photo saw alone.
+
+        Args:
+            rows: Which these are, each once.
+            gradient_px: As of ``observe``, theirs.
+            width: As of ``observe``.
+            height: The same.
+        """
+        score = _in_ndc(gradient_px, width, height).nan_to_num_(0.0, 0.0, 0.0)
+        self.score_sum.index_add_(0, rows, score)
+        self.seen.index_add_(0, rows, torch.ones_like(score))
 
     def add(self, score: Float[Tensor, " n"], visible: Bool[Tensor, " n"]) -> None:
         """Add an iteration's scores, which are overwritten; those that are not finite count as 0."""
@@ -189,6 +208,10 @@ class DensityStatistics:
     def to_arrays(self) -> dict[str, Tensor]:
         """Its tensors by name, for a checkpoint."""
         return {"score_sum": self.score_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
+
+
+def _in_ndc(gradient_px: Float[Tensor, "k 2"], width: float, height: float) -> Float[Tensor, " k"]:
+    return torch.hypot(gradient_px[:, 0] * (0.5 * width), gradient_px[:, 1] * (0.5 * height))
 
 
 def room_at(schedule: DensitySchedule, initial: int, iteration: int) -> int:

@@ -64,7 +64,7 @@ class Density:
     def observe(
         self,
         rendered: Render,
-        gradient_px: Float[Tensor, "n 2"],
+        gradient_px: Float[Tensor, "m 2"],
         schedule: DensitySchedule,
         photo: TrainingPhoto,
     ) -> None:
@@ -74,13 +74,18 @@ class Density:
         same however a photo is divided.
 
         Args:
-            rendered: What was compared with the photo.
-            gradient_px: By the means on the image plane, pixels; with ``magnitudes`` the sums of those.
+            rendered: What was compared with the photo, of the n Gaussians that are trained.
+            gradient_px: By the means on the image plane, pixels; with ``magnitudes`` the sums of those. Sparse, of what
+                is trained and visible, or of all that was drawn, those n first.
             schedule: Of density control.
             photo: What was trained on.
         """
         whole = photo.camera.whole()
-        self.statistics.observe(gradient_px, rendered.visible, photo.share * whole.width, photo.share * whole.height)
+        size = (photo.share * whole.width, photo.share * whole.height)
+        if gradient_px.is_sparse:
+            self.statistics.observe_rows(gradient_px.indices()[0], gradient_px.values(), *size)
+        else:
+            self.statistics.observe(gradient_px[: len(rendered.visible)], rendered.visible, *size)
         if schedule.prune_screen_px > 0.0:
             self.statistics.observe_radii(rendered.radii)
 

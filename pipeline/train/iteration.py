@@ -72,7 +72,7 @@ def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
         own = state.of_trained(rendered)
         state.step(own.visible, now, plan)
         if probe is not None and probe.grad is not None:
-            state.density.observe(own, probe.grad[: len(state.gaussians)], plan.schedule.density, photo)
+            state.density.observe(own, probe.grad, plan.schedule.density, photo)
         techniques.after_step(shot)
     state.history.add_loss(photometric.detach())
 

@@ -117,7 +117,8 @@ class TrainState:
     def screen_probe(self) -> Float[Tensor, "n 2"]:
         """Zeros whose gradient is that of what is drawn by its places on the screen, once the parameters are stepped:
         those of the Gaussians that are trained come first."""
-        return torch.zeros(len(self.drawn), 2, device=self.gaussians.means.device, requires_grad=True)
+        zero = torch.zeros(1, 2, device=self.gaussians.means.device)
+        return zero.expand(len(self.drawn), 2).requires_grad_()  # nobody reads its values
 
     def step(self, gradient_rows: Bool[Tensor, " n"], now: Moment, plan: Plan) -> None:
         """Step the parameters against their gradients, which are dropped; those that ``buffers`` hold, too.
@@ -146,9 +147,10 @@ class TrainState:
         """Give the Gaussians that are trained their part of the gradients of all that was drawn."""
         if self.whole is None:
             return
-        unfinished = self.buffers.take_unfinished()
-        if unfinished is not None:
-            unfinished.finish(self.whole.tensors())
+        if self.gaussians.means.device.type != "cpu":  # there a step takes all that was rendered
+            unfinished = self.buffers.take_unfinished()
+            if unfinished is not None:
+                unfinished.finish(self.whole.tensors())
         drawn = self.whole.tensors()
         for name, tensor in self.gaussians.tensors().items():
             gradient = drawn[name].grad

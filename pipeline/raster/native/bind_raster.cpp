@@ -50,6 +50,8 @@ using PictureGradientArrays = std::tuple<std::optional<Cube<const float>>, std::
                                          std::optional<Grid<const float>>, std::optional<Grid<const float>>>;
 // of each parameter, the rate of every value of a row
 using RateArrays = std::array<Line<const float>, 5>;
+// rows that are stepped; the gradients by their centres on the screen
+using SeenArrays = std::tuple<Line<int64_t>, Grid<float>>;
 // beta1, beta2, epsilon; the step, from 1
 using AdamTuple = std::tuple<double, double, double, int64_t>;
 
@@ -179,23 +181,30 @@ class Frame {
     int64_t step(const ParameterArrays<const float>& arrays, const ParameterArrays<float>& values,
                  const ParameterArrays<float>& means, const ParameterArrays<float>& squares, const RateArrays& rates,
                  const AdamTuple& options, const std::array<float, 2>& limits,
-                 const std::optional<Line<const float>>& logit_gain, const std::optional<Grid<float>>& means2d) {
+                 const std::optional<Line<const float>>& logit_gain, const std::optional<SeenArrays>& seen) {
         const splat::Parameters in = rendered(arrays);
-        const size_t n = in.count;
+        const size_t n = std::get<0>(values).shape(0);
+        if (n > size_t(in.count)) throw nb::value_error("values");
         splat::FrameStep step{};
+        step.count = static_cast<int64_t>(n);
         step.tensors = adam_rows(values, means, squares, rates, n, view_.sh_count);
         const auto [beta1, beta2, epsilon, number] = options;
         step.options = {beta1, beta2, epsilon, number};
         if (!splat::are_adam_options(step.options)) throw nb::value_error("options");
         step.log_scale_min = limits[0], step.log_scale_max = limits[1];
         step.logit_gain = logit_gain ? checked(*logit_gain, n, "logit_gain") : nullptr;
-        step.means2d = means2d ? checked(*means2d, n, 2, "means2d") : nullptr;
+        if (seen) {
+            const size_t visible = frame_->visible();
+            step.seen = checked(std::get<0>(*seen), visible, "rows");
+            step.means2d = checked(std::get<1>(*seen), visible, 2, "means2d");
+        }
         nb::gil_scoped_release release;
         is_blended_back_ = false;  // the parameters are others now
         return frame_->step(in, step);
     }
 
     int64_t pairs() const { return frame_->pairs(); }
+    int64_t visible() const { return frame_->visible(); }
 
     int64_t contributing_pairs() const {
         require_render();
@@ -234,7 +243,8 @@ void bind_raster(nb::module_& m) {
              nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert())
         .def("step", &Frame::step, nb::arg("parameters").noconvert(), nb::arg("values").noconvert(),
              nb::arg("means").noconvert(), nb::arg("squares").noconvert(), nb::arg("rates").noconvert(), "options"_a,
-             "log_scale_limits"_a, nb::arg("logit_gain").noconvert().none(), nb::arg("means2d").noconvert().none())
+             "log_scale_limits"_a, nb::arg("logit_gain").noconvert().none(), nb::arg("seen").noconvert().none())
         .def_prop_ro("pairs", &Frame::pairs)
+        .def_prop_ro("visible", &Frame::visible)
         .def("contributing_pairs", &Frame::contributing_pairs, nb::call_guard<nb::gil_scoped_release>());
 }

@@ -59,13 +59,17 @@ void copy_row(const ParameterGradients& from, int64_t from_row, int sh_row, int6
     copy(to.opacity_logits, from.opacity_logits, 1), copy(to.sh, from.sh, sh_row), copy(to.means2d, from.means2d, 2);
 }
 
-// What is between gradients and their step: those by the logits that were rendered, and what density control wants.
-void end_gradients(const FrameStep& step, const int32_t* rows, int count, BackRows* back) {
+// What is between gradients and their step: those by the logits that were rendered, and what density control wants, to
+// place `at` and what follows of it. Returns where the next go.
+int64_t end_gradients(const FrameStep& step, const int32_t* rows, int count, int64_t at, BackRows* back) {
     for (int i = 0; i < count; ++i) {
         if (rows[i] < 0) continue;
         if (step.logit_gain) back->opacity_logits[i] *= step.logit_gain[rows[i]];
-        if (step.means2d) std::copy_n(back->means2d + 2 * i, 2, step.means2d + 2 * int64_t{rows[i]});
+        if (!step.seen) continue;
+        step.seen[at] = rows[i];
+        std::copy_n(back->means2d + 2 * i, 2, step.means2d + 2 * at++);
     }
+    return at;
 }
 
 void hold_scales(const FrameStep& step, const int32_t* rows, int count) {
@@ -139,19 +143,21 @@ void RasterFrame::project_backward(const Parameters& in, const ParameterGradient
 }
 
 int64_t RasterFrame::step(const Parameters& in, const FrameStep& step) {
-    const AdamTables adam(step.tensors, in.count, nullptr, step.options);
+    const AdamTables adam(step.tensors, step.count, nullptr, step.options);
     const AdamKernels& kernels = SPLAT_KERNELS(adam_kernels);
     std::vector<int64_t> skipped(static_cast<std::size_t>(divide_up(candidates_, kCandidatesATask)));
     for_tasks(candidates_, kCandidatesATask, [&](int64_t task, int64_t begin, int64_t end) {
         BackRows back;
         const float* gradients[] = {back.means, back.log_scales, back.quats, back.opacity_logits, back.sh};
-        for (int64_t first = begin; first < end; first += kBackRows) {
-            const int count = static_cast<int>(std::min(end - first, int64_t{kBackRows}));
+        int64_t at = tasks_.data()[task].visible;
+        for (int64_t first = begin; first < end && data_.rows[first] < step.count; first += kBackRows) {
+            int count = static_cast<int>(std::min(end - first, int64_t{kBackRows}));
+            while (data_.rows[first + count - 1] >= step.count) --count;
             fetch_moments(adam.job(), data_.rows + first, count);
             project_->project_backward(view_, in, first, first + count, data_, magnitudes_, back.gradients());
             int32_t rows[kBackRows];
             for (int i = 0; i < count; ++i) rows[i] = data_.keys[first + i] == kCulled ? -1 : data_.rows[first + i];
-            end_gradients(step, rows, count, &back);
+            at = end_gradients(step, rows, count, at, &back);
             skipped[static_cast<std::size_t>(task)] += kernels.some(adam.job(), rows, count, gradients);
             hold_scales(step, rows, count);
         }

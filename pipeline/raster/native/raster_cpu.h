@@ -71,10 +71,12 @@ class Buffer {
 // The step of the optimiser that a backward pass ends with.
 struct FrameStep {
     std::vector<AdamRows> tensors;  // means, log_scales, quats, opacity_logits, sh, without gradients
+    int64_t count;                  // of their rows, the rendered Gaussians' first: the others are left as they are
     AdamOptions options;
     float log_scale_min, log_scale_max;  // of the rows that take part, afterwards
-    const float* logit_gain;             // (n,): of the rendered logits by those that are stepped; null: the same ones
-    float* means2d;                      // as of ParameterGradients, of the rows that take part; null: not wanted
+    const float* logit_gain;             // (count,): of the rendered logits by those that are stepped; null: the same
+    int64_t* seen;                       // (visible()): the rows that take part, ascending; null: not wanted
+    float* means2d;                      // (visible(), 2): theirs, as of ParameterGradients
 };
 
 // A view's rasterization, with what its backward pass needs. One render at a time.
@@ -94,6 +96,7 @@ class RasterFrame {
     int64_t step(const Parameters& in, const FrameStep& step);
 
     int64_t pairs() const { return pairs_; }
+    int64_t visible() const { return visible_; }
 
     // Pairs of a pixel and a splat blended into it, of the last forward() call. For benchmarks: slow.
     int64_t contributions() const;
