@@ -136,7 +136,7 @@ INITIALIZE = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=8,
+    version=9,
     config=TrainConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={
