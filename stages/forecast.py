@@ -12,12 +12,21 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
+from splatpipe.pipeline.engine.machine import available_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.needs import whole as whole
 from splatpipe.pipeline.engine.source import Source
 from splatpipe.pipeline.engine.stage import Summary
-from splatpipe.pipeline.train.limits import FIXED_BYTES, PIXEL_BYTES, SMALLEST_WINDOW, bytes_per_gaussian
+from splatpipe.pipeline.train.limits import (
+    FIXED_BYTES,
+    LIBRARIES_BYTES,
+    MACHINE_SHARE,
+    PIXEL_BYTES,
+    SMALLEST_WINDOW,
+    bytes_per_gaussian,
+)
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import FEWEST_GAUSSIANS, LEAST_SHARE, MEGA, CaptureSize, Work
@@ -36,6 +45,7 @@ def forecast(
     *,
     speed: float = 1.0,
     costs: Costs = REFERENCE,
+    machine_bytes: int = 0,
 ) -> dict[str, Need]:
     """What each stage takes, by its name.
 
@@ -45,8 +55,9 @@ def forecast(
         threads: That the run is given.
         speed: Of this machine's cores, as ``machine_speed`` says.
         costs: Of a unit of each stage's work.
+        machine_bytes: Memory of the machine that decides on blocks; 0 where nobody knows.
     """
-    work = Work.of(size, config, costs, threads)
+    work = Work.of(size, config, costs, threads, machine_bytes)
     needs = work.needs(speed)
     budget = config.train.time_budget_s
     if not budget:
@@ -82,9 +93,39 @@ class Forecaster:
         return machine_speed()
 
     def __call__(self, summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
-        """From what ``ingest`` counted; nothing before it, nor where the photos came otherwise."""
+        """From what ``ingest`` counted; nothing before it, nor where the photos came otherwise.
+
+        Once ``blocks`` is done, by what it decided, with each block's own need.
+        """
         size = counted(summaries)
-        return {} if size is None else forecast(size, self.config, self.threads, speed=self.speed)
+        if size is None:
+            return {}
+        decided = summaries.get("blocks")
+        memory = available_memory_bytes()
+        if decided is not None:  # on whatever machine
+            memory = int(decided.get("of_blocks", {}).get("limit_bytes", 0) / MACHINE_SHARE)
+        needs = forecast(size, self.config, self.threads, speed=self.speed, machine_bytes=memory)
+        return needs if decided is None else needs | needs_of_blocks(needs["train"], decided.get("of_blocks", {}))
+
+
+def needs_of_blocks(train: Need, told: Mapping[str, Any]) -> dict[str, Need]:
+    """Each block's share of the training, by its name.
+
+    Args:
+        train: The need of all of them.
+        told: What ``blocks`` said of them; nothing without blocks.
+    """
+    iterations, disk = told.get("iterations", ()), told.get("disk_bytes", ())
+    whole, checkpoint = max(1, sum(iterations)), max(0, train.memory_bytes - LIBRARIES_BYTES)
+    return {
+        f"train.{number}": replace(
+            train,
+            cpu_seconds=train.cpu_seconds * own / whole,
+            disk_bytes=round(train.disk_bytes * own / whole),
+            scratch_bytes=int(decoded) + checkpoint,
+        )
+        for number, (own, decoded) in enumerate(zip(iterations, disk, strict=True), 1)
+    }
 
 
 def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:

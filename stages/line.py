@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from splatpipe.pipeline.engine.stage import NamedFile, Stage
+from splatpipe.pipeline.engine.stage import NamedFile, Shards, Stage
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
+from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
 
@@ -134,11 +135,28 @@ INITIALIZE = Stage(
     parts={"splat": "init.ply"},
     entry="splatpipe.stages.initialize:run",
 )
+BLOCKS = Stage(
+    "blocks",
+    version=1,
+    config=BlocksConfig,
+    reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
+    parts={"plan": "blocks.json", "coarse": "coarse"},
+    entry="splatpipe.stages.blocks:run",
+    borrows=tuple(f"train.{name}" for name in TrainConfig.model_fields),
+    resumable=True,
+)
 TRAIN = Stage(
     "train",
     version=9,
     config=TrainConfig,
-    reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
+    reads=(
+        "undistort.dataset",
+        "split.views",
+        "initialize.splat",
+        "georef.boundary",
+        "blocks.plan",
+        "blocks.coarse",
+    ),
     parts={
         "model": "model.ply",
         "history": "history.json",
@@ -149,6 +167,12 @@ TRAIN = Stage(
     },
     entry="splatpipe.stages.train:run",
     resumable=True,
+    shards=Shards(
+        counted_by="blocks.plan",
+        parts={"model": "model.ply", "history": "history.json", "plan": "plan.json"},
+        entry="splatpipe.stages.train:run_block",
+        resumable=True,
+    ),
 )
 EVALUATE = Stage(
     "evaluate",
@@ -219,6 +243,7 @@ LINE = (
     UNDISTORT,
     SPLIT,
     INITIALIZE,
+    BLOCKS,
     TRAIN,
     EVALUATE,
     EXPORT,

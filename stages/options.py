@@ -12,6 +12,7 @@ from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, Undisto
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
+from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import GONE as GONE_OF_TRAIN
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
@@ -46,6 +47,7 @@ class LineConfig(StageConfig):
     undistort: UndistortConfig = UndistortConfig()
     split: SplitConfig = SplitConfig()
     initialize: InitializeConfig = InitializeConfig()
+    blocks: BlocksConfig = BlocksConfig()
     train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     export: ExportConfig = ExportConfig()

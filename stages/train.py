@@ -1,5 +1,67 @@
-"""train: optimises the Gaussians against the photos; see ``pipeline.train.loop``."""
+"""train: optimises the Gaussians against the photos, all at once or block by block."""
 
-from splatpipe.pipeline.train.loop import run
+from __future__ import annotations
 
-__all__ = ["run"]
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shard, Summary
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks.assembly import assemble
+from splatpipe.pipeline.train.blocks.site_plan import load_site_plan
+from splatpipe.pipeline.train.blocks.training import BlockTask, SiteParts, train_block
+from splatpipe.pipeline.train.options import TrainConfig
+
+
+def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write the model, its history, its plan and side models: trained here, or merged from blocks where there are any.
+
+    Raises:
+        SplatpipeError: if nothing is left to train on.
+        MachineError: if the device asked for is not there.
+        KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
+    """
+    return assemble(inputs, out, report) if inputs.shards else loop.run(config, inputs, out, report)
+
+
+class BlockReporter:
+    """Tells of a block as of one of several.
+
+    Args:
+        report: Takes it.
+        block: Which it is.
+    """
+
+    def __init__(self, report: Reporter, block: Shard) -> None:
+        self._report, self._name = report, f"block {block.number} of {block.count}"
+
+    def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
+        """As of a ``Reporter``."""
+        self._report.progress(done, total, f"{self._name}: {what}", unit)
+
+    def metric(self, name: str, value: int | float, step: int | None = None) -> None:
+        """As of a ``Reporter``."""
+        self._report.metric(name, value, step)
+
+    def note(self, message: str) -> None:
+        """As of a ``Reporter``."""
+        self._report.note(f"{self._name}: {message}")
+
+    def warning(self, message: str, hint: str = "") -> None:
+        """As of a ``Reporter``."""
+        self._report.warning(f"{self._name}: {message}", hint)
+
+
+def run_block(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write one block's model, history and plan; go on from a checkpoint where a killed run left one.
+
+    Raises:
+        StageError: if what `blocks` left cannot be read.
+        MachineError: if the device asked for is not there.
+        KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
+    """
+    assert inputs.shard is not None
+    site, number = load_site_plan(inputs["blocks.plan"]), inputs.shard.index
+    parts = SiteParts(inputs["undistort.dataset"], inputs["split.views"], inputs["blocks.coarse"], site.partition)
+    limits = site.blocks[number]
+    task = BlockTask(number, limits.share, limits.trained, limits.frozen, site.window_pixels)
+    return train_block(config, parts, task, inputs.machine, out, BlockReporter(report, inputs.shard))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.film.options import MOST_FILM_MEGAPIXELS
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
+from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divided, memory_limit
+from splatpipe.pipeline.train.blocks.lengths import coarse_lengths, finer_lengths
 from splatpipe.pipeline.train.lengths import (
     WINDOW_PIXELS,
     Footage,
@@ -25,6 +28,7 @@ from splatpipe.pipeline.train.limits import (
     worthwhile_iterations,
 )
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
+from splatpipe.stages.block_work import BlockWork
 from splatpipe.stages.costs import Costs
 from splatpipe.stages.options import LineConfig
 
@@ -56,12 +60,16 @@ PARALLEL = {
     "sparse": 0.2,
     "undistort": 0.8,
     "initialize": 0.85,
+    "blocks": 0.93,
     "train": 0.93,
     "evaluate": 0.75,
     "export": 0.2,
     "flythrough": 0.7,
 }
 """Of each stage's CPU seconds, what more threads divide among themselves; measured with one and two."""
+
+TRAINING = {"blocks": "train", "train": "train"}
+"""Stages that train, by whose costs they go."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +117,7 @@ class Work:
         threads: Of the run.
         lengths: Of the training: levels and their iterations.
         gaussians: At its end.
+        blocks: The blocks that the scene is trained in; None where it is trained whole.
     """
 
     size: CaptureSize
@@ -117,13 +126,38 @@ class Work:
     threads: int
     lengths: tuple[Length, ...]
     gaussians: float
+    blocks: BlockWork | None = None
 
     @staticmethod
-    def of(size: CaptureSize, config: LineConfig, costs: Costs, threads: int) -> Work:
-        """The work without a time budget."""
+    def of(size: CaptureSize, config: LineConfig, costs: Costs, threads: int, machine_bytes: int = 0) -> Work:
+        """The work without a time budget.
+
+        Args:
+            size: Of the capture.
+            config: The options, resolved.
+            costs: What a unit costs.
+            threads: Of the run.
+            machine_bytes: The machine's memory, where it may decide on blocks; 0 where it is not to.
+        """
         work = Work(size, config, costs, threads, (), 0.0)
         work = replace(work, lengths=tuple(lengths_of(config.train, work.footage)))
-        return replace(work, gaussians=min(work.most_gaussians, work.grown))
+        division = work.division(machine_bytes)
+        if division.is_whole:
+            return replace(work, gaussians=min(work.most_gaussians, work.grown))
+        footage = replace(work.footage, window_pixels=division.window_pixels)
+        coarse, finer = (tuple(each(config.train, footage)) for each in (coarse_lengths, finer_lengths))
+        blocks = BlockWork(division, footage, coarse, finer)
+        return replace(work, gaussians=min(float(division.cap), work.grown), blocks=blocks)
+
+    def division(self, machine_bytes: int) -> Division:
+        """Into how many blocks the scene is cut, by its options and what it is thought to grow to."""
+        train = self.config.train
+        footage = replace(self.footage, window_pixels=WINDOW_PIXELS["cpu"])
+        window = max(footage.largest(stretch.look) for stretch in stretches(footage, self.lengths))
+        scene = SceneSize(train.max_gaussians, self.grown, window, train.sh_degree, self.size.photos)
+        if train.time_budget_s:
+            return divided(scene, 0)
+        return divided(scene, memory_limit(train.max_memory_bytes, machine_bytes), self.config.blocks.least)
 
     def filling(self, seconds: float, speed: float) -> Work:
         """The same with a training of so many seconds: iterations by their root, and the Gaussians that then fit in."""
@@ -183,27 +217,37 @@ class Work:
 
     @property
     def iterations(self) -> int:
-        """Of the training."""
-        return sum(count for _level, count in self.lengths)
+        """Of the training; in blocks, of the coarse pass and all of them."""
+        lengths = self.lengths if self.blocks is None else (*self.blocks.coarse, *self.blocks.lengths)
+        return sum(count for _level, count in lengths)
 
     @property
     def training(self) -> float:
-        """Of all iterations: megapixels, and Gaussians as megapixels that cost as much."""
-        footage, done, total = self.footage, 0, 0.0
-        for stretch in stretches(footage, self.lengths):
+        """Of all iterations: megapixels, and Gaussians as megapixels that cost as much; of blocks, of all of them."""
+        if self.blocks is None:
+            return self._training(self.footage, self.lengths, self.gaussians)
+        need = self.blocks.division.need
+        there = min(float(need.trained), self.gaussians) + need.frozen
+        return self._training(self.blocks.footage, self.blocks.lengths, there)
+
+    @property
+    def coarse_training(self) -> float:
+        """The same of the pass over the whole before blocks; 0 without them."""
+        if self.blocks is None:
+            return 0.0
+        gaussians = min(float(self.blocks.division.coarse_cap), self.gaussians)
+        return self._training(self.blocks.footage, self.blocks.coarse, gaussians)
+
+    @staticmethod
+    def _training(footage: Footage, lengths: Sequence[Length], gaussians: float) -> float:
+        done, total = 0, 0.0
+        for stretch in stretches(footage, lengths):
             count, share = stretch.until - done, footage.share(stretch.look)
             cost = GAUSSIAN_MEGAPIXELS * (UNSEEN_SHARE + (1.0 - UNSEEN_SHARE) * share)
-            there = self.gaussians * self._mean_growth(done, stretch.until)
+            there = gaussians * _mean_growth(lengths, done, stretch.until)
             total += count * (footage.pixels(stretch.look) / MEGA + cost * there)
             done = stretch.until
         return total
-
-    def _mean_growth(self, start: int, end: int) -> float:
-        """Share of the final Gaussians that iterations have on average: x (2 - x) of the growth, all of it later on."""
-        last = max(1, growth_until(self.lengths))
-        middles = (start + (step + 0.5) * (end - start) / GROWTH_SAMPLES for step in range(GROWTH_SAMPLES))
-        shares = [min(1.0, middle / last) for middle in middles]
-        return START_SHARE + (1.0 - START_SHARE) * sum(x * (2.0 - x) for x in shares) / GROWTH_SAMPLES
 
     @property
     def most_gaussians(self) -> float:
@@ -245,6 +289,8 @@ class Work:
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
         done = self.costs.flat if train.stop_when_flat and not train.time_budget_s else 1.0
         state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.window
+        if self.blocks is not None:
+            state = self.blocks.division.memory_bytes - self.costs.stages["train"].resident
         looked = photos * self.looked_at * SIFT_WORK[extractor]
         looked_at_once = self.threads * self.looked_at * SIFT_MEMORY[extractor]
         controlled = float(size.control)
@@ -260,6 +306,7 @@ class Work:
             "undistort": Units(pixels, at_once, photos * self.kept_at),
             "split": Units(photos, 0.0, photos),
             "initialize": Units(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
+            "blocks": Units(done * self.coarse_training, state, 0.0),
             "train": Units(done * self.training, state, gaussians),
             "evaluate": Units(judged, gaussians, judged),
             "export": Units(gaussians, gaussians, gaussians),
@@ -270,23 +317,41 @@ class Work:
         """What the units cost, by stage, on a machine of that speed."""
         most, found = self.config.train.max_memory_bytes, {}
         for stage, units in self.units().items():
-            cost = self.costs.stages[stage]
+            cost = self.costs.stages[TRAINING.get(stage, stage)]
             memory = cost.resident + cost.memory * units.memory
-            if stage == "train" and most:
+            if stage in TRAINING and most:
                 memory = min(memory, most)
             found[stage] = Need(
                 int(memory),
                 cost.cpu * units.cpu / speed,
-                int(cost.disk * units.disk),
+                int(cost.disk * units.disk) + self._disk_of_blocks(stage),
                 self._scratch(stage, units),
                 PARALLEL.get(stage, 0.0),
             )
         return found
+
+    def _disk_of_blocks(self, stage: str) -> int:
+        """Bytes that a stage leaves besides where the scene is trained in blocks."""
+        if self.blocks is None:
+            return 0
+        return {"blocks": self.blocks.coarse_bytes, "train": self.blocks.block_bytes}.get(stage, 0)
 
     def _scratch(self, stage: str, units: Units) -> int:
         """Bytes that a stage takes while it runs: a copy of the features; decoded photos and a checkpoint."""
         if stage in ("matches", "sparse"):
             return int(self.costs.stages["features"].disk * units.disk)
         if stage == "train":
-            return int(PYRAMID * PHOTO_BYTES * MEGA * self.size.photos * self.trained_at + units.memory)
+            photos = self.size.photos if self.blocks is None else self.blocks.photos
+            return int(PYRAMID * PHOTO_BYTES * MEGA * photos * self.trained_at + units.memory)
+        if stage == "blocks" and self.blocks is not None:
+            (first, _count), *_ = self.blocks.coarse
+            return int(PYRAMID * PHOTO_BYTES * MEGA * self.size.photos * self.trained_at / 4**first + units.memory)
         return 0
+
+
+def _mean_growth(lengths: Sequence[Length], start: int, end: int) -> float:
+    """Share of the final Gaussians that iterations have on average: x (2 - x) of the growth, all of it later on."""
+    last = max(1, growth_until(lengths))
+    middles = (start + (step + 0.5) * (end - start) / GROWTH_SAMPLES for step in range(GROWTH_SAMPLES))
+    shares = [min(1.0, middle / last) for middle in middles]
+    return START_SHARE + (1.0 - START_SHARE) * sum(x * (2.0 - x) for x in shares) / GROWTH_SAMPLES

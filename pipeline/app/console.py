@@ -69,6 +69,7 @@ class RunConsole:
         self._stage_started_s = time.monotonic()
         self._plain_said_s = 0.0
         self._what = ""
+        self._shards = ShardTimes()
 
     def __call__(self, event: Event) -> None:
         show = getattr(self, f"_{event.kind}", None)
@@ -88,6 +89,7 @@ class RunConsole:
     def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
         self._stage_started_s = self._plain_said_s = time.monotonic()
         self._what = ""
+        self._shards.begin(stage, data.get("shard"))
         if not self._console.is_terminal:
             self._console.print(f"{self._label(stage)} started ({data['reason']})", markup=False)
             return
@@ -109,7 +111,10 @@ class RunConsole:
     def _progress(self, stage: str, data: Mapping[str, JSON]) -> None:
         done, total, what, unit = data["done"], data["total"], str(data["what"]), str(data["unit"])
         if self._live is not None and self._task is not None:
-            description = escape(f"{self._label(stage)} {what}")
+            of_all = (
+                self._shards.left(time.monotonic() - self._stage_started_s, done, total) if unit == "iterations" else ""
+            )
+            description = escape(f"{self._label(stage)} {what}{of_all}")
             if what != self._what:
                 self._live.reset(self._task, total=total)
             self._live.update(self._task, completed=done, total=total, description=description, unit=unit)
@@ -117,17 +122,21 @@ class RunConsole:
             now = time.monotonic()
             self._plain_said_s = now
             left = (now - self._stage_started_s) * (total - done) / done if done else 0.0
+            of_all = self._shards.left(now - self._stage_started_s, done, total) if unit == "iterations" else ""
             self._console.print(
-                f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}, about {_duration(left)} left",
+                f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}, "
+                f"about {_duration(left)} left{of_all}",
                 markup=False,
             )
         self._what = what
 
     def _stage_finished(self, stage: str, data: Mapping[str, JSON]) -> None:
         self.close()
+        self._shards.end(stage, float(data["seconds"]))
         self._line("✓", "green", stage, f"{_duration(data['seconds'])}  {_brief(data['summary'])}")
 
     def _stage_reused(self, stage: str, data: Mapping[str, JSON]) -> None:
+        self._shards.end(stage, float(data["seconds"]))
         self._line("=", "blue", stage, f"reused  {_brief(data['summary'])}")
 
     def _stage_failed(self, stage: str, data: Mapping[str, JSON]) -> None:
@@ -150,6 +159,47 @@ class RunConsole:
         if of not in self._order:
             return stage.ljust(10)
         return f"{self._order.index(of) + 1:>2}/{len(self._order)} {stage:<10}"
+
+
+class ShardTimes:
+    """How long the shards of a stage take, one after the other, so that the time left is told over all of them."""
+
+    def __init__(self) -> None:
+        self._took: dict[str, dict[str, float]] = {}
+        self._stage, self._after = "", 0
+
+    def begin(self, stage: str, shard: Mapping[str, int] | None) -> None:
+        """A stage, or a shard of one, begins.
+
+        Args:
+            stage: Its name.
+            shard: Its number and how many there are; None for a stage's own.
+        """
+        self._stage, self._after = stage_name(stage), 0
+        if shard is not None:
+            took = self._took.get(self._stage, {})
+            later = (f"{self._stage}.{number}" for number in range(shard["number"] + 1, shard["count"] + 1))
+            self._after = sum(name not in took for name in later)
+
+    def end(self, stage: str, seconds: float) -> None:
+        """A shard is there."""
+        if stage != stage_name(stage):
+            self._took.setdefault(stage_name(stage), {})[stage] = seconds
+
+    def left(self, seconds: float, done: float, total: float) -> str:
+        """About how long all take from here on, in words; empty for the last one, and where nothing tells yet.
+
+        Args:
+            seconds: That the one at work has taken.
+            done: Of it.
+            total: Of it.
+        """
+        if not self._after or not done or not total:
+            return ""
+        whole = seconds * total / done
+        each = [*self._took.get(self._stage, {}).values(), whole]
+        left = whole - seconds + self._after * sum(each) / len(each)
+        return f", {_duration(left)} with the {self._after} after it"
 
 
 def escape(text: str) -> str:

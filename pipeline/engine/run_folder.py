@@ -6,7 +6,7 @@ Unlike ``runner.survey`` this asks nothing of the photos, so it finds what they 
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from splatpipe.pipeline.engine.config import Table, known, load_file, resolve, settings_of
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.lock import is_locked
-from splatpipe.pipeline.engine.stage import Stage
+from splatpipe.pipeline.engine.stage import Stage, stage_name
 from splatpipe.pipeline.engine.store import Artifact, Part, Store, is_copy, open_store
 
 CONFIG_FILE = "config.toml"
@@ -30,7 +30,7 @@ class Contents:
 
     Attributes:
         artifacts: By stage.
-        working: Where a stage that is not done leaves what it has so far, by stage.
+        working: Where a stage that is not done leaves what it has so far, by stage; also a shard, by its name.
     """
 
     artifacts: Mapping[str, Artifact] = field(default_factory=dict)
@@ -124,9 +124,19 @@ class RunFolder:
             if artifact is not None:
                 chosen[stage.name] = artifact
                 digests |= {name: part.digest for name, part in artifact.parts.items()}
-            elif key and folder.is_dir():
+                continue
+            if key and folder.is_dir():
                 working[stage.name] = folder
+            working |= self._shards_at_work(stage, keys)
         return Contents(chosen, working)
+
+    def _shards_at_work(self, stage: Stage, keys: Mapping[str, str]) -> dict[str, Path]:
+        """Where shards of a stage work, as far as events tell of them."""
+        if stage.shards is None:
+            return {}
+        names = [name for name in keys if name != stage.name and stage_name(name) == stage.name]
+        folders = {name: self.store.working_folder(replace(stage, name=name), keys[name]) for name in names}
+        return {name: folder for name, folder in folders.items() if folder.is_dir()}
 
     def lineage(self, *stages: Stage) -> dict[str, Part]:
         """The parts behind what lies in OUT, found by digests alone, so in what another version left, too.

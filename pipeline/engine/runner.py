@@ -227,7 +227,8 @@ class Runner:
         known = self.store.find(stage, inputs.key) is not None
         reason = "asked for" if known else explain(inputs, self.store.artifacts(stage.name))
         reason = f"{job.shard}: {reason}" if job.shard else reason
-        self.sink(Event("stage_started", stage.name, {"reason": reason, "key": inputs.key}))
+        of = {"shard": asdict(job.shard)} if job.shard else {}
+        self.sink(Event("stage_started", stage.name, {"reason": reason, "key": inputs.key, **of}))
         try:
             with self._explained():
                 self._check_space()

@@ -34,6 +34,9 @@ DEVICE_COPIES = 3  # a parameter has two moments there
 DEVICE_PASSING_BYTES = 320  # the larger of what a frame and density control take
 FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
 
+LIBRARIES_BYTES = 576_000_000  # of a training's process, whatever it trains: interpreter, torch, what comes with it
+MACHINE_SHARE = 0.8  # of a machine's memory, that a training may take where nobody gave a limit: others want some
+
 SMALLEST_WINDOW = 60_000  # pixels: below it margins, 5 pixels a side, and the Gaussians' own cost are what is paid for
 WINDOW_SHARE = 0.25  # of the memory for pixels and Gaussians, that a window takes at most
 

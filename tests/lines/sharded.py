@@ -109,7 +109,9 @@ class Forecaster:
         return forecast(None, self.config)
 
 
-def forecast(_size: object, config: LineConfig, _threads: int = 1, *, speed: float = 1.0) -> dict[str, Need]:
+def forecast(
+    _size: object, config: LineConfig, _threads: int = 1, *, speed: float = 1.0, machine_bytes: int = 0
+) -> dict[str, Need]:
     """A hundred million bytes a stage; half of the disk's and a tenth of the time for the third shard."""
     needs = {stage.name: Need(100_000_000, 60.0, 8_000_000) for stage in LINE}
     return needs | {"sum.3": Need(100_000_000, 6.0, 4_000_000)}

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
+import cv2
 import numpy as np
+import pycolmap
 import torch
 from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster.rasterizer import RenderOptions
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.rendering import render_depth
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import rgb_to_dc
@@ -104,3 +107,34 @@ def site_sights(coarse: Gaussians, points: Float64[np.ndarray, "p 3"], by_depth:
     cameras = flight()
     rows = observed(points, cameras, coarse)
     return sights(cameras, rows, (lambda grid: depth_of(coarse, grid)) if by_depth else None)
+
+
+def write_dataset(folder: Path) -> Path:
+    """Write the flight as a dataset: photos of the model, its cameras, and every seventh point as a sparse one."""
+    everything = surface()
+    truth = model(everything)
+    cameras, xyz = flight(), everything[::7].copy()
+    rows = observed(xyz, cameras, truth)
+    found = pycolmap.Reconstruction()
+    tracks: dict[int, list[pycolmap.TrackElement]] = {}
+    for number, (view, seen) in enumerate(zip(cameras, rows, strict=True), start=1):
+        path = folder / "images" / f"{view.name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with torch.no_grad():
+            colour = render(truth, view, OPTIONS).colour
+        cv2.imwrite(str(path), (colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).numpy()[:, :, ::-1])
+        lens = [view.fx, view.fy, view.cx, view.cy]
+        found.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model="PINHOLE", width=view.width, height=view.height, params=lens)
+        )
+        keypoints = view.project(xyz[seen]) + 0.5
+        photo = pycolmap.Image(name=f"{view.name}.png", camera_id=number, image_id=number, keypoints=keypoints)
+        found.add_image_with_trivial_frame(photo, pycolmap.Rigid3d(view.cam_from_world[:3]))
+        for at, row in enumerate(seen.tolist()):
+            tracks.setdefault(row, []).append(pycolmap.TrackElement(number, at))
+    for row, elements in sorted(tracks.items()):
+        if len(elements) > 1:
+            found.add_point3D(xyz[row], pycolmap.Track(elements), np.array([128, 128, 128], np.uint8))
+    (folder / "sparse/0").mkdir(parents=True)
+    found.write(folder / "sparse/0")
+    return folder

@@ -22,7 +22,7 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.line import Line, Standing, survey
 from splatpipe.pipeline.engine.lock import is_locked
-from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
+from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
 from splatpipe.pipeline.engine.session import Request, survey_line
@@ -147,7 +147,8 @@ def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Se
         planned = _with_kept_failure(planned, first, request.out)
     if names and not planned.message:
         planned = _with_broken_file(planned, request)
-    foresee = partial(forecast, size, config, speed=machine_speed())
+    memory = available_memory_bytes() if settings.local else 0
+    foresee = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
     # Where the stage that counts them is to run, it says how many there are then.
     counted = [each for each in standings if each.stage.name in names] if first else []
     shards = {} if planned.message else missing_shards(counted)

@@ -180,7 +180,7 @@ def forecast_presets(
     speed = machine_speed()
     told = []
     for preset, config in configs.items():
-        need = whole(forecast(size, config, threads, speed=speed))
+        need = whole(forecast(size, config, threads, speed=speed, machine_bytes=machine.memory_bytes))
         disk_bytes = need.disk_bytes + need.scratch_bytes
         lacking = []
         if 0 < machine.memory_bytes < need.memory_bytes:

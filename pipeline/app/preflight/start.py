@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.session import Request
+    from splatpipe.stages.block_work import BlockWork
     from splatpipe.stages.options import LineConfig
 
 
@@ -52,6 +53,7 @@ def told_beforehand(request: Request) -> str:
     """What the whole line takes of this machine, in a sentence; empty where nothing is known of the capture."""
     from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.app.report.wording import roughly
+    from splatpipe.pipeline.engine.machine import available_memory_bytes
     from splatpipe.pipeline.engine.needs import whole
     from splatpipe.pipeline.engine.source import open_source
     from splatpipe.stages.costs import REFERENCE
@@ -63,8 +65,9 @@ def told_beforehand(request: Request) -> str:
     size = size_of(source)
     if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request):
         return ""
-    needs = forecast(size, config, threads, speed=machine_speed())
-    need, work = whole(needs), Work.of(size, config, REFERENCE, threads)
+    memory = available_memory_bytes()
+    needs = forecast(size, config, threads, speed=machine_speed(), machine_bytes=memory)
+    need, work = whole(needs), Work.of(size, config, REFERENCE, threads, memory)
     seconds = sum(each.seconds(threads) for each in needs.values())
     told = f"{size.photos:,} photos of {size.megapixels:.1f} megapixels take about {roughly(seconds)}, "
     told += (
@@ -72,10 +75,20 @@ def told_beforehand(request: Request) -> str:
     )
     if config.train.time_budget_s:
         return f"{told}."
-    told += f": training {roughly(needs['train'].seconds(threads))}, {work.iterations:,} iterations"
-    if config.train.max_memory_bytes and work.most_gaussians < work.grown:
+    training = sum(needs[stage].seconds(threads) for stage in ("blocks", "train"))
+    told += f": training {roughly(training)}, {work.iterations:,} iterations"
+    if work.blocks is not None:
+        told += f", {told_of_blocks(work.blocks)}"
+    elif config.train.max_memory_bytes and work.most_gaussians < work.grown:
         told += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos ask for more"
     return f"{told}."
+
+
+def told_of_blocks(blocks: BlockWork) -> str:
+    """How a scene is cut, and what a block takes, in words."""
+    division = blocks.division
+    told = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians at most"
+    return f"{told}, {division.memory_bytes / 1e9:.1f} GB of memory and about {blocks.photos:.0f} photos each"
 
 
 def _on_cuda(request: Request) -> bool:

@@ -28,7 +28,8 @@ def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
         drawn: Whether to draw charts.
     """
     story = holdings.story.stages.get("train")
-    if "train" not in holdings.artifacts and (story is None or story.state == "not reached"):
+    in_blocks = any(name.startswith("train.") for name in holdings.story.stages)
+    if "train" not in holdings.artifacts and (story is None or story.state == "not reached") and not in_blocks:
         return None
     summary, history = holdings.summary("train"), holdings.read("train.history")
     plan, split = summary.get("plan") or {}, holdings.read("split.views")
@@ -38,6 +39,7 @@ def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
     curves = _curves(holdings, history)
     gaussians = summary.get("gaussians") or _last(curves.get("gaussians", {}))
     facts = [
+        ("Blocks", _blocks(holdings)),
         ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
         ("Gaussians", f"{count(gaussians)}, {count(holdings.summary('initialize').get('gaussians'))} at the beginning"),
         (
@@ -176,6 +178,18 @@ def _why_earlier(summary: Mapping[str, Any]) -> str:
         [f"after {count(flat)}"] if flat else []
     )
     return f": the loss was flat {', '.join(told)}" if told else ""
+
+
+def _blocks(holdings: Holdings) -> str:
+    """How many blocks it was trained in, or how far they are; empty where it is trained whole."""
+    blocks = holdings.summary("blocks").get("blocks", 1)
+    if blocks == 1:
+        return ""
+    if "train" in holdings.artifacts:
+        return f"trained in {count(blocks)}, after a coarse pass over the whole"
+    stages = holdings.story.stages.items()
+    done = [name for name, stage in stages if name.startswith("train.") and stage.state in ("finished", "reused")]
+    return f"{count(len(done))} of {count(blocks)} trained"
 
 
 def _seed(holdings: Holdings) -> str:

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.wording import count, duration, moment, plural, size
-from splatpipe.pipeline.engine.stage import shards_first
+from splatpipe.pipeline.engine.stage import shards_first, stage_name
 from splatpipe.stages.line import LINE
 
 Chapter = dict[str, Any]
@@ -46,10 +46,11 @@ def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
         versions = versions or dict(artifact.manifest.get("versions", {}))
         machine = machine or dict(artifact.manifest.get("machine", {}))
     options = {} if holdings.config is None else holdings.config.model_dump(mode="json")
+    counted = [row for row in rows if not _is_in_stage(holdings, row["name"])]
     chapter: Chapter = {
         "rows": rows,
-        "total": duration(sum(row["seconds"] or 0.0 for row in rows)),
-        "cpu_total": duration(sum(row["cpu_seconds"] or 0.0 for row in rows)),
+        "total": duration(sum(row["seconds"] or 0.0 for row in counted)),
+        "cpu_total": duration(sum(row["cpu_seconds"] or 0.0 for row in counted)),
         "peak": size(max((row["memory"] or 0 for row in rows), default=0) or None),
         "forecast": _forecast([row["foreseen"] for row in rows if row["foreseen"]]),
         "machine": _machine(machine),
@@ -103,6 +104,11 @@ def said_chapter(holdings: Holdings) -> Chapter:
     warnings = [(name, *told) for name, stage in stages.items() for told in stage.told.warnings]
     notes = [(name, told) for name, stage in stages.items() for told in stage.told.notes]
     return {"warnings": warnings, "notes": notes}
+
+
+def _is_in_stage(holdings: Holdings, name: str) -> bool:
+    """Whether a row is a shard's, of which its stage's tells already."""
+    return name != stage_name(name) and stage_name(name) in holdings.artifacts
 
 
 def _stage_row(holdings: Holdings, name: str) -> dict[str, Any]:

@@ -30,6 +30,8 @@ from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, viewer_splat
 
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
+FROZEN = "frozen.ply"  # beside a block's checkpoint: what is drawn around it
+COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # of a scene in blocks
 JPEG_QUALITY = 92
 SKY = "sky.colours"  # array of a checkpoint
 RENDER_BYTES = 1000  # of a card's for a Gaussian: 236 of parameters, 201 of a frame, 8 pairs of 64
@@ -44,10 +46,10 @@ class Source:
 
     Attributes:
         path: Its file.
-        kind: ``initial``, ``checkpoint`` or ``model`` (finished).
+        kind: ``initial``, ``checkpoint``, ``coarse`` (the whole, which blocks go on from) or ``model`` (finished).
         stamp: Changes with its content.
         rendering: How it is rendered; None before training has begun.
-        sky: The finished sky, beside a finished model.
+        sky: The finished sky, beside a finished model, or of a block.
     """
 
     path: Path
@@ -77,18 +79,53 @@ def newest(opened: Contents) -> Source | None:
         rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
         return Source(part.path, "model", part.digest[:16], rendering, sky)
     folder = opened.working.get("train")
-    if folder is not None:
+    for at_work, rendering in _trainings(opened):
         try:
-            facts = (folder / CHECKPOINT).stat()
+            facts = (at_work / CHECKPOINT).stat()
             stamp = f"{facts.st_ino:x}-{facts.st_mtime_ns:x}"
-            return Source(folder / CHECKPOINT, "checkpoint", stamp, folder / RENDERING)
+            sky = rendering.with_name(COARSE_SKY)
+            return Source(at_work / CHECKPOINT, "checkpoint", stamp, rendering, sky if sky.is_file() else None)
         except OSError:
-            pass
+            continue
+    coarse = _coarse(opened)
+    if coarse is not None:
+        stamp = opened.parts["blocks.coarse"].digest[:16]
+        return Source(coarse / COARSE_MODEL, "coarse", stamp, coarse / RENDERING, coarse / COARSE_SKY)
     if "initialize.splat" in opened.parts:
         part = opened.parts["initialize.splat"]
         begun = folder is not None and (folder / RENDERING).is_file()
         return Source(part.path, "initial", part.digest[:16], folder / RENDERING if folder and begun else None)
     return None
+
+
+def _coarse(opened: Contents) -> Path | None:
+    """Where the coarse pass of a scene in blocks left its model; None without blocks, or before it is done."""
+    part = opened.parts.get("blocks.coarse")
+    return None if part is None or not (part.path / COARSE_MODEL).is_file() else part.path
+
+
+def _trainings(opened: Contents) -> list[tuple[Path, Path]]:
+    """Where trainings are at work, and how what they train is rendered: the whole, blocks, or the coarse pass.
+
+    Of blocks the one that moved last comes first.
+    """
+    found = []
+    if "train" in opened.working:
+        found.append((opened.working["train"], opened.working["train"] / RENDERING))
+    if (coarse := _coarse(opened)) is not None:
+        blocks = [folder for name, folder in opened.working.items() if name.startswith("train.")]
+        found += [(folder, coarse / RENDERING) for folder in sorted(blocks, key=_moved, reverse=True)]
+    if "blocks" in opened.working:
+        folder = opened.working["blocks"] / "coarse"
+        found.append((folder, folder / RENDERING))
+    return found
+
+
+def _moved(folder: Path) -> int:
+    try:
+        return (folder / CHECKPOINT).stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def iteration_of(source: Source) -> int | None:
@@ -112,6 +149,8 @@ def load(source: Source, opened: Contents) -> Shown:
     """
     if source.kind == "checkpoint":
         gaussians, sky = _from_checkpoint(source.path, opened)
+        if sky is None and source.sky is not None:
+            sky = read_panorama(source.sky)
     else:
         gaussians = read_splat(source.path)
         sky = read_panorama(source.sky) if source.sky is not None else None
@@ -225,6 +264,9 @@ def _from_checkpoint(path: Path, opened: Contents) -> tuple[Gaussians, Panorama 
     except Exception as error:  # the readers of zip, of headers and of arrays raise almost anything on broken files
         raise SplatpipeError(f"The checkpoint cannot be read: {' '.join(str(error).split())[:120]}") from error
     gaussians = gaussians.select(gaussians.finite())
+    frozen = path.with_name(FROZEN)
+    if frozen.is_file():
+        gaussians = Gaussians.concat([gaussians, read_splat(frozen)])
     sky = None
     if colours is not None and "georef.frame" in opened.parts:
         # A checkpoint has no up of its own; the frame's is within a cell of it.

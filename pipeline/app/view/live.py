@@ -74,6 +74,7 @@ class Live:
                 "last_s": log.last_s,
                 "now_s": time.time(),
                 "stages": [stage.told() for stage in log.stages.values()],
+                "left_after_s": log.left_after_s,
                 "curves": {name: log.curves[name].points for name in CURVES if name in log.curves},
                 "notes": log.notes[-20:],
                 "model": model,

@@ -36,6 +36,8 @@ class StageState:
         unit: Of progress.
         trail: Times (seconds since the epoch) and progress, the last ``RATE_WINDOW_S``.
         message: Of a failure.
+        shard: Its number and how many there are; empty for a stage's own.
+        began_s: When it began, seconds since the epoch; 0 where it did not.
     """
 
     name: str
@@ -47,6 +49,8 @@ class StageState:
     unit: str = ""
     trail: list[tuple[float, float]] = field(default_factory=list)
     message: str = ""
+    shard: Mapping[str, int] = field(default_factory=dict)
+    began_s: float = 0.0
 
     def progress(self, data: Mapping[str, JSON], time_s: float) -> None:
         """Take an event of progress."""
@@ -178,6 +182,19 @@ class RunLog:
             self._stage_event(kind, self.stages[stage], data, time_s)
 
     @property
+    def left_after_s(self) -> float | None:
+        """About how long those shards take that come after the one at work; None where nothing tells, or none does."""
+        running = next((stage for stage in self.stages.values() if stage.state == "running" and stage.shard), None)
+        if running is None or running.seconds_left is None or self.last_s is None:
+            return None
+        of = stage_name(running.name)
+        done = [stage.seconds for name, stage in self.stages.items() if stage_name(name) == of and stage.seconds]
+        later = range(int(running.shard["number"]) + 1, int(running.shard["count"]) + 1)
+        open_ones = sum(f"{of}.{number}" not in self.stages for number in later)
+        each = [*done, self.last_s - running.began_s + running.seconds_left]
+        return open_ones * sum(each) / len(each) if open_ones else None
+
+    @property
     def unfinished(self) -> set[str]:
         """Stages that the last run began and did not end."""
         return {name for name, stage in self.stages.items() if stage.state in ("running", "failed")}
@@ -188,7 +205,8 @@ class RunLog:
         if kind == "progress":
             state.progress(data, time_s)
         elif kind == "stage_started":
-            state.state = "running"
+            state.state, state.began_s = "running", time_s
+            state.shard = data.get("shard", {})
         elif kind in ("stage_finished", "stage_reused"):
             state.state, state.seconds = kind.removeprefix("stage_").replace("finished", "done"), float(data["seconds"])
         elif kind == "stage_failed":

@@ -7,7 +7,12 @@ import uPlot from "uplot";
 const $ = (id) => document.getElementById(id);
 const EVERY_MS = 2000;
 const NAMES = { waiting: "waits", running: "at work", done: "done", reused: "reused", failed: "failed" };
-const MODELS = { initial: "the start, before training", checkpoint: "iteration", model: "finished, iteration" };
+const MODELS = {
+  initial: "the start, before training",
+  coarse: "the whole, which blocks go on from",
+  checkpoint: "iteration",
+  model: "finished, iteration",
+};
 
 let told = null;
 let updates = 0;
@@ -74,7 +79,9 @@ function showState(running, failed) {
         : ["failed", "not at work"];
   $("state").className = `state ${kind}`;
   $("state").textContent = text;
-  $("left").textContent = told.at_work && running?.seconds_left != null ? `${duration(running.seconds_left)} left in ${running.name}` : "";
+  const after = told.left_after_s ? `, ${duration(running.seconds_left + told.left_after_s)} with those after it` : "";
+  $("left").textContent =
+    told.at_work && running?.seconds_left != null ? `${duration(running.seconds_left)} left in ${running.name}${after}` : "";
 }
 
 function showProgress(running) {
@@ -99,7 +106,7 @@ function showViews() {
   const model = told.model;
   for (const id of ["view", "previous", "next"]) $(id).disabled = number < 0;
   $("nothing").hidden = Boolean(model);
-  $("iteration").textContent = model ? [MODELS[model.kind], model.kind === "initial" ? "" : model.iteration?.toLocaleString("en")].join(" ") : "";
+  $("iteration").textContent = model ? [MODELS[model.kind], ["initial", "coarse"].includes(model.kind) ? "" : model.iteration?.toLocaleString("en")].join(" ") : "";
   $("viewer").hidden = !model?.in_3d;
   $("viewer").href = `/live/${model?.stamp}/viewer.html`;
   if (model && number >= 0) picture(model.stamp, number);

@@ -1,0 +1,135 @@
+"""Trained blocks joined to what a training of the whole leaves: model, history, plan and side models."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
+from splatpipe.pipeline.render.rendering import load_rendering
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
+from splatpipe.pipeline.train.blocks.merging import merged
+from splatpipe.pipeline.train.blocks.site_plan import load_site_plan
+
+OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # are the coarse pass's, which looked at the whole
+FROM_COARSE = ("train_megapixels", "sky_photos", "device", "instruction_set", "mode")
+
+
+def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write what stage `train` leaves, from its shards and the coarse pass.
+
+    Args:
+        inputs: The stage's.
+        out: Where to.
+        report: Told of progress.
+
+    Raises:
+        StageError: if a part of a block is broken.
+    """
+    site, coarse = load_site_plan(inputs["blocks.plan"]), inputs["blocks.coarse"]
+    report.progress(0, len(inputs.shards), "merging blocks", "blocks")
+    blocks = _Models(inputs.shards, report)
+    gaussians = merged(site.partition, read_splat(coarse / "model.ply"), blocks)
+    antialias = load_rendering(coarse / "rendering.json").antialias
+    write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if antialias else [])
+    for name in OF_ALL:
+        shutil.copyfile(coarse / name, out / name)
+    histories = [_read(folder / "history.json") for folder in inputs.shards]
+    history = joint_history(_read(coarse / "history.json"), histories)
+    (out / "history.json").write_text(json.dumps(history, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    plans = {"coarse": _read(coarse / "plan.json"), "blocks": [_read(each / "plan.json") for each in inputs.shards]}
+    (out / "plan.json").write_text(json_text(plans), encoding="utf-8")
+    most = sum(block.share for block in site.blocks)
+    return {"gaussians": len(gaussians), "blocks": len(inputs.shards), **_told(inputs, history, most)}
+
+
+class _Models(Mapping[int, Gaussians]):
+    """What each block trained, read when it is asked for, so that there is one in memory at a time."""
+
+    def __init__(self, folders: Sequence[Path], report: Reporter) -> None:
+        self._folders, self._report = folders, report
+
+    def __getitem__(self, block: int) -> Gaussians:
+        found = read_splat(self._folders[block] / "model.ply")
+        self._report.progress(block + 1, len(self._folders), "merging blocks", "blocks")
+        return found
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(range(len(self._folders)))
+
+    def __len__(self) -> int:
+        return len(self._folders)
+
+
+def joint_history(coarse: Mapping[str, Any], blocks: Sequence[Mapping[str, Any]]) -> dict[str, JSON]:
+    """The history of the coarse pass, and after it that of all blocks as if they had been trained side by side.
+
+    A point of the curve has the iterations of all, their mean loss and the Gaussians of all together; each block's own
+    history is there, too.
+
+    Args:
+        coarse: The coarse pass's `history.json`.
+        blocks: The blocks', in their order.
+    """
+    before = list(coarse["curve"])
+    done = int(before[-1]["iteration"]) if before else 0
+    curves = [block["curve"] for block in blocks if block["curve"]]
+    return {
+        "curve": [*before, *_side_by_side(curves, done)],
+        "density": [],
+        "resets": list(coarse["resets"]),
+        "growth_ended": 0,
+        "skipped_gradients": sum(int(each["skipped_gradients"]) for each in (coarse, *blocks)),
+        "coarse_iterations": done,
+        "blocks": [dict(block) for block in blocks],
+    }
+
+
+def _side_by_side(curves: Sequence[Sequence[Mapping[str, Any]]], before: int) -> list[dict[str, JSON]]:
+    found = []
+    length = max(map(len, curves), default=0)
+    for step in range(1, length + 1):
+        points = [curve[math.ceil(step * len(curve) / length) - 1] for curve in curves]
+        told = [(float(point["loss"]), float(point["iteration"])) for point in points if point["loss"] is not None]
+        weight = sum(iterations for _, iterations in told)
+        found.append(
+            {
+                "iteration": before + sum(int(point["iteration"]) for point in points),
+                "loss": sum(loss * iterations for loss, iterations in told) / weight if weight else None,
+                "gaussians": sum(int(point["gaussians"]) for point in points),
+                "sh_degree": max(int(point["sh_degree"]) for point in points),
+                "width": max(int(point["width"]) for point in points),
+            }
+        )
+    return found
+
+
+def _told(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JSON]:
+    """What people are told of the training: sums over its blocks, with the coarse pass; the loss is the blocks'."""
+    first = inputs.summaries.get("blocks", {}).get("coarse", {})
+    each = [inputs.summaries.get(f"train.{number}", {}) for number in range(1, len(inputs.shards) + 1)]
+    losses = [point["loss"] for point in history["curve"] if point["loss"] is not None]
+    parts = [first, *each]
+    found: dict[str, JSON] = {
+        "iterations": sum(int(part.get("iterations", 0)) for part in parts),
+        "planned_iterations": sum(int(part.get("planned_iterations", 0)) for part in parts),
+        "loss": losses[-1] if losses else None,
+        "train_seconds": round(sum(float(part.get("train_seconds", 0.0)) for part in parts), 1),
+        "peak_memory_bytes": max(int(part.get("peak_memory_bytes", 0)) for part in parts),
+    }
+    plan = {**first.get("plan", {}), "max_gaussians": most, "blocks": len(each)}
+    return found | {name: first[name] for name in FROM_COARSE if name in first} | {"plan": plan}
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from train.") from error

@@ -1,0 +1,89 @@
+"""The cells of a site and what each block may take, from a coarse model of the whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan
+from splatpipe.pipeline.geometry.plan_area import read_model_area
+from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_split, load_views
+from splatpipe.pipeline.photos.small_views import small_view
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
+from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
+from splatpipe.pipeline.train.blocks.division import Division
+from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
+from splatpipe.pipeline.train.blocks.partition import Partition
+from splatpipe.pipeline.train.blocks.site_plan import SitePlan, block_limits
+from splatpipe.pipeline.train.options import TrainConfig
+
+
+def lay_out(
+    train: TrainConfig, inputs: Inputs, division: Division, coarse: Path, report: Reporter
+) -> tuple[SitePlan, dict[str, JSON]]:
+    """Cut a site into cells and share the cap among them.
+
+    Args:
+        train: Options of training.
+        inputs: The stage's.
+        division: Into how many blocks, and what one may take.
+        coarse: Folder of the coarse pass.
+        report: Told of what is being done.
+
+    Returns:
+        The plan, and what people are told of its blocks.
+    """
+    dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
+    kept = set(load_split(inputs["split.views"]).train)
+    views = [view for view in load_views(dataset) if view.camera.name in kept]
+    points, tracks = load_points_and_tracks(dataset)
+    xyz, observed = points.xyz, [tracks[view.camera.name] for view in views]
+    area = read_model_area(inputs.parts.get("georef.boundary"))
+    report.progress(0, 1, "cutting the site into blocks")
+    seen = coarse_sights(coarse, views, observed, inputs.machine)
+    with same_bits(threads):
+        plan = GroundPlan.across(upward(views, xyz, threads))
+        work = work_map(plan, site(plan, seen, xyz, area), seen, xyz)
+        partition = cut(work, division.blocks)
+        means = read_splat(coarse / "model.ply").means.double().numpy()
+        weights = shares(work, partition).mean(axis=0).tolist()
+        counted = [(weight, *_counted(partition, k, means)) for k, weight in enumerate(weights)]
+        outlooks = block_outlooks(train, views, seen, xyz, partition, division.window_pixels)
+    limits = block_limits(division, train.sh_degree, counted)
+    told: Mapping[str, JSON] = {
+        "limit_bytes": division.limit_bytes,
+        "margin": partition.margin,
+        "photos": [outlook.photos for outlook in outlooks],
+        "iterations": [outlook.iterations for outlook in outlooks],
+        "gaussians": [limit.share for limit in limits],
+        "disk_bytes": [outlook.disk_bytes for outlook in outlooks],
+    }
+    return SitePlan(partition, tuple(limits), division.window_pixels, division.limit_bytes), {"of_blocks": told}
+
+
+def upward(views: Sequence[View], xyz: Float64[np.ndarray, "p 3"], threads: int) -> Float64[np.ndarray, " 3"]:
+    """The unit vector against gravity, by the cameras alone: new control moves the frame, and no training.
+
+    Args:
+        views: Photos.
+        xyz: The sparse points.
+        threads: That read photos, where these seem to be turned.
+    """
+
+    def photo(index: int) -> SkyPhoto:
+        camera, pixels, mask = small_view(views[index], WORK_MEGAPIXELS)
+        return SkyPhoto(camera, pixels, None if mask is None else ~mask)
+
+    return up_of([view.camera for view in views], photo, xyz[np.isfinite(xyz).all(axis=1)], threads)
+
+
+def _counted(partition: Partition, block: int, means: Float64[np.ndarray, "n 3"]) -> tuple[int, int]:
+    """Gaussians in a block's cell, and in its cell and margin."""
+    places = partition.plan.places(means)
+    return int(partition.cells[block].contains(places).sum()), int(partition.trained_by(block, means).sum())

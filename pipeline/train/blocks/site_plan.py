@@ -1,0 +1,137 @@
+"""What the stage `blocks` leaves for those who train and merge: how many blocks there are, and what each may take."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.train.blocks.division import Division
+from splatpipe.pipeline.train.blocks.needs import MARGIN_GROWTH, frozen_bytes, shared_cap, with_margin
+from splatpipe.pipeline.train.blocks.partition import Partition
+from splatpipe.pipeline.train.limits import FIXED_BYTES, LIBRARIES_BYTES, PIXEL_BYTES, bytes_per_gaussian
+
+MOST_GROWTH = 2.0 * MARGIN_GROWTH  # of a cell with its margin over the cell: beyond it, its neighbours are what is full
+
+
+@dataclass(frozen=True)
+class BlockLimits:
+    """What a block may take.
+
+    Attributes:
+        share: Gaussians of the merged scene in its cell, at most.
+        trained: Gaussians that it trains, in cell and margin, at most.
+        frozen: Gaussians that it draws besides, at most.
+    """
+
+    share: int
+    trained: int
+    frozen: int
+
+
+@dataclass(frozen=True)
+class SitePlan:
+    """How a scene is trained in blocks.
+
+    Attributes:
+        partition: The cells.
+        blocks: What each may take, in the cells' order.
+        window_pixels: Of a photo, that an iteration looks at at most.
+        limit_bytes: Of memory; 0 for none.
+    """
+
+    partition: Partition
+    blocks: tuple[BlockLimits, ...]
+    window_pixels: int
+    limit_bytes: int
+
+    def to_json(self) -> str:
+        """The text of `blocks.json`."""
+        fields = {
+            "shards": len(self.blocks),
+            "limit_bytes": self.limit_bytes,
+            "window_pixels": self.window_pixels,
+            "partition": self.partition.facts(),
+            "blocks": [asdict(block) for block in self.blocks],
+        }
+        return json_text(fields)
+
+
+def whole_json() -> str:
+    """The text of `blocks.json` where the scene is trained in one."""
+    return json_text({"shards": 0})
+
+
+def load_site_plan(path: Path) -> SitePlan:
+    """Read what `blocks` left of a scene that is trained in blocks.
+
+    Raises:
+        StageError: if it is not that.
+    """
+    try:
+        fields: Any = json.loads(path.read_text(encoding="utf-8"))
+        partition = Partition.of_facts(fields["partition"])
+        blocks = tuple(BlockLimits(**block) for block in fields["blocks"])
+        if len(blocks) != len(partition.cells):
+            raise ValueError("another number of cells")
+        return SitePlan(partition, blocks, int(fields["window_pixels"]), int(fields["limit_bytes"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
+
+
+def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[float, int, int]]) -> list[BlockLimits]:
+    """Share the cap among blocks, so that each keeps to the limit of memory.
+
+    Args:
+        division: How the scene is divided.
+        sh_degree: Of the model.
+        counted: Of each block its weight, and the coarse model's Gaussians in its cell, and in cell and margin.
+    """
+    most = division.need.trained
+    weights = [weight for weight, _, _ in counted]
+    grown = [min(MOST_GROWTH, block / cell) if cell else MARGIN_GROWTH for _, cell, block in counted]
+    tops = [max(1, int(most / growth)) if division.limit_bytes else division.cap for growth in grown]
+    found = []
+    for share, (_, in_cell, in_block) in zip(capped_shares(division.cap, weights, tops), counted, strict=True):
+        wanted = with_margin(share, in_cell, in_block)
+        trained = max(share, min(wanted, most)) if division.limit_bytes else wanted
+        found.append(BlockLimits(share, trained, _frozen(division, trained, sh_degree)))
+    return found
+
+
+def _frozen(division: Division, trained: int, sh_degree: int) -> int:
+    """Gaussians around a block that memory has room for; where there is no limit, all that a coarse model has."""
+    if not division.limit_bytes:
+        return max(1, division.coarse_cap)
+    room = division.limit_bytes - LIBRARIES_BYTES - FIXED_BYTES - PIXEL_BYTES * division.window_pixels
+    left = room - trained * bytes_per_gaussian(sh_degree)
+    return max(1, min(division.coarse_cap, left // frozen_bytes(sh_degree)))
+
+
+def capped_shares(cap: int, weights: Sequence[float], tops: Sequence[int]) -> list[int]:
+    """A cap shared by weight among blocks of which each takes no more than its own; what one cannot take, others do.
+
+    Args:
+        cap: Of all together.
+        weights: Of each, not negative; equal where all are 0.
+        tops: The most of each.
+
+    Returns:
+        The shares; less than the cap together only where all have their most.
+    """
+    shares = [0] * len(weights)
+    open_ones, rest = list(range(len(weights))), cap
+    while open_ones:
+        parts = shared_cap(rest, [weights[k] for k in open_ones])
+        full = [k for k, part in zip(open_ones, parts, strict=True) if part >= tops[k]]
+        for k, part in zip(open_ones, parts, strict=True):
+            shares[k] = min(part, tops[k])
+        if not full:
+            break
+        rest -= sum(tops[k] for k in full)
+        open_ones = [k for k in open_ones if k not in full]
+    return shares

@@ -1,0 +1,70 @@
+"""What blocks add to a line's work, before anything of the site is known but the photos' number and size. Light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from splatpipe.pipeline.train.blocks.division import Division
+from splatpipe.pipeline.train.blocks.needs import round_pixels
+from splatpipe.pipeline.train.lengths import Footage, Length, stretches
+
+MEGA = 1e6
+SEEN_BY = 12.0  # photos that show a place: what 80 % of overlap along the lines and 60 % across give, with some oblique
+PYRAMID = 4.0 / 3.0  # times a photo's pixels: with all its halves
+DECODED_BYTES = 3  # of a pixel
+SPLAT_BYTES = 249  # of a Gaussian in a file
+SIGHT_BYTES = 40_000  # of a photo: the coarse depth by which blocks know what it sees
+
+
+@dataclass(frozen=True)
+class BlockWork:
+    """A site that is trained in blocks.
+
+    Attributes:
+        division: How many, and what one may take.
+        footage: The photos as they are trained on.
+        coarse: Levels and iterations of the pass over the whole.
+        finer: Those that the blocks would have together if no window were looked at twice.
+    """
+
+    division: Division
+    footage: Footage
+    coarse: tuple[Length, ...]
+    finer: tuple[Length, ...]
+
+    def repeats(self, level: int) -> float:
+        """How many blocks look at a window, on average."""
+        blocks, photos = self.division.blocks, max(1, self.footage.photos)
+        parts = self.footage.parts(level) / photos
+        return blocks * round_pixels(1.0, blocks, math.sqrt(min(1.0, SEEN_BY / photos) / parts), 1.0)
+
+    @property
+    def lengths(self) -> tuple[Length, ...]:
+        """Levels and iterations of all blocks together."""
+        return tuple((level, round(count * self.repeats(level))) for level, count in self.finer)
+
+    @property
+    def photos(self) -> float:
+        """That a block looks at, whole or in part."""
+        blocks, photos = self.division.blocks, max(1, self.footage.photos)
+        return photos * round_pixels(1.0, blocks, math.sqrt(min(1.0, SEEN_BY / photos)), 1.0)
+
+    def megapixels(self, lengths: Sequence[Length]) -> float:
+        """That iterations look at."""
+        done, total = 0, 0.0
+        for stretch in stretches(self.footage, lengths):
+            total += (stretch.until - done) * self.footage.pixels(stretch.look) / MEGA
+            done = stretch.until
+        return total
+
+    @property
+    def coarse_bytes(self) -> int:
+        """Of the coarse pass's files."""
+        return int(SPLAT_BYTES * self.division.coarse_cap + SIGHT_BYTES * self.footage.photos)
+
+    @property
+    def block_bytes(self) -> int:
+        """Of what all blocks leave."""
+        return int(SPLAT_BYTES * self.division.blocks * self.division.need.trained)

@@ -1,0 +1,131 @@
+"""blocks: whether a scene is trained whole or in blocks; for blocks the coarse pass over all, and the cells."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.machine import available_memory_bytes
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.dataset import load_split, load_views
+from splatpipe.pipeline.photos.options import UndistortConfig
+from splatpipe.pipeline.raster.device import Device, choose_device
+from splatpipe.pipeline.splat.ply import read_splat_header
+from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
+from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divided, memory_limit
+from splatpipe.pipeline.train.blocks.layout import lay_out
+from splatpipe.pipeline.train.blocks.options import BlocksConfig
+from splatpipe.pipeline.train.blocks.site_plan import whole_json
+from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.limits import LIBRARIES_BYTES
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.stages.costs import REFERENCE
+from splatpipe.stages.options import LineConfig
+from splatpipe.stages.work import MEGA, CaptureSize, Work
+
+LARGEST_PHOTO = 200.0  # megapixels: the dataset's own size is what counts
+
+
+def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `blocks.json` and `coarse/`: model, sky and exposures of the whole, as blocks begin; empty without blocks.
+
+    What was decided lies in `division.json` before anything is trained, so a run that goes on elsewhere goes on alike.
+
+    Raises:
+        MachineError: if the device asked for is not there.
+        KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
+    """
+    train = TrainConfig.model_validate(
+        {name.removeprefix("train."): value for name, value in inputs.settings.items() if name.startswith("train.")}
+    )
+    device = choose_device(inputs.machine.device, train.unfit_for_cuda(), report.note)
+    plan = _whole_plan(train, inputs, device)
+    division = kept_division(out / "division.json", lambda: _division(config, train, plan, device))
+    coarse = out / "coarse"
+    coarse.mkdir(exist_ok=True)
+    if division.is_whole:
+        (out / "blocks.json").write_text(whole_json(), encoding="utf-8")
+        return {"blocks": 1}
+    _tell(division, train, report)
+    told = out / "coarse.json"
+    if not told.is_file():
+        limits = Limits(division.coarse_cap, division.window_pixels)
+        summary = train_coarse(train, inputs, limits, coarse, report)
+        write_durably(told, json.dumps(dict(summary)))
+    (coarse / "checkpoint.npz").unlink(missing_ok=True)
+    site, told_of_blocks = lay_out(train, inputs, division, coarse, report)
+    (out / "blocks.json").write_text(site.to_json(), encoding="utf-8")
+    return {"blocks": division.blocks, **told_of_blocks, "coarse": json.loads(told.read_text(encoding="utf-8"))}
+
+
+def kept_division(path: Path, make: Callable[[], Division]) -> Division:
+    """What was decided before in this folder, which is of one key; decided now where nothing was.
+
+    Args:
+        path: Where it is kept.
+        make: Decides.
+    """
+    try:
+        return Division.of_facts(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError):
+        division = make()
+        write_durably(path, json.dumps(asdict(division)))
+        return division
+
+
+def _whole_plan(train: TrainConfig, inputs: Inputs, device: Device) -> Plan:
+    """The training of the scene in one, without limits of memory."""
+    views, split = load_views(inputs["undistort.dataset"]), load_split(inputs["split.views"])
+    start = read_splat_header(inputs["initialize.splat"]).count
+    return make_plan(train, views, split, start, WINDOW_PIXELS[device.name])
+
+
+def _division(config: BlocksConfig, train: TrainConfig, plan: Plan, device: Device) -> Division:
+    if train.time_budget_s:  # which plans one training
+        return divided(_scene(train, plan), 0)
+    limit = memory_limit(train.max_memory_bytes, _memory_of(device))
+    if limit and device.name == "cuda":
+        limit += LIBRARIES_BYTES  # which are not in the card's memory
+    return divided(_scene(train, plan), limit, config.least)
+
+
+def _memory_of(device: Device) -> int:
+    if device.name == "cuda":
+        return int(torch.cuda.get_device_properties(device.tensors).total_memory)
+    return available_memory_bytes()
+
+
+def _scene(train: TrainConfig, plan: Plan) -> SceneSize:
+    window = max(plan.footage.largest(stretch.look) for stretch in plan.schedule.stretches)
+    photos = sum(count for _width, _height, count in plan.sizes)
+    pixels = sum(width * height * count for width, height, count in plan.sizes) / max(photos, 1)
+    size = CaptureSize(photos, pixels / MEGA, True, _shape(plan))
+    whole = LineConfig(train=train, undistort=UndistortConfig(max_megapixels=LARGEST_PHOTO))
+    expected = Work.of(size, whole, REFERENCE, threads=1).grown
+    return SceneSize(train.max_gaussians, expected, window, train.sh_degree, photos)
+
+
+def _shape(plan: Plan) -> float:
+    """The shorter side over the longer one of the commonest photos."""
+    width, height, _count = max(plan.sizes, key=lambda size: size[2])
+    return min(width, height) / max(width, height)
+
+
+def _tell(division: Division, train: TrainConfig, report: Reporter) -> None:
+    """The decision for people."""
+    told = f"{division.cap:,} Gaussians are trained in {division.blocks} blocks"
+    if division.limit_bytes:
+        told += f", each within {division.limit_bytes / 1e9:.1f} GB"
+    report.note(f"{told}, after a coarse pass with {division.coarse_cap:,}")
+    if division.cap < train.max_gaussians:
+        report.warning(
+            f"{division.limit_bytes / 1e9:.2f} GB hold {division.cap:,} Gaussians in {division.blocks} blocks, fewer "
+            f"than the {train.max_gaussians:,} of train.max_gaussians; of so few photos there are no more blocks.",
+            hint="Give more with --max-memory for a finer model.",
+        )

@@ -1,0 +1,214 @@
+"""Blocks in the line: how many there are, shards of the training, and what they are joined to."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.lock import locked_shard
+from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks.assembly import joint_history
+from splatpipe.pipeline.train.blocks.division import PHOTOS_A_BLOCK, Division, SceneSize, divided, memory_limit
+from splatpipe.pipeline.train.blocks.needs import need_of_blocks
+from splatpipe.pipeline.train.blocks.options import BlocksConfig
+from splatpipe.pipeline.train.blocks.site_plan import block_limits, capped_shares, load_site_plan
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.stages import blocks, initialize, train
+
+sys.path.insert(0, str(Path(__file__).parent / "lines"))
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import block_line
+import building_site
+import tiny_scene
+
+LINE = Path(__file__).parent / "lines" / "block_line.py"
+SITE = SceneSize(cap=1_000_000, expected=3e6, window_pixels=1 << 19, sh_degree=3, photos=400)
+QUICK = tiny_scene.plain(iterations=80, max_gaussians=6000, sh_degree=0).model_dump()
+OPTIONS: Mapping[str, object] = {"train": QUICK, "blocks": {"least": 3}}
+SHARDS = ("train.1", "train.2", "train.3")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What comes before blocks: a dataset of 30 photos, its split, the initial Gaussians."""
+    folder = tmp_path_factory.mktemp("scene")
+    dataset = building_site.write_dataset(folder / "dataset")
+    parts = {"undistort.dataset": dataset, **tiny_scene.split_part(dataset, 8)}
+    parts["split.views"].rename(folder / "split.json")
+    (folder / "boundary.json").write_text(json.dumps({"model": None, "world": None}))
+    initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An OUT that one process made from beginning to end."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    assert block_line.make(scene, out, OPTIONS).ran == ["blocks", *SHARDS, "train"]
+    return out
+
+
+def inputs(scene: Path, config: TrainConfig, **more: Path) -> Inputs:
+    parts = {name: scene / path for name, path in block_line.GIVEN.items()} | {
+        name.replace("_", "."): path for name, path in more.items()
+    }
+    settings = {f"train.{name}": value for name, value in config.model_dump().items()}
+    return Inputs(parts, scene, settings, Machine("cpu", 1))
+
+
+def part(out: Path, name: str) -> Path:
+    stage, _, file = name.partition("/")
+    (found,) = out.glob(f"stages/{stage}-*/{file}")
+    return found
+
+
+def digests(out: Path) -> dict[str, str]:
+    """Of all that `blocks`, each shard and `train` left."""
+    files = [path for path in out.glob("stages/*-*/**/*") if path.is_file() and path.name != "manifest.json"]
+    return {
+        path.relative_to(out / "stages").as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
+    }
+
+
+def alone(scene: Path, out: Path, shard: str, threads: int) -> subprocess.Popen[str]:
+    words = [sys.executable, str(LINE), scene, out, shard, json.dumps(OPTIONS), threads]
+    return subprocess.Popen(list(map(str, words)), stdout=subprocess.PIPE, text=True, start_new_session=True)
+
+
+@pytest.mark.parametrize("limit", [1_000_000_000, 1_500_000_000, 2_000_000_000])
+def test_a_cap_that_does_not_fit_stays_and_the_scene_is_cut(limit: int) -> None:
+    found = divided(SITE, limit)
+    assert found.blocks > 1 and found.cap == SITE.cap and found.memory_bytes <= limit
+    assert found.coarse_cap <= found.need.trained < found.cap
+    fewer = need_of_blocks(found.blocks - 1, SITE.cap, found.window_pixels, SITE.sh_degree)
+    assert fewer.memory_bytes > limit - (found.memory_bytes - found.need.memory_bytes)  # as few as there can be
+
+
+def test_what_fits_or_will_not_come_near_the_cap_is_one_whole() -> None:
+    assert divided(SITE, 0).is_whole and divided(SITE, 8_000_000_000).is_whole
+    assert divided(replace(SITE, expected=90_000.0), 1_500_000_000).is_whole
+    assert divided(SITE, 0, least=4).blocks == divided(SITE, 8_000_000_000, least=4).blocks == 4
+
+
+def test_few_photos_have_few_blocks_and_then_the_cap_is_what_these_hold() -> None:
+    few = divided(replace(SITE, photos=5 * PHOTOS_A_BLOCK), 1_000_000_000)
+    assert few.blocks == 5 and 0 < few.cap < SITE.cap and few.memory_bytes <= 1_000_000_000
+    assert divided(replace(SITE, photos=PHOTOS_A_BLOCK), 1_000_000_000).is_whole
+    assert divided(SITE, 500_000_000).is_whole  # which says itself that it is too little
+
+
+def test_a_limit_that_was_asked_for_counts_before_the_machines() -> None:
+    assert memory_limit(3, 100) == 3 and 0 < memory_limit(0, 100) < 100 and memory_limit(0, 0) == 0
+
+
+def test_shares_add_up_to_the_cap_and_no_block_has_more_than_fits() -> None:
+    assert capped_shares(100, [1.0, 1.0, 2.0], [90, 90, 90]) == [25, 25, 50]
+    assert capped_shares(100, [1.0, 1.0, 8.0], [90, 90, 40]) == [30, 30, 40]
+    assert capped_shares(100, [1.0, 1.0], [10, 10]) == [10, 10]
+    division = divided(SITE, 1_500_000_000)
+    counted = [(1.0, 1000, 1400), (3.0, 2000, 2300), (1.0, 0, 0), *[(1.0, 1000, 1400)] * (division.blocks - 3)]
+    limits = block_limits(division, SITE.sh_degree, counted)
+    assert sum(each.share for each in limits) == SITE.cap
+    for each in limits:
+        assert 0 < each.share <= each.trained <= division.need.trained and each.frozen > 0
+
+
+def test_without_blocks_nothing_is_trained_before_and_training_is_as_it_was(scene: Path, tmp_path: Path) -> None:
+    config = tiny_scene.plain(iterations=12, sh_degree=0)
+    folders = [tmp_path / name for name in ("blocks", "whole", "line")]
+    for folder in folders:
+        folder.mkdir()
+    summary = blocks.run(BlocksConfig(), inputs(scene, config), folders[0], tiny_scene.Recorder())
+    assert summary == {"blocks": 1} and json.loads((folders[0] / "blocks.json").read_text()) == {"shards": 0}
+    assert not list((folders[0] / "coarse").iterdir())
+    more = {"blocks_plan": folders[0] / "blocks.json", "blocks_coarse": folders[0] / "coarse"}
+    loop.run(config, inputs(scene, config), folders[1], tiny_scene.Recorder())
+    train.run(config, inputs(scene, config, **more), folders[2], tiny_scene.Recorder())
+    for name in ("model.ply", "history.json", "plan.json", "rendering.json", "exposures.json", "sky.npz"):
+        assert (folders[1] / name).read_bytes() == (folders[2] / name).read_bytes()
+
+
+def test_a_machine_with_other_memory_goes_on_with_the_division_that_was_made(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny_scene.plain(iterations=12, sh_degree=0, max_gaussians=2_000_000)
+    monkeypatch.setattr(blocks, "available_memory_bytes", lambda: 32 << 30)
+    blocks.run(BlocksConfig(), inputs(scene, config), tmp_path, tiny_scene.Recorder())
+    kept = (tmp_path / "division.json").read_bytes()
+    monkeypatch.setattr(blocks, "available_memory_bytes", lambda: 1 << 30)
+    assert blocks.run(BlocksConfig(), inputs(scene, config), tmp_path, tiny_scene.Recorder()) == {"blocks": 1}
+    assert (tmp_path / "division.json").read_bytes() == kept
+    division = divided(SITE, 1_500_000_000)
+    assert Division.of_facts(json.loads(json.dumps(asdict(division)))) == division
+
+
+def test_blocks_are_joined_to_what_a_training_leaves(undisturbed: Path) -> None:
+    site = load_site_plan(part(undisturbed, "blocks/blocks.json"))
+    model = read_splat(part(undisturbed, "train/model.ply"))
+    assert len(site.blocks) == 3 and sum(each.share for each in site.blocks) == 6000
+    each = [len(read_splat(part(undisturbed, f"{name}/model.ply"))) for name in SHARDS]
+    assert 0 < len(model) <= sum(each) + len(read_splat(part(undisturbed, "blocks/coarse/model.ply")))
+    coarse = part(undisturbed, "blocks/coarse")
+    for name in ("sky.npz", "exposures.json", "rendering.json"):
+        assert part(undisturbed, f"train/{name}").read_bytes() == (coarse / name).read_bytes()
+    manifest = json.loads(part(undisturbed, "train/manifest.json").read_text())
+    history = json.loads(part(undisturbed, "train/history.json").read_text())
+    steps = [point["iteration"] for point in history["curve"]]
+    assert steps == sorted(steps) and steps[-1] == manifest["summary"]["iterations"] >= 80
+    assert manifest["summary"]["blocks"] == len(history["blocks"]) == 3
+    assert manifest["summary"]["gaussians"] == len(model) and manifest["summary"]["plan"]["max_gaussians"] == 6000
+    assert manifest["summary"]["loss"] < history["curve"][0]["loss"]
+
+
+def test_any_order_any_threads_and_a_kill_in_a_block_give_the_same_bits(
+    scene: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    """Blocks of two processes, the last one first, each killed with -9 in its training, made again on two threads."""
+    block_line.make(scene, tmp_path, {**OPTIONS, "blocks": {"least": 0}}, until="blocks")
+    block_line.make(scene, tmp_path, OPTIONS, until="blocks")
+    for shard in reversed(SHARDS):
+        with alone(scene, tmp_path, shard, 1) as process:
+            assert process.stdout is not None and process.stdout.readline().startswith(shard)
+            os.killpg(process.pid, signal.SIGKILL)
+        assert not list(tmp_path.glob(f"stages/{shard}-*"))
+    assert block_line.make(scene, tmp_path, OPTIONS, "train.3", threads=2).ran == ["train.3"]
+    assert block_line.make(scene, tmp_path, OPTIONS, threads=2).ran == ["train.1", "train.2", "train"]
+    found, wanted = digests(tmp_path), digests(undisturbed)
+    assert {name: found[name] for name in wanted} == wanted
+
+
+def test_two_makers_of_one_block_are_refused_and_of_two_are_not(
+    scene: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
+    with locked_shard(undisturbed, "train.2"):
+        with pytest.raises(UsageError, match=r"is making train\.2 in"):
+            block_line.make(scene, undisturbed, OPTIONS, "train.2")
+        with pytest.raises(UsageError, match=r"is making train\.2 in|is working in"):
+            block_line.make(scene, undisturbed, OPTIONS)
+        assert block_line.make(scene, undisturbed, OPTIONS, "train.1").ran == []  # it is there
+
+
+def test_the_history_of_blocks_is_one_curve_after_the_coarse_pass() -> None:
+    def history(*curve: tuple[int, float, int]) -> dict[str, object]:
+        points = [
+            {"iteration": step, "loss": loss, "gaussians": count, "sh_degree": 0, "width": 9}
+            for step, loss, count in curve
+        ]
+        return {"curve": points, "resets": [], "skipped_gradients": 1}
+
+    joint = joint_history(history((50, 0.5, 10)), [history((50, 0.4, 5), (100, 0.2, 9)), history((60, 0.3, 7))])
+    assert [(point["iteration"], point["gaussians"]) for point in joint["curve"]] == [(50, 10), (160, 12), (210, 16)]
+    assert joint["curve"][-1]["loss"] == pytest.approx((100 * 0.2 + 60 * 0.3) / 160)
+    assert joint["skipped_gradients"] == 3 and len(joint["blocks"]) == 2
