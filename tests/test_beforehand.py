@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.cli_runs import request_of
+from splatpipe.pipeline.app.cli_runs import overrides, request_of
 from splatpipe.pipeline.app.preflight.start import require_memory, told_beforehand
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError
@@ -31,6 +31,14 @@ def test_a_limit_that_no_training_keeps_to_is_refused_before_anything_is_done(tm
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 4 and "No training keeps to 0.50 GB" in done.stderr and "at least" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "size"),
+    [([], 0.5), (["train.time_budget_s=60"], 0.0), (["train.time_budget_s=60", "train.max_megapixels=0.4"], 0.4)],
+)
+def test_a_time_budget_may_take_all_of_the_photos_unless_somebody_says_less(said: list[str], size: float) -> None:
+    assert overrides(None, said, None).resolve(load_preset("standard")).train.max_megapixels == size
 
 
 def test_the_least_limit_that_is_told_is_taken(tmp_path: Path) -> None:

@@ -28,9 +28,12 @@ class Overrides:
     tables: Sequence[dict[str, Any]]
 
     def resolve(self, *below: dict[str, Any]) -> LineConfig:
-        from splatpipe.pipeline.engine.config import resolve
+        from splatpipe.pipeline.engine.config import merge, resolve
         from splatpipe.stages.options import LineConfig
 
+        train = merge(self.tables).get("train")
+        if isinstance(train, dict) and train.get("time_budget_s"):
+            below = (*below, {"train": {"max_megapixels": 0.0}})  # a preset's size goes with its own length
         return resolve(LineConfig, [*below, *self.tables])
 
 
