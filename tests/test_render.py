@@ -29,9 +29,10 @@ from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.render.rendering import render_normals, render_pixels
+from splatpipe.pipeline.render import rendering
+from splatpipe.pipeline.render.rendering import render_depth, render_normals, render_pixels
 from splatpipe.pipeline.splat.gaussians import Gaussians, quat_from_rotation
-from splatpipe.pipeline.splat.panorama import write_panorama
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, write_panorama
 from splatpipe.pipeline.splat.ply import write_splat
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.train.options import TrainConfig
@@ -295,6 +296,23 @@ def test_normals_of_a_slanted_wall_are_its_own() -> None:
         assert np.degrees(np.arccos(np.clip(seen @ towards, -1.0, 1.0))).max() < 2.0
     empty = wall.select(torch.zeros(len(wall), dtype=torch.bool))
     assert not render_normals(empty, camera, rasterizer.RenderOptions(sh_degree=0)).any()
+
+
+@pytest.mark.parametrize("pixels", [1, 3000, 1 << 21])
+def test_pictures_made_strip_by_strip_are_those_of_one_piece(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, options = tiny_scene.true_model(), rasterizer.RenderOptions(sh_degree=0)
+    sky = Panorama(np.array([0.0, 0.6, 0.8]), torch.rand(ROWS * COLUMNS, 3, generator=torch.Generator().manual_seed(1)))
+    camera = tiny_scene.cameras()[0].scaled(151, 117)
+
+    def made() -> list[np.ndarray]:
+        depths, normals = (render(model, camera, options) for render in (render_depth, render_normals))
+        return [render_pixels((model, sky), camera, options), depths, normals]
+
+    whole = made()
+    monkeypatch.setattr(rendering, "STRIP_PIXELS", pixels)
+    assert len(rendering.strips(camera)) == {1: 15, 3000: 8, 1 << 21: 1}[pixels]
+    for one, other in zip(whole, made(), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)  # a part's pixels count from another corner
 
 
 def test_colours_of_depths_and_normals() -> None:

@@ -148,7 +148,7 @@ def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
     if isinstance(error, MemoryError) or any(said in text for said in NO_MEMORY):
         return MachineError(
             f"The stage {stage} ran out of memory.",
-            "Close other programs, or lower undistort.max_megapixels or train.max_gaussians.",
+            "Close other programs, or lower train.max_megapixels or train.max_gaussians.",
         )
     return StageError(
         f"The stage {stage} failed: {type(error).__name__}: {error}",

@@ -34,6 +34,7 @@ ASPECT = 16.0 / 9.0
 SAMPLED = 8  # cameras of a way whose depths tell the range of all
 RANGE = (0.01, 0.99)  # quantiles of depth between which colours go from near to far
 LEAST_SIDE, MOST_SIDE = 16, 8192  # pixels of a picture
+ROWS_AT_ONCE = 256  # of a picture whose colours are made
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +139,7 @@ def depth_range(pictures: Pictures, cameras: Sequence[Camera]) -> tuple[float, f
     """The depths that most of a way's pictures show, nearest and farthest."""
     found = []
     for index in np.unique(np.linspace(0, len(cameras) - 1, min(SAMPLED, len(cameras))).round().astype(int)):
-        values = pictures.values(cameras[index])
+        values = pictures.values(reduced_camera(cameras[index], MOST_FILM_MEGAPIXELS))
         if values is not None and (values > 0.0).any():
             found.append(values[values > 0.0])
     if not found:
@@ -150,16 +151,26 @@ def depth_range(pictures: Pictures, cameras: Sequence[Camera]) -> tuple[float, f
 def coloured_depth(depth: Float[np.ndarray, "h w"], depths: tuple[float, float]) -> Pixels:
     """Depths as colours, even by ratio: red is near, blue far, black nothing; (h, w, 3) RGB."""
     nearest, farthest = depths
-    share = np.log(np.maximum(depth, 1e-30) / nearest) / math.log(farthest / nearest)
-    steps = np.clip(255.5 - 255.0 * share, 0.0, 255.0).astype(np.uint8)
-    colours = np.asarray(cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, :, ::-1], np.uint8).copy()
+    steps = np.empty(depth.shape, np.uint8)
+    for rows in _blocks(len(depth)):
+        share = np.log(np.maximum(depth[rows], 1e-30) / nearest) / math.log(farthest / nearest)
+        steps[rows] = np.clip(255.5 - 255.0 * share, 0.0, 255.0)
+    colours = np.ascontiguousarray(cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, :, ::-1], np.uint8)
     colours[depth <= 0.0] = 0
     return colours
 
 
 def coloured_normals(normals: Float[np.ndarray, "h w 3"]) -> Pixels:
     """Normals as colours: red, green, blue grow with x, y, z; grey is nothing; (h, w, 3) RGB."""
-    return np.asarray(np.clip(127.5 * normals + 128.0, 0.0, 255.0), np.uint8)
+    colours = np.empty(normals.shape, np.uint8)
+    for rows in _blocks(len(normals)):
+        colours[rows] = np.clip(127.5 * normals[rows] + 128.0, 0.0, 255.0)
+    return colours
+
+
+def _blocks(rows: int) -> list[slice]:
+    """Rows of a picture that are worked on at once, so that what is between takes little memory."""
+    return [slice(start, start + ROWS_AT_ONCE) for start in range(0, rows, ROWS_AT_ONCE)]
 
 
 @dataclass(frozen=True)

@@ -207,9 +207,9 @@ def _refuse(error: Exception, gaussians: int) -> NoReturn:
     if isinstance(error, MemoryError):
         raise MachineError(
             f"Not enough memory to rasterize {gaussians} Gaussians.",
-            hint="Lower undistort.max_megapixels or train.max_gaussians.",
+            hint="Lower train.max_megapixels or train.max_gaussians.",
         ) from error
     raise SplatpipeError(
         f"{gaussians} Gaussians cover the picture so often over that 32-bit indices do not hold it.",
-        hint="Lower undistort.max_megapixels or train.max_gaussians.",
+        hint="Lower train.max_megapixels or train.max_gaussians.",
     ) from error

@@ -214,7 +214,7 @@ def render_cuda(
             raise
         raise MachineError(
             f"Not enough memory on the graphics card to rasterize {len(gaussians)} Gaussians.",
-            hint="Lower undistort.max_megapixels or train.max_gaussians, or give --device cpu.",
+            hint="Lower train.max_megapixels or train.max_gaussians, or give --device cpu.",
         ) from error
     return Render(*outputs)
 

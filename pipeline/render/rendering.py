@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -17,11 +18,12 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.raster.reference import project
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import Panorama, laid_over
+from splatpipe.pipeline.splat.panorama import STEP_PX, Panorama, laid_over
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 
 Model = tuple[Gaussians, Panorama | None]
 SURFACE = 0.5  # least alpha of a pixel that shows one, as for the median depth
+STRIP_PIXELS = 1 << 21  # that are rendered at once: a picture of 100 megapixels takes no more memory than one of two
 
 
 @dataclass(frozen=True)
@@ -90,23 +92,53 @@ def placed(model: Model, device: Device) -> Model:
     return gaussians.to(device.tensors), None if sky is None else sky.to(device.tensors)
 
 
+def strips(camera: Camera) -> list[Camera]:
+    """Parts of a picture from top to bottom, of ``STRIP_PIXELS`` at most, whose borders are on the sky's nodes."""
+    rows = camera.height
+    if camera.width * rows > STRIP_PIXELS:
+        rows = max(STEP_PX, STRIP_PIXELS // camera.width // STEP_PX * STEP_PX)
+    tops = range(0, camera.height, rows)
+    return [camera.cut(0, top, camera.width, min(rows, camera.height - top)) for top in tops]
+
+
+def _by_strips(camera: Camera, made: Callable[[Camera], np.ndarray]) -> np.ndarray:
+    """A picture made strip by strip, in one array from the start."""
+    first, *rest = strips(camera)
+    part = made(first)
+    if not rest:
+        return part
+    picture = np.empty((camera.height, *part.shape[1:]), part.dtype)
+    picture[: first.height], done = part, first.height
+    for strip in rest:
+        picture[done : done + strip.height] = made(strip)
+        done += strip.height
+    return picture
+
+
 def render_pixels(model: Model, camera: Camera, options: rasterizer.RenderOptions) -> Pixels:
     """Render a camera's view, with the sky if there is one, to 8 bits, (h, w, 3) RGB, rounded to the nearest step."""
-    gaussians, sky = model
     with torch.no_grad():
-        rendered = rasterizer.render(gaussians, camera, options)
-        colour = rendered.colour
-        if sky is not None:
-            behind = sky.behind(camera, options.background)
-            colour = laid_over(colour, rendered.alpha, options.background, behind)
-        return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
+        return _by_strips(camera, lambda strip: _pixels(model, strip, options))
+
+
+def _pixels(model: Model, camera: Camera, options: rasterizer.RenderOptions) -> Pixels:
+    gaussians, sky = model
+    rendered = rasterizer.render(gaussians, camera, options)
+    colour = rendered.colour
+    if sky is not None:
+        behind = sky.behind(camera, options.background)
+        colour = laid_over(colour, rendered.alpha, options.background, behind)
+    return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 
 def render_depth(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w"]:
     """A camera's median depth, world units along the view axis; 0 where the model has none."""
     with torch.no_grad():
-        rendered = rasterizer.render(gaussians, camera, options.for_depths())
-    return np.asarray(rendered.median_depth.cpu().numpy())
+        return _by_strips(camera, lambda strip: _depths(gaussians, strip, options.for_depths()))
+
+
+def _depths(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w"]:
+    return np.asarray(rasterizer.render(gaussians, camera, options).median_depth.cpu().numpy())
 
 
 def render_normals(
@@ -131,9 +163,14 @@ def render_normals(
             gaussians, sh=rgb_to_dc(0.5 + 0.5 * torch.where(splats.usable[:, None], normals, 0.0))[:, None]
         )
         plain = replace(options.for_depths(), depth=False)
-        rendered = rasterizer.render(coloured, camera, plain)
-        alpha = rendered.alpha[..., None]
-        summed = 2.0 * rendered.colour - alpha
-        length = torch.linalg.vector_norm(summed, dim=2, keepdim=True)
-        seen = (alpha >= SURFACE) & (length > 0.0)
-        return np.asarray(torch.where(seen, summed / length.clamp_min(1e-12), 0.0).cpu().numpy())
+        return _by_strips(camera, lambda strip: _directions(coloured, strip, plain))
+
+
+def _directions(coloured: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w 3"]:
+    """Unit vectors of Gaussians whose colours are theirs, halved about 0.5."""
+    rendered = rasterizer.render(coloured, camera, options)
+    alpha = rendered.alpha[..., None]
+    summed = 2.0 * rendered.colour - alpha
+    length = torch.linalg.vector_norm(summed, dim=2, keepdim=True)
+    seen = (alpha >= SURFACE) & (length > 0.0)
+    return np.asarray(torch.where(seen, summed / length.clamp_min(1e-12), 0.0).cpu().numpy())
