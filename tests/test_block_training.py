@@ -17,6 +17,7 @@ import torch
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
@@ -33,14 +34,17 @@ from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize
 
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
+from on_cpu import kernels_on_cpu
 
 WINDOW = 1000  # of 72 × 54 pixels: four windows a photo, and one at half the size
 CELLS = (Cell((-3.0, -1.5), (0.0, 3.0)), Cell((0.0, -1.5), (3.0, 3.0)))
 PARTITION = Partition(GroundPlan(np.array([[1.0, 0, 0], [0, 0, 1.0]]), np.array([0, -1.0, 0])), CELLS, 0.25)
 CONFIG = TrainConfig(iterations=120, sh_degree=1, prune_free_space=2, exposure="affine", max_gaussians=400)
 TASK = BlockTask(0, share=160, trained=230, frozen=120, window_pixels=WINDOW)
+STEP_SHARE = 1e-3  # L2 of how far parameters move, as for windows without blocks
 
 
 @pytest.fixture(scope="module")
@@ -181,3 +185,28 @@ def test_interrupt_leaves_a_checkpoint(site: SiteParts, undisturbed: Path, tmp_p
     plan = Plan.from_json((tmp_path / "plan.json").read_text())
     assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts["iteration"] == 10
     assert digest(trained(site, tmp_path)) == digest(undisturbed)
+
+
+def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
+    frozen, models = read_splat(undisturbed / "frozen.ply"), []
+
+    def look(state: TrainState, photo: TrainingPhoto) -> None:
+        if state.iteration == 8:  # density control has not acted yet
+            models.append(state.gaussians.detach().clone())
+            around = state.drawn.detach().after(len(state.gaussians))
+            assert all(torch.equal(getattr(around, name), getattr(frozen, name)) for name in PARAMETERS)
+            raise Killed
+
+    for kernels in (kernels_on_cpu(), None):
+        out = tmp_path / str(len(models))
+        out.mkdir()
+        for name in ("plan.json", "seen.npz", "frozen.ply"):
+            (out / name).write_bytes((undisturbed / name).read_bytes())
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed), use_kernels(kernels):
+            step_with(patch, look)
+            trained(site, out)
+    begun = Block.of(CONFIG, site, TASK, cpu()).start()
+    for name in PARAMETERS:
+        ours, theirs, before = (getattr(model, name).double() for model in (*models, begun))
+        moved = torch.linalg.vector_norm(theirs - before)
+        assert moved > 0.0 and torch.linalg.vector_norm(ours - theirs) <= STEP_SHARE * moved, name

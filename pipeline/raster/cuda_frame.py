@@ -161,7 +161,10 @@ class UnfinishedBackward:
             return False
         rendered = dict(zip(PARAMETERS, self.frame.parameters, strict=True))
         stepped = [name for name in PARAMETERS if self.logits_are_leaf or name != "opacity_logits"]
-        same = all(parameters[name].data_ptr() == rendered[name].data_ptr() for name in stepped)
+        same = all(
+            parameters[name].data_ptr() == rendered[name].data_ptr() and len(parameters[name]) == len(rendered[name])
+            for name in stepped
+        )
         alone = all(parameters[name].grad is None for name in stepped)
         return same and alone and (visible is None or visible.data_ptr() == self.visible.data_ptr())
 

@@ -147,10 +147,6 @@ class TrainState:
         """Give the Gaussians that are trained their part of the gradients of all that was drawn."""
         if self.whole is None:
             return
-        if self.gaussians.means.device.type != "cpu":  # there a step takes all that was rendered
-            unfinished = self.buffers.take_unfinished()
-            if unfinished is not None:
-                unfinished.finish(self.whole.tensors())
         drawn = self.whole.tensors()
         for name, tensor in self.gaussians.tensors().items():
             gradient = drawn[name].grad
