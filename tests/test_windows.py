@@ -93,6 +93,19 @@ def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own()
     assert [visits.at(number + 9).window for number in range(1, 91)] != [other.at(n).window for n in range(1, 91)]
 
 
+def test_windows_of_photos_of_several_sizes_are_seen_equally_often() -> None:
+    small, large = tiny_scene.cameras()[:2]
+    cameras = [small.scaled(640, 480), large.scaled(2000, 1500), small.scaled(600, 500)]
+    look = Look(0, 100_000)
+    cells = [len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras]
+    assert len(set(cells)) > 1
+    visits = PhotoVisits(cameras, [Look(2)] * 6 + [look] * (3 * sum(cells) + 1), 0)
+    seen = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
+    rounds = [seen[6 + start : 6 + start + sum(cells)] for start in range(0, 3 * sum(cells), sum(cells))]
+    shown = [[(visit.view, visit.window) for visit in each] for each in rounds]
+    assert all(len(set(each)) == sum(cells) for each in shown) and len({tuple(each) for each in shown}) == 3
+
+
 @pytest.mark.parametrize("fill", [False, True])
 def test_windows_of_the_stream_are_parts_of_the_whole_photo_to_the_bit(
     views: list[View], tmp_path: Path, fill: bool

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import reduced_camera
@@ -61,7 +62,8 @@ class PhotoVisits(Visits):
     """Visits of all that photos show: they depend on the cameras, the looks, the seed and the iteration alone.
 
     Photos go by epochs, each once; the windows of a photo at a level go by rounds, each once; every epoch and every
-    round has an order of its own.
+    round has an order of its own. Where photos have different numbers of windows, the windows of all go by rounds, or
+    those of the larger photos would be seen less often.
 
     Args:
         cameras: Of the photos.
@@ -84,10 +86,27 @@ class PhotoVisits(Visits):
             for camera in (self.camera(view, look.level) for view in range(photos))
         }
         self._windows = {size: windows_of(*size) for size in sizes}
+        self._given = np.full(len(looks), -1, np.int64)  # windows that do not follow from the turn
+        for look in sorted(set(looks), key=lambda look: (look.level, look.window_pixels)):
+            self._mix(look)
         before: Counter[tuple[int, Look]] = Counter()
         for place, key in enumerate(zip(self._views.tolist(), looks, strict=True)):
             self._turns[place] = before[key]
             before[key] += 1
+
+    def _mix(self, look: Look) -> None:
+        """Let the windows of all photos go by rounds, where photos have different numbers of them."""
+        counts = [len(self._windows_at(view, look)) for view in range(len(self._cameras))]
+        if len(set(counts)) < 2:
+            return
+        pairs = np.array([(view, window) for view, count in enumerate(counts) for window in range(count)])
+        places = np.array([place for place, each in enumerate(self._looks) if each == look])
+        rows = in_rounds(self._seed, len(pairs), len(places))
+        self._views[places], self._given[places] = pairs[rows].T
+
+    def _windows_at(self, view: int, look: Look) -> list[Frame]:
+        camera = self.camera(view, look.level)
+        return self._windows[camera.width, camera.height, look.window_pixels]
 
     def __len__(self) -> int:
         """How many iterations there are."""
@@ -97,9 +116,9 @@ class PhotoVisits(Visits):
         """The visit of an iteration, from 1."""
         view, look = int(self._views[iteration - 1]), self._looks[iteration - 1]
         camera = self.camera(view, look.level)
-        windows = self._windows[camera.width, camera.height, look.window_pixels]
-        if len(windows) == 1:
-            return Visit(view, look.level, camera, windows[0])
+        windows, given = self._windows_at(view, look), int(self._given[iteration - 1])
+        if len(windows) == 1 or given >= 0:
+            return Visit(view, look.level, camera, windows[max(0, given)])
         past, place = divmod(int(self._turns[iteration - 1]), len(windows))
         drawn = random_bits(self._seed, past, WINDOW_ORDER, view * MOST_WINDOWS + np.arange(len(windows)))
         return Visit(view, look.level, camera, windows[int(np.argsort(drawn, kind="stable")[place])])
@@ -139,8 +158,7 @@ class PartVisits(Visits):
         self._rows = np.zeros(len(looks), np.int64)  # of the level's parts
         for level in np.unique(levels).tolist():
             wanted, count = np.flatnonzero(levels == level), len(parts[level])
-            rounds = [permutation(seed, turn, count) for turn in range(-(-len(wanted) // count))]
-            self._rows[wanted] = np.concatenate(rounds)[: len(wanted)]
+            self._rows[wanted] = in_rounds(seed, count, len(wanted))
 
     def __len__(self) -> int:
         """How many iterations there are."""
@@ -160,6 +178,12 @@ class PartVisits(Visits):
         """The levels of each photo that is looked at more than once from an iteration on, finest first."""
         looks, rows = self._looks[first - 1 :], self._rows[first - 1 :].tolist()
         return _wanted_again([self._parts[look.level][row][0] for look, row in zip(looks, rows, strict=True)], looks)
+
+
+def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"]:
+    """Numbers below a count, each once a round; every round has an order of its own."""
+    rounds = [permutation(seed, turn, count) for turn in range(-(-visits // count))]
+    return np.concatenate(rounds)[:visits]
 
 
 def _wanted_again(views: Sequence[int], looks: Sequence[Look]) -> dict[int, list[int]]:
