@@ -64,7 +64,7 @@ REFERENCE = Costs(
             "undistort": StageCosts(0.0304, 290e6, 15.6e6, 0.911e6),
             "split": StageCosts(0.0001, 284e6, 0.0, 18.3),
             "initialize": StageCosts(0.336, 569e6, 0.0, 225.0),
-            "train": StageCosts(0.134, 531e6, 1.0, 249.0),
+            "train": StageCosts(0.134, 561e6, 1.0, 249.0),
             "evaluate": StageCosts(0.508, 767e6, 500.0, 0.76e6),
             "export": StageCosts(1.97e-05, 614e6, 1200.0, 374.0),
             "flythrough": StageCosts(0.3, 574e6, 0.0, 0.13e6),

@@ -113,6 +113,9 @@ class Frame:
     def contributing_pairs(self) -> int:
         """Pairs of a pixel and a splat blended into it; slow, for benchmarks."""
 
+def free_frames() -> None:
+    """Give back the memory that is kept for renders to come."""
+
 def photo_loss(
     render: Tensor,
     photo: Tensor,

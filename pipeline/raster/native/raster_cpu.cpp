@@ -335,4 +335,9 @@ std::shared_ptr<RasterFrame> borrow_frame() {
     return std::shared_ptr<RasterFrame>(frame.release(), take_back);
 }
 
+void free_frames() {
+    std::lock_guard<std::mutex> lock(shelf_mutex);
+    shelf.clear();
+}
+
 }  // namespace splat

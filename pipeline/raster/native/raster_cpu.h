@@ -140,4 +140,7 @@ class RasterFrame {
 // Frames are handed out and taken back, a few of them kept with their memory.
 std::shared_ptr<RasterFrame> borrow_frame();
 
+// Gives back the memory of those that are kept.
+void free_frames();
+
 }  // namespace splat

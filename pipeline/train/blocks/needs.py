@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.limits import (
 
 MARGIN_GROWTH = 1.44  # (1 + 2 × 0.1)²: a square cell with its margin, over the cell
 FROZEN_SHARE = 1.0  # of those that a block trains: a coarse model that fits one block's memory is drawn unthinned
-FROZEN_COPIES = 2  # of a frozen Gaussian's parameters: a frame's gradients are written for all that it draws
+FROZEN_COPIES = 2  # of a frozen Gaussian's parameters: density control copies them with the others
 FRAME_BYTES = 201  # of any Gaussian in a frame (`limits.py`)
 MOST_BLOCKS = 4096  # beyond it a block is no larger than its margin
 
