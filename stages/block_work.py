@@ -7,15 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from splatpipe.pipeline.train.blocks.division import Division
-from splatpipe.pipeline.train.blocks.needs import round_pixels
+from splatpipe.pipeline.train.blocks.needs import SPLAT_BYTES, round_pixels, work_bytes
 from splatpipe.pipeline.train.lengths import Footage, Length, stretches
 
 MEGA = 1e6
 SEEN_BY = 12.0  # photos that show a place: what 80 % of overlap along the lines and 60 % across give, with some oblique
-PYRAMID = 4.0 / 3.0  # times a photo's pixels: with all its halves
-DECODED_BYTES = 3  # of a pixel
-SPLAT_BYTES = 249  # of a Gaussian in a file
-SIGHT_BYTES = 40_000  # of a photo: the coarse depth by which blocks know what it sees
+BEGINNING_S = 5.0  # CPU seconds of a block before its first iteration: libraries, what its photos see, free space
 
 
 @dataclass(frozen=True)
@@ -62,9 +59,14 @@ class BlockWork:
     @property
     def coarse_bytes(self) -> int:
         """Of the coarse pass's files."""
-        return int(SPLAT_BYTES * self.division.coarse_cap + SIGHT_BYTES * self.footage.photos)
+        return SPLAT_BYTES * self.division.coarse_cap
 
     @property
     def block_bytes(self) -> int:
         """Of what all blocks leave."""
-        return int(SPLAT_BYTES * self.division.blocks * self.division.need.trained)
+        return SPLAT_BYTES * self.division.blocks * self.division.need.trained
+
+    @property
+    def work_bytes(self) -> int:
+        """Of what a block has on the disk while it trains, besides its photos: its checkpoints, what is around it."""
+        return work_bytes(self.division.need.trained, self.division.need.frozen)

@@ -21,7 +21,6 @@ from splatpipe.pipeline.engine.source import Source
 from splatpipe.pipeline.engine.stage import Summary
 from splatpipe.pipeline.train.limits import (
     FIXED_BYTES,
-    LIBRARIES_BYTES,
     MACHINE_SHARE,
     PIXEL_BYTES,
     SMALLEST_WINDOW,
@@ -115,16 +114,16 @@ def needs_of_blocks(train: Need, told: Mapping[str, Any]) -> dict[str, Need]:
         train: The need of all of them.
         told: What ``blocks`` said of them; nothing without blocks.
     """
-    iterations, disk = told.get("iterations", ()), told.get("disk_bytes", ())
-    whole, checkpoint = max(1, sum(iterations)), max(0, train.memory_bytes - LIBRARIES_BYTES)
+    iterations, disk, around = (told.get(name, ()) for name in ("iterations", "disk_bytes", "work_bytes"))
+    whole = max(1, sum(iterations))
     return {
         f"train.{number}": replace(
             train,
             cpu_seconds=train.cpu_seconds * own / whole,
             disk_bytes=round(train.disk_bytes * own / whole),
-            scratch_bytes=int(decoded) + checkpoint,
+            scratch_bytes=int(decoded) + int(beside),
         )
-        for number, (own, decoded) in enumerate(zip(iterations, disk, strict=True), 1)
+        for number, (own, decoded, beside) in enumerate(zip(iterations, disk, around, strict=True), 1)
     }
 
 

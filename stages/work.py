@@ -28,7 +28,7 @@ from splatpipe.pipeline.train.limits import (
     worthwhile_iterations,
 )
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
-from splatpipe.stages.block_work import BlockWork
+from splatpipe.stages.block_work import BEGINNING_S, BlockWork
 from splatpipe.stages.costs import Costs
 from splatpipe.stages.options import LineConfig
 
@@ -323,12 +323,16 @@ class Work:
                 memory = min(memory, most)
             found[stage] = Need(
                 int(memory),
-                cost.cpu * units.cpu / speed,
+                (cost.cpu * units.cpu + self._beginning_s(stage)) / speed,
                 int(cost.disk * units.disk) + self._disk_of_blocks(stage),
                 self._scratch(stage, units),
                 PARALLEL.get(stage, 0.0),
             )
         return found
+
+    def _beginning_s(self, stage: str) -> float:
+        """CPU seconds of blocks before their first iterations, however few these are."""
+        return 0.0 if self.blocks is None or stage != "train" else BEGINNING_S * self.blocks.division.blocks
 
     def _disk_of_blocks(self, stage: str) -> int:
         """Bytes that a stage leaves besides where the scene is trained in blocks."""
@@ -340,12 +344,14 @@ class Work:
         """Bytes that a stage takes while it runs: a copy of the features; decoded photos and a checkpoint."""
         if stage in ("matches", "sparse"):
             return int(self.costs.stages["features"].disk * units.disk)
-        if stage == "train":
-            photos = self.size.photos if self.blocks is None else self.blocks.photos
-            return int(PYRAMID * PHOTO_BYTES * MEGA * photos * self.trained_at + units.memory)
+        decoded = PYRAMID * PHOTO_BYTES * MEGA * self.trained_at
+        if stage == "train" and self.blocks is None:
+            return int(decoded * self.size.photos + units.memory)
+        if stage == "train" and self.blocks is not None:
+            return int(decoded * self.blocks.photos) + self.blocks.work_bytes
         if stage == "blocks" and self.blocks is not None:
             (first, _count), *_ = self.blocks.coarse
-            return int(PYRAMID * PHOTO_BYTES * MEGA * self.size.photos * self.trained_at / 4**first + units.memory)
+            return int(decoded * self.size.photos / 4**first) + self.blocks.work_bytes
         return 0
 
 

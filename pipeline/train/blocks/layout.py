@@ -18,6 +18,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
 from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.division import Division
+from splatpipe.pipeline.train.blocks.needs import work_bytes
 from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
 from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan, block_limits
@@ -63,6 +64,7 @@ def lay_out(
         "iterations": [outlook.iterations for outlook in outlooks],
         "gaussians": [limit.share for limit in limits],
         "disk_bytes": [outlook.disk_bytes for outlook in outlooks],
+        "work_bytes": [work_bytes(limit.trained, limit.frozen) for limit in limits],
     }
     return SitePlan(partition, tuple(limits), division.window_pixels, division.limit_bytes), {"of_blocks": told}
 

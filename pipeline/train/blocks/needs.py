@@ -23,6 +23,8 @@ MARGIN_GROWTH = 1.44  # (1 + 2 × 0.1)²: a square cell with its margin, over th
 FROZEN_SHARE = 1.0  # of those that a block trains: a coarse model that fits one block's memory is drawn unthinned
 FROZEN_COPIES = 2  # of a frozen Gaussian's parameters: density control copies them with the others
 FRAME_BYTES = 201  # of any Gaussian in a frame (`limits.py`)
+SPLAT_BYTES = 249  # of a Gaussian in a file
+CHECKPOINT_BYTES = 2 * 720  # of a Gaussian that is trained: parameters and moments, and the new one beside the old
 MOST_BLOCKS = 4096  # beyond it a block is no larger than its margin
 
 
@@ -87,6 +89,16 @@ def fewest_blocks(cap: int, room_bytes: int, window_pixels: int, sh_degree: int)
         if need_of_blocks(blocks, cap, window_pixels, sh_degree).memory_bytes <= room_bytes:
             return blocks
     return None
+
+
+def work_bytes(trained: int, frozen: int) -> int:
+    """What a block has on the disk while it trains, besides its photos: its checkpoints, and what is around it.
+
+    Args:
+        trained: Gaussians that it trains.
+        frozen: Gaussians that it draws besides.
+    """
+    return CHECKPOINT_BYTES * trained + SPLAT_BYTES * frozen
 
 
 def round_pixels(pixels: float, blocks: int, window_side: float, site_area: float) -> float:
