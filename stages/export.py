@@ -60,8 +60,6 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     model = read_splat(inputs["train.model"])
     comments = ply_comments(frame, load_rendering(inputs["train.rendering"]).antialias)
     area = read_world_area(inputs.parts.get("georef.boundary"))
-    gaussians, within = inside_first(in_world(model, frame), area)
-    write_splat(out / "splat.ply", gaussians, [*comments, *bounded_comments(within, len(gaussians))])
     sky = read_panorama(inputs["train.sky"]) if config.sky else None
     (out / "sky").mkdir()
     if sky is not None:
@@ -69,6 +67,9 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         write_splat(out / "sky/sky.ply", in_world(dome, frame), comments)
     elif config.sky:
         report.warning("There is no sky to hand over.", hint="It takes train.sky=model, and photos that show the sky.")
+    gaussians, within = inside_first(in_world(model, frame), area)
+    del model  # the next is as large, and what follows wants room
+    write_splat(out / "splat.ply", gaussians, [*comments, *bounded_comments(within, len(gaussians))])
     report.progress(1, 4, "writing the cameras and the points", "files")
     write_json(out / "cameras.json", cameras_json(cameras, frame))
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))

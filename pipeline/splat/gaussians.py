@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -96,6 +96,21 @@ class Gaussians:
     def after(self, count: int) -> Gaussians:
         """Those after the first so many, not copied."""
         return self._map(lambda tensor: tensor[count:])
+
+    def pieces(self, rows: int = _ROWS_AT_ONCE) -> Iterator[Gaussians]:
+        """All of them, so many at a time, not copied: what is made of a piece is small."""
+        for start in range(0, len(self), rows):
+            yield self._map(lambda tensor, start=start: tensor[start : start + rows])  # type: ignore[misc]
+
+    @staticmethod
+    def gathered(parts: Iterable[Gaussians], like: Gaussians) -> Gaussians:
+        """Pieces one after another, none of which is kept; of another's degree and type, and at most as many."""
+        found, count = Gaussians.empty(len(like), like.sh_degree, like.means.dtype), 0
+        for part in parts:
+            for name, tensor in found.tensors().items():
+                tensor[count : count + len(part)] = getattr(part, name)
+            count += len(part)
+        return found.first(count)
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:

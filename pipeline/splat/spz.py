@@ -13,7 +13,7 @@ import struct
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float, Float32, Float64, UInt8
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
@@ -33,9 +33,15 @@ ROTATION_STEPS = 511
 SH_STEPS = 128.0
 SH_BITS = (6, 5)  # of degree 1 and of the rest, one more than the reference writer keeps: a fifth larger, 3 dB better
 GZIP_LEVEL = 6
+ARRAYS = 6  # after the header
 
 
-def spz_bytes(gaussians: Gaussians, antialias: bool, sh_bits: tuple[int, int] = SH_BITS) -> bytes:
+def spz_bytes(
+    gaussians: Gaussians,
+    antialias: bool,
+    sh_bits: tuple[int, int] = SH_BITS,
+    turn: Float[torch.Tensor, "3 3"] | None = None,
+) -> bytes:
     """Code Gaussians; the same bytes for the same Gaussians.
 
     A Gaussian far beyond all others is brought in along its ray from the origin and shrunk alike, so that it looks the
@@ -45,6 +51,7 @@ def spz_bytes(gaussians: Gaussians, antialias: bool, sh_bits: tuple[int, int] = 
         gaussians: Finite; in the file's frame (y up: see ``SPZ_FROM_Z_UP``), about an origin near the scene.
         antialias: Whether their opacities allow for the blur on screen.
         sh_bits: Kept of the harmonics of degree 1, and of the others; at most 8.
+        turn: Rotation to the file's frame, where they are in another.
 
     Returns:
         The file.
@@ -52,24 +59,41 @@ def spz_bytes(gaussians: Gaussians, antialias: bool, sh_bits: tuple[int, int] = 
     Raises:
         ValueError: if a parameter is not finite.
     """
-    if not bool(gaussians.finite().all()):
+    if not all(bool(piece.finite().all()) for piece in gaussians.pieces()):
         raise ValueError("an SPZ file holds finite numbers only")
     gaussians = gaussians.detach()
-    means = gaussians.means.numpy().astype(np.float64)
-    bits, shrink = _range(means)
+    means = [np.zeros((0, 3)), *(_turned(piece, turn).means.numpy() for piece in gaussians.pieces())]
+    bits, shrink = _range(np.concatenate(means, dtype=np.float64))
     header = struct.pack(
         "<IIIBBBB", MAGIC, VERSION, len(gaussians), gaussians.sh_degree, bits, ANTIALIASED if antialias else 0, 0
     )
+    coded: list[list[bytes]] = [[] for _ in range(ARRAYS)]
+    done = 0
+    for piece in gaussians.pieces():
+        arrays = _coded(_turned(piece, turn), bits, shrink[done : done + len(piece)], sh_bits)
+        for kept, array in zip(coded, arrays, strict=True):
+            kept.append(array.tobytes())
+        done += len(piece)
+    return gzip.compress(b"".join((header, *(data for kept in coded for data in kept))), GZIP_LEVEL, mtime=0)
+
+
+def _turned(gaussians: Gaussians, turn: Float[torch.Tensor, "3 3"] | None) -> Gaussians:
+    return gaussians if turn is None else gaussians.transformed(1.0, turn, torch.zeros(3, dtype=torch.float64))
+
+
+def _coded(
+    gaussians: Gaussians, bits: int, shrink: Float64[np.ndarray, " n"], sh_bits: tuple[int, int]
+) -> tuple[UInt8[np.ndarray, ...], ...]:
+    """The file's arrays of some Gaussians."""
     log_scales = gaussians.log_scales.numpy() + np.log(shrink).astype(np.float32)[:, None]
-    arrays = (
-        _fixed_point(means * shrink[:, None], bits),
+    return (
+        _fixed_point(gaussians.means.numpy().astype(np.float64) * shrink[:, None], bits),
         _to_byte(torch.sigmoid(gaussians.opacity_logits).numpy() * 255.0),
         _to_byte(gaussians.sh[:, 0].numpy() * (COLOUR_SCALE * 255.0) + 127.5),
         _to_byte((log_scales - LEAST_LOG_SCALE) * LOG_SCALE_STEPS),
         _smallest_three(gaussians.quats.numpy()),
         _harmonics(gaussians.sh[:, 1:].numpy(), sh_bits),
     )
-    return gzip.compress(b"".join((header, *(array.tobytes() for array in arrays))), GZIP_LEVEL, mtime=0)
 
 
 def _range(means: Float64[np.ndarray, "n 3"]) -> tuple[int, Float64[np.ndarray, " n"]]:

@@ -26,6 +26,10 @@ def in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
         gaussians: In the model's frame.
         frame: georef's.
     """
+    return Gaussians.gathered((_in_world(piece, frame) for piece in gaussians.pieces()), gaussians)
+
+
+def _in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
     similarity = frame.world_from_model
     moved = gaussians.transformed(
         float(similarity.scale),

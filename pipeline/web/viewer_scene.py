@@ -123,8 +123,7 @@ def viewer_splat(gaussians: Gaussians, antialias: bool) -> bytes:
         gaussians: In the world frame (z up), finite.
         antialias: Whether their opacities allow for the blur on screen.
     """
-    turn = torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64)
-    return spz_bytes(gaussians.transformed(1.0, turn, torch.zeros(3, dtype=torch.float64)), antialias)
+    return spz_bytes(gaussians, antialias, turn=torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64))
 
 
 def upright(camera: Camera) -> tuple[Camera, int]:
