@@ -66,7 +66,7 @@ REFERENCE = Costs(
             "initialize": StageCosts(0.336, 569e6, 0.0, 225.0),
             "train": StageCosts(0.134, 561e6, 1.0, 249.0),
             "evaluate": StageCosts(0.508, 767e6, 500.0, 0.76e6),
-            "export": StageCosts(1.97e-05, 614e6, 560.0, 374.0),
+            "export": StageCosts(1.97e-05, 651e6, 560.0, 374.0),
             "flythrough": StageCosts(0.3, 574e6, 0.0, 0.13e6),
         }
     ),
