@@ -83,20 +83,23 @@ def load_site_plan(path: Path) -> SitePlan:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
 
 
-def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[float, int, int]]) -> list[BlockLimits]:
+def block_limits(
+    division: Division, cap: int, sh_degree: int, counted: Sequence[tuple[float, int, int]]
+) -> list[BlockLimits]:
     """Share the cap among blocks, so that each keeps to the limit of memory.
 
     Args:
         division: How the scene is divided.
+        cap: Gaussians of all cells together: those of the scene but for its backdrop, which is the coarse model's.
         sh_degree: Of the model.
         counted: Of each block its weight, and the coarse model's Gaussians in its cell, and in cell and margin.
     """
     most = division.need.trained
     weights = [weight for weight, _, _ in counted]
     grown = [min(MOST_GROWTH, block / cell) if cell else MARGIN_GROWTH for _, cell, block in counted]
-    tops = [max(1, int(most / growth)) if division.limit_bytes else division.cap for growth in grown]
+    tops = [max(1, int(most / growth)) if division.limit_bytes else cap for growth in grown]
     found = []
-    for share, (_, in_cell, in_block) in zip(capped_shares(division.cap, weights, tops), counted, strict=True):
+    for share, (_, in_cell, in_block) in zip(capped_shares(cap, weights, tops), counted, strict=True):
         wanted = with_margin(share, in_cell, in_block)
         trained = max(share, min(wanted, most)) if division.limit_bytes else wanted
         found.append(BlockLimits(share, trained, _frozen(division, trained, sh_degree)))
