@@ -68,7 +68,7 @@ def train(base: Path, photos: Path, arm: str, given: list[str]) -> Row:
         shutil.copytree(base, out)
     mine = ["--set", f"train.max_megapixels={size}", "--set", f"train.iterations={iterations}"]
     words = ["run", str(photos), str(out), "--until", "evaluate", *given, *mine]
-    for end in run_all([splatpipe(arm, words, out.with_suffix(".log"))], 1):
+    for end in run_all([splatpipe(arm, words, out.with_name(f"{out.name}.log"))], 1):
         if end.failure:
             raise SystemExit(end.failure)
     return judged(out)
