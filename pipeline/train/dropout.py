@@ -83,14 +83,15 @@ class _Dropped(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, logits: Float[Tensor, " n"], kept: Bool[Tensor, " n"], share: float) -> Float[Tensor, " n"]:
         opacity = torch.sigmoid(logits)
-        scaled = (opacity / (1.0 - share)).clamp(max=LARGEST_OPACITY)
+        scaled = (opacity / (1.0 - share)).clamp_(max=LARGEST_OPACITY)
         ctx.save_for_backward(opacity, scaled, kept)
         ctx.share = share
-        return torch.where(kept, torch.log(scaled) - torch.log1p(-scaled), DROPPED_LOGIT)
+        return torch.where(kept, torch.log(scaled).sub_(torch.log1p(-scaled)), DROPPED_LOGIT)
 
     @staticmethod
     def backward(ctx: Any, gradient: Float[Tensor, " n"]) -> tuple[Tensor, None, None]:
         opacity, scaled, kept = ctx.saved_tensors
         # d logit(σ') / d logit(σ) with σ' = σ / (1 - share): both logits' slopes are σ (1 - σ).
-        slope = opacity * (1.0 - opacity) / ((1.0 - ctx.share) * scaled * (1.0 - scaled))
-        return torch.where(kept, gradient * slope, 0.0), None, None
+        slope = (1.0 - opacity).mul_(opacity)
+        slope.div_(((1.0 - ctx.share) * scaled).mul_(1.0 - scaled)).mul_(gradient)
+        return torch.where(kept, slope, 0.0), None, None
