@@ -47,6 +47,7 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     device = choose_device(inputs.machine.device, train.unfit_for_cuda(), report.note)
     plan = _whole_plan(train, inputs, device)
     division = kept_division(out / "division.json", lambda: _division(config, train, plan, device))
+    report.progress(1, 1, "choosing blocks")
     coarse = out / "coarse"
     coarse.mkdir(exist_ok=True)
     if division.is_whole:
