@@ -74,6 +74,7 @@ def _show(preflight: Preflight) -> None:
     for forecast in preflight.forecasts:
         text = f"{forecast.preset}: {forecast.memory_bytes / 1e9:.1f} GB of memory, {forecast.seconds / 60.0:.0f} min, "
         text += f"{forecast.disk_bytes / 1e9:.1f} GB on the disk"
+        text += f", trained in {forecast.blocks} blocks" if forecast.blocks > 1 else ""
         say(f"  {text}" + (f"; lacks {forecast.lacking}" if forecast.lacking else ""))
     verdict = {
         "error": "This capture cannot be reconstructed as it is",

@@ -167,8 +167,9 @@ def forecast_presets(
     intake: Intake, control: bool, configs: Mapping[str, LineConfig], threads: int
 ) -> tuple[tuple[PresetForecast, ...], MachineFacts]:
     """What a run with each preset would need, and whether this machine has it."""
+    from splatpipe.stages.costs import REFERENCE
     from splatpipe.stages.forecast import forecast, machine_speed
-    from splatpipe.stages.work import CaptureSize
+    from splatpipe.stages.work import CaptureSize, Work
 
     disk = shutil.disk_usage(Path.cwd())
     machine = MachineFacts(available_memory_bytes(), available_cores(), disk.free)
@@ -182,6 +183,7 @@ def forecast_presets(
     for preset, config in configs.items():
         need = whole(forecast(size, config, threads, speed=speed, machine_bytes=machine.memory_bytes))
         disk_bytes = need.disk_bytes + need.scratch_bytes
+        blocks = Work.of(size, config, REFERENCE, threads, machine.memory_bytes).blocks
         lacking = []
         if 0 < machine.memory_bytes < need.memory_bytes:
             lacking.append(
@@ -197,6 +199,7 @@ def forecast_presets(
                 need.seconds(threads),
                 disk_bytes,
                 "; ".join(lacking),
+                1 if blocks is None else blocks.division.blocks,
             )
         )
     return tuple(told), machine

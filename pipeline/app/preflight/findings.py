@@ -121,6 +121,7 @@ class PresetForecast:
         seconds: On this machine's processors.
         disk_bytes: That OUT takes.
         lacking: Why it does not fit this machine; empty when it does.
+        blocks: That the scene is trained in; 1 where it is trained whole.
     """
 
     preset: str
@@ -129,6 +130,7 @@ class PresetForecast:
     seconds: float
     disk_bytes: int
     lacking: str = ""
+    blocks: int = 1
 
 
 @dataclass(frozen=True)

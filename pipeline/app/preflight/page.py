@@ -13,7 +13,7 @@ from typing import Literal
 from splatpipe.pipeline.app.page_file import page_text, shown
 from splatpipe.pipeline.app.places import Places
 from splatpipe.pipeline.app.preflight.finding_pictures import FindingPicture, finding_pictures
-from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, Severity
+from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, PresetForecast, Severity
 from splatpipe.pipeline.app.preflight.overlap_map import overlap_map
 from splatpipe.pipeline.app.report.wording import count, duration, number, plural, roughly, size
 from splatpipe.pipeline.engine.durable import write_durably
@@ -91,7 +91,7 @@ def check_page(preflight: Preflight) -> str:
         control=preflight.control[:MOST_CONTROL],
         control_more=max(0, len(preflight.control) - MOST_CONTROL),
         forecasts=[
-            (it.preset, size(it.memory_bytes), roughly(it.seconds), roughly(it.cpu_seconds), size(it.disk_bytes),
+            (_named(it), size(it.memory_bytes), roughly(it.seconds), roughly(it.cpu_seconds), size(it.disk_bytes),
              it.lacking)
             for it in preflight.forecasts
         ],
@@ -119,6 +119,10 @@ def _verdict(preflight: Preflight) -> tuple[str, str, str]:
         text = f"The {photos} can be reconstructed; what is told below costs photos, accuracy or completeness."
         return "doubt", f"{which} to see to before you leave", text
     return "good", "Nothing stands in the way", f"The {photos} can be reconstructed, as far as can be told beforehand."
+
+
+def _named(forecast: PresetForecast) -> str:
+    return forecast.preset if forecast.blocks == 1 else f"{forecast.preset}, in {forecast.blocks} blocks"
 
 
 def _told(finding: Finding, pictures: list[FindingPicture]) -> Told:
