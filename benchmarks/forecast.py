@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -92,7 +93,7 @@ def show(title: str, outcomes: Sequence[Outcome]) -> None:
                 "cpu": outcome.cpu,
                 "disk": outcome.disk,
                 "holds": " ".join("yes" if well else "NO" for well in holds(outcome)),
-                **{stage: outcome.stages[stage] for stage in SHOWN},
+                **{stage: outcome.stages.get(stage, math.nan) for stage in SHOWN},
             }
         )
     columns = {

@@ -22,9 +22,13 @@ BY_GAUSSIANS = ("train", "evaluate", "export")
 """Stages whose memory grows with Gaussians, of which runs at `preview` have too few to tell how: what one takes is
 counted in training (`train/limits.py`), and was seen on seneca's 325,000 in the stages after it."""
 
-BY_HAND = ("matches",)
-"""Stages whose memory is taken as it stands: matching runs in processes of its own since these runs; two of them took
-346 to 388 MB on the demo, beside 250 of the stage's own."""
+SELDOM = ("control", "targets", "blocks")
+"""Stages that have nothing to do for most captures, so that nothing is fitted to them."""
+
+BY_HAND = ("matches", "train")
+"""Stages whose memory is taken as it stands: matching runs in processes of its own; two of them took 346 to 388 MB on
+the demo, beside 250 of the stage's own. Training's is from before its frames were freed early; two runs since then say
+0.31 GB, but of few Gaussians, and limits of memory rest on it."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ def read_run(out: Path, config: LineConfig, name: str) -> Run:
         "gaussians": float(summaries["train"]["gaussians"]),
         "iterations": float(summaries["train"]["iterations"]),
     }
-    used = {stage: _used(manifest) for stage, manifest in manifests.items()}
+    used = {stage: _used(manifest) for stage, manifest in manifests.items() if stage not in SELDOM}
     return Run(name, size, config, int(manifests["train"]["machine"]["threads"]), counts, used)
 
 
