@@ -214,7 +214,7 @@ def main() -> None:
     parts |= {"blocks.plan": arguments.work / "blocks.json", "blocks.coarse": coarse}
     of_blocks = told["of_blocks"]
     print(f"photos a block: {of_blocks['photos']}; iterations: {of_blocks['iterations']}")
-    own = needs_of_blocks(needs["train"], of_blocks)
+    own = needs_of_blocks(needs["train"], of_blocks, sum(count for _level, count in work.blocks.lengths))
     rows = []
     for place, block in zip(("middle", "edge"), middle_and_edge(site.partition.cells), strict=True):
         took = trained(block + 1, site, parts, config, arguments.work, arguments.threads)

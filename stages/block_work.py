@@ -11,7 +11,7 @@ from splatpipe.pipeline.train.blocks.needs import SPLAT_BYTES, round_pixels, wor
 from splatpipe.pipeline.train.lengths import Footage, Length, stretches
 
 MEGA = 1e6
-SEEN_BY = 12.0  # photos that show a place: what 80 % of overlap along the lines and 60 % across give, with some oblique
+SEEN_BY = 20.0  # photos that show a place: some 12 of a flight straight down, 35 of orbits; judgement
 BEGINNING_S = 5.0  # CPU seconds of a block before its first iteration: libraries, what its photos see, free space
 
 

@@ -104,27 +104,35 @@ class Forecaster:
         if decided is not None:  # on whatever machine
             memory = int(decided.get("of_blocks", {}).get("limit_bytes", 0) / MACHINE_SHARE)
         needs = forecast(size, self.config, self.threads, speed=self.speed, machine_bytes=memory)
-        return needs if decided is None else needs | needs_of_blocks(needs["train"], decided.get("of_blocks", {}))
+        work = Work.of(size, self.config, REFERENCE, self.threads, memory)
+        if decided is None or work.blocks is None:
+            return needs
+        planned = sum(count for _level, count in work.blocks.lengths)
+        return needs | needs_of_blocks(needs["train"], decided.get("of_blocks", {}), planned)
 
 
-def needs_of_blocks(train: Need, told: Mapping[str, Any]) -> dict[str, Need]:
-    """Each block's share of the training, by its name.
+def needs_of_blocks(train: Need, told: Mapping[str, Any], planned: int) -> dict[str, Need]:
+    """Each block's need by its name, and that of all of them, once it is known what each looks at.
 
     Args:
-        train: The need of all of them.
+        train: The need of all of them as it was forecast.
         told: What ``blocks`` said of them; nothing without blocks.
+        planned: Iterations of all of them that the forecast took.
     """
     iterations, disk, around = (told.get(name, ()) for name in ("iterations", "disk_bytes", "work_bytes"))
-    whole = max(1, sum(iterations))
-    return {
+    whole, planned = max(1, sum(iterations)), max(1, planned)
+    each = {
         f"train.{number}": replace(
             train,
-            cpu_seconds=train.cpu_seconds * own / whole,
+            cpu_seconds=train.cpu_seconds * own / planned,
             disk_bytes=round(train.disk_bytes * own / whole),
             scratch_bytes=int(decoded) + int(beside),
         )
         for number, (own, decoded, beside) in enumerate(zip(iterations, disk, around, strict=True), 1)
     }
+    if not each:
+        return {}
+    return each | {"train": replace(train, cpu_seconds=sum(need.cpu_seconds for need in each.values()))}
 
 
 def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
