@@ -137,7 +137,7 @@ INITIALIZE = Stage(
 )
 BLOCKS = Stage(
     "blocks",
-    version=2,
+    version=3,
     config=BlocksConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={"plan": "blocks.json", "coarse": "coarse"},

@@ -11,7 +11,7 @@ from typing import Any
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.train.blocks.division import Division
-from splatpipe.pipeline.train.blocks.needs import MARGIN_GROWTH, frozen_bytes, shared_cap, with_margin
+from splatpipe.pipeline.train.blocks.needs import FROZEN_SHARE, MARGIN_GROWTH, frozen_bytes, shared_cap, with_margin
 from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.limits import FIXED_BYTES, LIBRARIES_BYTES, PIXEL_BYTES, bytes_per_gaussian
 
@@ -94,16 +94,22 @@ def block_limits(
         sh_degree: Of the model.
         counted: Of each block its weight, and the coarse model's Gaussians in its cell, and in cell and margin.
     """
-    most = division.need.trained
-    weights = [weight for weight, _, _ in counted]
-    grown = [min(MOST_GROWTH, block / cell) if cell else MARGIN_GROWTH for _, cell, block in counted]
-    tops = [max(1, int(most / growth)) if division.limit_bytes else cap for growth in grown]
+    most = _most(division, sh_degree)
+    top = max(1, int(most / MARGIN_GROWTH)) if division.limit_bytes else cap
     found = []
-    for share, (_, in_cell, in_block) in zip(capped_shares(cap, weights, tops), counted, strict=True):
-        wanted = with_margin(share, in_cell, in_block)
+    shares = capped_shares(cap, [weight for weight, _, _ in counted], [top] * len(counted))
+    for share, (_, in_cell, in_block) in zip(shares, counted, strict=True):
+        wanted = max(share, min(with_margin(share, in_cell, in_block), int(MOST_GROWTH * share)))
         trained = max(share, min(wanted, most)) if division.limit_bytes else wanted
         found.append(BlockLimits(share, trained, _frozen(division, trained, sh_degree)))
     return found
+
+
+def _most(division: Division, sh_degree: int) -> int:
+    """Gaussians that a block may train within the limit of memory, with as many frozen ones around."""
+    room = division.limit_bytes - LIBRARIES_BYTES - FIXED_BYTES - PIXEL_BYTES * division.window_pixels
+    fitting = int(room / (bytes_per_gaussian(sh_degree) + FROZEN_SHARE * frozen_bytes(sh_degree)))
+    return max(division.need.trained, fitting)
 
 
 def _frozen(division: Division, trained: int, sh_degree: int) -> int:
