@@ -275,9 +275,10 @@ def test_the_workflow_has_a_rule_for_each_stage_that_runs_and_asks_for_what_it_n
     assert [line for line in text.splitlines() if line.startswith("rule ")] == [
         "rule all:",
         "rule georef:",
+        "rule train_shard:",
         "rule train:",
     ]
-    assert text.count("gpu=1") == 1 and "0002-barn" not in text
+    assert text.count("gpu=1") == 2 and "0002-barn" not in text  # without blocks the whole is trained in the last one
     assert '"train": [2, 900, 21, 50]' in text
     assert "gpu" not in workflow_text(call, call.plan(), LINE)
 
