@@ -53,7 +53,7 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     if division.is_whole:
         (out / "blocks.json").write_text(whole_json(), encoding="utf-8")
         return {"blocks": 1}
-    _tell(division, train, report)
+    _tell(division, train, division.limit_bytes and division.limit_bytes - _beside(device), report)
     told = out / "coarse.json"
     if not told.is_file():
         limits = Limits(division.coarse_cap, division.window_pixels)
@@ -91,9 +91,12 @@ def _division(config: BlocksConfig, train: TrainConfig, plan: Plan, device: Devi
     if train.time_budget_s:  # which plans one training
         return divided(_scene(train, plan), 0)
     limit = memory_limit(train.max_memory_bytes, _memory_of(device))
-    if limit and device.name == "cuda":
-        limit += LIBRARIES_BYTES  # which are not in the card's memory
-    return divided(_scene(train, plan), limit, config.least)
+    return divided(_scene(train, plan), limit and limit + _beside(device), config.least)
+
+
+def _beside(device: Device) -> int:
+    """What of a training's memory is not on its device: the libraries, where that is a card."""
+    return LIBRARIES_BYTES if device.name == "cuda" else 0
 
 
 def _memory_of(device: Device) -> int:
@@ -118,15 +121,15 @@ def _shape(plan: Plan) -> float:
     return min(width, height) / max(width, height)
 
 
-def _tell(division: Division, train: TrainConfig, report: Reporter) -> None:
-    """The decision for people."""
+def _tell(division: Division, train: TrainConfig, limit_bytes: int, report: Reporter) -> None:
+    """The decision for people; the limit as they know it."""
     told = f"{division.cap:,} Gaussians are trained in {division.blocks} blocks"
-    if division.limit_bytes:
-        told += f", each within {division.limit_bytes / 1e9:.1f} GB"
+    if limit_bytes:
+        told += f", each within {limit_bytes / 1e9:.1f} GB"
     report.note(f"{told}, after a coarse pass with {division.coarse_cap:,}")
     if division.cap < train.max_gaussians:
         report.warning(
-            f"{division.limit_bytes / 1e9:.2f} GB hold {division.cap:,} Gaussians in {division.blocks} blocks, fewer "
+            f"{limit_bytes / 1e9:.2f} GB hold {division.cap:,} Gaussians in {division.blocks} blocks, fewer "
             f"than the {train.max_gaussians:,} of train.max_gaussians; of so few photos there are no more blocks.",
             hint="Give more with --max-memory for a finer model.",
         )

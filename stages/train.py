@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shard, Summary
+from splatpipe.pipeline.geometry.plan_area import read_model_area
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.blocks.assembly import assemble
 from splatpipe.pipeline.train.blocks.site_plan import load_site_plan
@@ -61,7 +62,8 @@ def run_block(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) 
     """
     assert inputs.shard is not None
     site, number = load_site_plan(inputs["blocks.plan"]), inputs.shard.index
-    parts = SiteParts(inputs["undistort.dataset"], inputs["split.views"], inputs["blocks.coarse"], site.partition)
+    area = read_model_area(inputs.parts.get("georef.boundary"))
+    parts = SiteParts(inputs["undistort.dataset"], inputs["split.views"], inputs["blocks.coarse"], site.partition, area)
     limits = site.blocks[number]
     task = BlockTask(number, limits.share, limits.trained, limits.frozen, site.window_pixels)
     return train_block(config, parts, task, inputs.machine, out, BlockReporter(report, inputs.shard))

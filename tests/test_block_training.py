@@ -16,11 +16,13 @@ import torch
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_split, load_views
 from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.splat.archives import read_archive
+from splatpipe.pipeline.splat.backdrop import backdrop_limit
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
@@ -101,6 +103,18 @@ def test_outcome_is_of_cell_and_margin_alone_and_keeps_to_its_shares(site: SiteP
     start = read_splat(site.coarse / "model.ply")
     inside = PARTITION.trained_by(0, start.means.double().numpy())
     assert len(model) > inside.sum()  # it has grown
+
+
+def test_outside_of_a_boundary_a_block_stays_coarse(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
+    plan = PARTITION.plan
+    inside = np.array([[-4.0, -2.0], [-1.0, -2.0], [-1.0, 4.0], [-4.0, 4.0]])
+    area = PlanArea(plan.axes, ((inside,),))
+    most = backdrop_limit(0, TASK.trained)
+    outside = [
+        int((~area.contains(read_splat(folder / "model.ply").means.double().numpy())).sum())
+        for folder in (undisturbed, trained(replace(site, area=area), tmp_path))
+    ]
+    assert outside[0] > 1.25 * most >= outside[1] > 0  # a few wander out after the last step of density control
 
 
 class Killed(BaseException):

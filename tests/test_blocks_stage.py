@@ -191,6 +191,29 @@ def test_any_order_any_threads_and_a_kill_in_a_block_give_the_same_bits(
     assert {name: found[name] for name in wanted} == wanted
 
 
+class Killed(BaseException):
+    """Stands for a kill."""
+
+
+def test_a_coarse_pass_that_is_done_is_not_made_again(
+    scene: Path, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig(**QUICK)
+
+    def killed(*_arguments: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(blocks, "lay_out", killed)
+        blocks.run(BlocksConfig(least=3), inputs(scene, config), tmp_path, tiny_scene.Recorder())
+    monkeypatch.setattr(blocks, "train_coarse", killed)
+    summary = blocks.run(BlocksConfig(least=3), inputs(scene, config), tmp_path, tiny_scene.Recorder())
+    manifest = json.loads(part(undisturbed, "blocks/manifest.json").read_text())
+    assert summary["of_blocks"] == manifest["summary"]["of_blocks"] and summary["coarse"]["gaussians"] > 0
+    for path in ("blocks.json", "coarse/model.ply"):
+        assert (tmp_path / path).read_bytes() == part(undisturbed, f"blocks/{path}").read_bytes()
+
+
 def test_two_makers_of_one_block_are_refused_and_of_two_are_not(
     scene: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -227,6 +227,20 @@ def test_no_name_colours_or_commands_the_terminal(capfd: pytest.CaptureFixture[s
     assert not {"\x1b", "\x07", "\x9b"} & set(shown) and shown.count("[bold]") >= 5
 
 
+@pytest.mark.parametrize(("stages", "told"), [(["blocks", "train"], True), (["train.2"], False)])
+def test_time_left_is_that_of_all_shards_unless_one_is_made_alone(
+    stages: list[str], told: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatpipe.pipeline.app.console.PLAIN_INTERVAL_S", -1.0)
+    console = RunConsole()
+    console(Event("run_started", data={"stages": stages}))
+    console(Event("stage_started", "train.2", {"reason": "", "shard": {"number": 2, "count": 4}}))
+    console(Event("progress", "train.2", {"done": 5.0, "total": 10.0, "what": "training", "unit": "iterations"}))
+    console.close()
+    shown = " ".join(capfd.readouterr().err.split())
+    assert "5/10 iterations" in shown and ("with the 2 after it" in shown) == told
+
+
 def splatpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)

@@ -89,7 +89,7 @@ class RunConsole:
     def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
         self._stage_started_s = self._plain_said_s = time.monotonic()
         self._what = ""
-        self._shards.begin(stage, data.get("shard"))
+        self._shards.begin(stage, None if stage in self._order else data.get("shard"))  # None: it is made alone
         if not self._console.is_terminal:
             self._console.print(f"{self._label(stage)} started ({data['reason']})", markup=False)
             return

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import JSON, Machine, Reporter, Summary
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
@@ -49,12 +50,14 @@ class SiteParts:
         split: Which photos are trained on.
         coarse: The folder that the coarse pass left.
         partition: The cells.
+        area: That counts, in the model's frame; None where all does.
     """
 
     dataset: Path
     split: Path
     coarse: Path
     partition: Partition
+    area: PlanArea | None = None
 
 
 @dataclass(frozen=True)
@@ -100,9 +103,9 @@ def train_block(
         windows = block.surveyor.parts(out, report)
         plan = load_or_write_plan(out / "plan.json", lambda: block.plan(windows))
         if plan.schedule.iterations == 0:
-            report.note(f"block {task.number}: there is nothing to train")
+            report.note("there is nothing to train")
             return _leave(block, plan, out, (block.start(), History())) | device.facts()
-        report.note(f"block {task.number}: {len(plan.train_views)} photos, {plan.described()}")
+        report.note(f"{len(plan.train_views)} photos, {plan.described()}")
         state = go_through(block.course(plan, windows, out), out, report)
         left = _leave(block, plan, out, (state.finished(), state.whole_history()))
     return summary_of(state, plan) | left | device.facts()
@@ -216,7 +219,7 @@ class Block:
         names, where = set(plan.train_views), self.device.tensors
         panorama = read_panorama(self.parts.coarse / "sky.npz")
         sky = None if panorama is None else SkyModel.given(panorama, read_skies(self.parts.coarse / SKIES, names))
-        made = make_techniques(plan, sky, views, device=where)
+        made = make_techniques(plan, sky, views, device=where, area=self.parts.area)
         if plan.options.exposure == "affine":
             exposure = Exposure.given({name: self.exposures[name] for name in plan.train_views})
             exposure.move_to(where)
