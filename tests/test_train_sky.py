@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
@@ -29,6 +30,7 @@ from splatpipe.pipeline.train.measure import Effort, Subject, measure
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan, make_plan
 from splatpipe.pipeline.train.sky import SkyModel, filled
+from splatpipe.pipeline.train.sky_file import read_skies, write_skies
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import evaluate, initialize, train
@@ -144,6 +146,38 @@ def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() 
         learnt = sky.panorama.behind(camera, (0.0, 0.0, 0.0))
     assert float((learnt - photo)[:24].abs().mean()) < 0.02
     assert float(learnt[-10:].mean()) > 0.4  # the dark wall below did not get into it
+
+
+def test_a_sky_that_was_trained_elsewhere_is_seen_and_stays() -> None:
+    camera = skies.look(pitch_deg=30.0).scaled(80, 60)
+    mask = np.zeros((60, 80), bool)
+    mask[:30] = True
+    colours = np.random.default_rng(1).random((CELLS, 3), np.float32)
+    trained = SkyModel(skies.UP, colours, {camera.name: SkyMask.packed(mask)})
+    given = SkyModel.given(trained.panorama, trained.masks).copied()
+    alpha = torch.full((60, 80), 0.5).requires_grad_()
+    for sky in (trained, given):
+        shown = sky.composite(replace(empty_render(camera), alpha=alpha), camera, sky.seen(camera), BLACK, BLACK)
+        (shown.mean() + sky.loss(alpha, sky.seen(camera))).backward()
+    assert alpha.grad is not None and trained.panorama.colours.grad is not None
+    assert given.is_given and given.panorama.colours.grad is None
+    np.testing.assert_array_equal(given.panorama.colours.numpy(), colours)
+
+
+def test_skies_come_back_for_the_photos_that_are_asked_for(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    sizes = {"flight 1/é": (5, 7), "b": (3, 3), "none": (1, 9)}
+    masks = {name: SkyMask.packed(rng.random(size) > 0.5) for name, size in sizes.items()}
+    write_skies(tmp_path / "skies.npz", masks)
+    found = read_skies(tmp_path / "skies.npz", {"b", "flight 1/é", "another"})
+    assert sorted(found) == ["b", "flight 1/é"]
+    for name, mask in found.items():
+        np.testing.assert_array_equal(mask.unpacked(), masks[name].unpacked())
+    write_skies(tmp_path / "skies.npz", {})
+    assert read_skies(tmp_path / "skies.npz", {"b"}) == {}
+    (tmp_path / "skies.npz").write_bytes(b"PK")
+    with pytest.raises(StageError, match="skies of the coarse pass"):
+        read_skies(tmp_path / "skies.npz", {"b"})
 
 
 def test_away_from_the_sky_nothing_shines_through_but_the_colour_given() -> None:
