@@ -158,7 +158,7 @@ def test_a_second_run_does_nothing(photos: Path, copy_of_run: Path) -> None:
 
 def test_changed_option_reruns_only_downstream(photos: Path, copy_of_run: Path) -> None:
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK, "train.iterations=40"))
-    assert ran(told) == ["train", "evaluate", "export", "flythrough"]
+    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough"]
 
 
 def test_a_budget_is_planned_shown_and_reused(photos: Path, copy_of_run: Path) -> None:
