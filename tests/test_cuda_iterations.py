@@ -121,7 +121,7 @@ def train(place: Place | None, given: Place) -> list[Tensor]:
             for tensor in scene.tensors().values():
                 tensor.grad = None
     assert optimizer.take_skipped() == 0
-    return [tensor.detach().cpu() for tensor in (*scene.tensors().values(), affine, probe.grad)]
+    return [tensor.detach().cpu() for tensor in (*scene.tensors().values(), affine, probe.grad.to_dense())]
 
 
 def test_iterations_never_wait_and_lead_where_the_cpus_do(place):
