@@ -3,6 +3,8 @@
 import json
 import math
 import sys
+import weakref
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +18,9 @@ from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_views
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.rendering import render_depth
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.ply import read_splat, write_splat, write_splat_parts
 from splatpipe.pipeline.train.blocks.cutting import BINS, cut, shares, site, work_map
-from splatpipe.pipeline.train.blocks.merging import merged, owned
+from splatpipe.pipeline.train.blocks.merging import counted, own_pieces, owned
 from splatpipe.pipeline.train.blocks.needs import (
     BlockNeed,
     block_need,
@@ -323,6 +325,29 @@ def _covariance(gaussians: Gaussians, row: int) -> torch.Tensor:
     return axes @ axes.T
 
 
+def merged(partition: Partition, coarse: Gaussians, trained: Mapping[int, Gaussians]) -> Gaussians:
+    models = {**trained, BACKDROP: coarse}
+    count, degree = counted(partition, models.__getitem__)
+    whole = Gaussians.concat(list(own_pieces(partition, models.__getitem__)))
+    assert (len(whole), whole.sh_degree) == (count, degree)
+    return whole
+
+
+class Read:
+    """Makes models when they are asked for, and notes whether one that was made before is alive then."""
+
+    def __init__(self, models: Mapping[int, Gaussians]) -> None:
+        self.models, self.order, self.alive = models, list[int](), 0
+        self._made: list[weakref.ref[np.ndarray]] = []
+
+    def __call__(self, block: int) -> Gaussians:
+        self.alive += sum(array() is not None for array in self._made)
+        self.order.append(block)
+        made = {name: tensor.numpy().copy() for name, tensor in self.models[block].tensors().items()}
+        self._made = [weakref.ref(array) for array in made.values()]  # which tensors and all views of them keep
+        return Gaussians.from_tensors({name: torch.from_numpy(array) for name, array in made.items()})
+
+
 def test_merge_takes_each_gaussian_once_in_any_order(
     coarse: Gaussians, seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
@@ -343,8 +368,27 @@ def test_merge_takes_each_gaussian_once_in_any_order(
     learnt = whole.sh[:, 0, 0] - merged(partition, coarse, dict.fromkeys(range(4), coarse)).sh[:, 0, 0]
     owners = partition.owners(whole.means.double().numpy())
     assert np.allclose(learnt.numpy(), np.where(owners == BACKDROP, 0.0, 0.01 * (owners + 1)), atol=1e-6)
-    with pytest.raises(ValueError, match="blocks"):
+    with pytest.raises(KeyError):
         merged(partition, coarse, {0: coarse})
+
+
+def test_blocks_are_merged_one_at_a_time_to_the_bytes_of_all_at_once(
+    coarse: Gaussians, seen: list[Sight], sparse: Float64[np.ndarray, "p 3"], tmp_path: Path
+) -> None:
+    partition = divided(seen, sparse, 4)
+    means = coarse.means.double().numpy()
+    trained = {n: coarse.select(torch.from_numpy(partition.trained_by(n, means))) for n in range(4)}
+    read = Read({**trained, BACKDROP: coarse})
+    count, degree = counted(partition, read)
+    write_splat_parts(tmp_path / "merged.ply", own_pieces(partition, read), count, degree, ["a comment"])
+    assert read.order == 2 * [0, 1, 2, 3, BACKDROP] and read.alive == 0
+    whole = Gaussians.concat([owned(partition, block, read.models[block]) for block in (0, 1, 2, 3, BACKDROP)])
+    write_splat(tmp_path / "whole.ply", whole, ["a comment"])
+    assert (tmp_path / "merged.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    held = read(0)
+    assert read(1) is not held and read.alive == len(held.tensors())  # it would have been noticed
+    with pytest.raises(ValueError, match="degrees"):
+        counted(partition, {**trained, BACKDROP: Gaussians.empty(3, 0 if degree else 1)}.__getitem__)
 
 
 def test_what_wanders_into_a_neighbours_cell_is_left_to_it(coarse: Gaussians) -> None:

@@ -18,6 +18,7 @@ from splatpipe.pipeline.splat.ply import (
     read_splat,
     read_splat_header,
     write_splat,
+    write_splat_parts,
 )
 
 # The order of the 3DGS reference implementation, spelled out.
@@ -53,6 +54,21 @@ def splat_bytes(tmp_path: Path, n: int = 3, degree: int = 0) -> bytes:
     path = tmp_path / "whole.ply"
     write_splat(path, random_gaussians(n, degree))
     return path.read_bytes()
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_parts_are_written_as_the_whole_and_are_what_was_promised(tmp_path, degree):
+    parts, path = [random_gaussians(n, degree) for n in (5, 0, 12)], tmp_path / "parts.ply"
+    write_splat(tmp_path / "whole.ply", Gaussians.concat(parts), [MIP_COMMENT])
+    write_splat_parts(path, iter(parts), 17, degree, [MIP_COMMENT])
+    assert path.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    with pytest.raises(ValueError, match="17 Gaussians were to be of 18"):
+        write_splat_parts(path, parts, 18, degree)
+    with pytest.raises(ValueError, match="degree"):
+        write_splat_parts(path, parts, 17, 1)
+    parts[0].means[2, 1] = torch.nan
+    with pytest.raises(ValueError, match="1 Gaussians have values that are not finite"):
+        write_splat_parts(path, parts, 17, degree)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -7,7 +7,7 @@ SIGGRAPH 2023), which every trainer and viewer follows; PLY itself: G. Turk, "Th
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -92,25 +92,60 @@ def write_splat(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) 
         OSError: if the file cannot be written.
     """
     gaussians = gaussians.detach().to("cpu", torch.float32)
+    _check_finite(gaussians)
+    with path.open("wb") as file:
+        file.write(_header(len(gaussians), property_names(gaussians.sh_degree), comments))
+        _write_rows(file, gaussians)
+
+
+def write_splat_parts(
+    path: Path, parts: Iterable[Gaussians], count: int, sh_degree: int, comments: Sequence[str] = ()
+) -> None:
+    """Write the bytes that ``write_splat`` writes of all parts one after another, of which none is kept.
+
+    Args:
+        path: The file; replaced if it is there, and no splat where this fails.
+        parts: Asked for one by one.
+        count: Gaussians in all of them.
+        sh_degree: Of all of them.
+        comments: As of ``write_splat``.
+
+    Raises:
+        ValueError: as ``write_splat``, or if the parts are not of this count or degree.
+        OSError: if the file cannot be written.
+    """
+    left = count
+    with path.open("wb") as file:
+        file.write(_header(count, property_names(sh_degree), comments))
+        for part in parts:
+            if part.sh_degree != sh_degree:
+                raise ValueError(f"a part is of SH degree {part.sh_degree}, not {sh_degree}")
+            gaussians = part.detach().to("cpu", torch.float32)
+            _check_finite(gaussians)
+            _write_rows(file, gaussians)
+            left -= len(gaussians)
+    if left:
+        raise ValueError(f"parts of {count - left} Gaussians were to be of {count}")
+
+
+def _check_finite(gaussians: Gaussians) -> None:
     bad = len(gaussians) - int(gaussians.finite().sum())
     if bad:
         raise ValueError(f"{bad} Gaussians have values that are not finite: never to be written")
-    names = property_names(gaussians.sh_degree)
-    with path.open("wb") as file:
-        file.write(_header(len(gaussians), names, comments))
-        for start in range(0, len(gaussians), _CHUNK_ROWS):
-            part = slice(start, start + _CHUNK_ROWS)
-            sh = gaussians.sh[part]
-            columns = [
-                gaussians.means[part],
-                torch.zeros(sh.shape[0], 3),
-                sh[:, 0],
-                sh[:, 1:].transpose(1, 2).flatten(1),  # channel-major: all of red, then green, blue
-                gaussians.opacity_logits[part, None],
-                gaussians.log_scales[part],
-                gaussians.quats[part],
-            ]
-            file.write(torch.cat(columns, dim=1).numpy().astype("<f4", copy=False).tobytes())
+
+
+def _write_rows(file: BinaryIO, gaussians: Gaussians) -> None:
+    for piece in gaussians.pieces(_CHUNK_ROWS):
+        columns = [
+            piece.means,
+            torch.zeros(len(piece), 3),
+            piece.sh[:, 0],
+            piece.sh[:, 1:].transpose(1, 2).flatten(1),  # channel-major: all of red, then green, blue
+            piece.opacity_logits[:, None],
+            piece.log_scales,
+            piece.quats,
+        ]
+        file.write(torch.cat(columns, dim=1).numpy().astype("<f4", copy=False).tobytes())
 
 
 def property_names(sh_degree: int) -> list[str]:

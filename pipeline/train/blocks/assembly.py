@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat
-from splatpipe.pipeline.train.blocks.merging import merged
+from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat_parts
+from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
+from splatpipe.pipeline.train.blocks.partition import BACKDROP
 from splatpipe.pipeline.train.blocks.site_plan import load_site_plan
 
 OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # are the coarse pass's, which looked at the whole
@@ -34,11 +35,10 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
         StageError: if a part of a block is broken.
     """
     site, coarse = load_site_plan(inputs["blocks.plan"]), inputs["blocks.coarse"]
-    report.progress(0, len(inputs.shards), "merging blocks", "blocks")
-    blocks = _Models(inputs.shards, report)
-    gaussians = merged(site.partition, read_splat(coarse / "model.ply"), blocks)
-    antialias = load_rendering(coarse / "rendering.json").antialias
-    write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if antialias else [])
+    read = _Reader(inputs.shards, coarse, report)
+    count, sh_degree = counted(site.partition, read)
+    comments = [MIP_COMMENT] if load_rendering(coarse / "rendering.json").antialias else []
+    write_splat_parts(out / "model.ply", own_pieces(site.partition, read), count, sh_degree, comments)
     for name in OF_ALL:
         shutil.copyfile(coarse / name, out / name)
     histories = [_read(folder / "history.json") for folder in inputs.shards]
@@ -47,25 +47,20 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
     plans = {"coarse": _read(coarse / "plan.json"), "blocks": [_read(each / "plan.json") for each in inputs.shards]}
     (out / "plan.json").write_text(json_text(plans), encoding="utf-8")
     most = sum(block.share for block in site.blocks)
-    return {"gaussians": len(gaussians), "blocks": len(inputs.shards), **_told(inputs, history, most)}
+    return {"gaussians": count, "blocks": len(inputs.shards), **_told(inputs, history, most)}
 
 
-class _Models(Mapping[int, Gaussians]):
-    """What each block trained, read when it is asked for, so that there is one in memory at a time."""
+class _Reader:
+    """Reads what a block trained or the coarse model, and tells how far that is: each is read to count and to write."""
 
-    def __init__(self, folders: Sequence[Path], report: Reporter) -> None:
-        self._folders, self._report = folders, report
+    def __init__(self, folders: Sequence[Path], coarse: Path, report: Reporter) -> None:
+        self._folders = {**dict(enumerate(folders)), BACKDROP: coarse}
+        self._report, self._done = report, 0
 
-    def __getitem__(self, block: int) -> Gaussians:
-        found = read_splat(self._folders[block] / "model.ply")
-        self._report.progress(block + 1, len(self._folders), "merging blocks", "blocks")
-        return found
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(range(len(self._folders)))
-
-    def __len__(self) -> int:
-        return len(self._folders)
+    def __call__(self, block: int) -> Gaussians:
+        self._report.progress(self._done, 2 * len(self._folders), "merging blocks", "steps")
+        self._done += 1
+        return read_splat(self._folders[block] / "model.ply")
 
 
 def joint_history(coarse: Mapping[str, Any], blocks: Sequence[Mapping[str, Any]]) -> dict[str, JSON]:

@@ -2,12 +2,12 @@
 
 A block trains its cell and a margin, so that what is at its border has seen what is on the other side; of its result
 only the cell is taken. What lies in no cell is the coarse model's. The blocks come in the order of their numbers,
-whatever the order in which they were trained.
+whatever the order in which they were trained. Models are read one at a time, to be counted and to be written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -28,18 +28,39 @@ def owned(partition: Partition, block: int, gaussians: Gaussians) -> Gaussians:
     return gaussians.select(torch.from_numpy(np.flatnonzero(owners == block)))
 
 
-def merged(partition: Partition, coarse: Gaussians, trained: Mapping[int, Gaussians]) -> Gaussians:
-    """The whole scene.
+def counted(partition: Partition, read: Callable[[int], Gaussians]) -> tuple[int, int]:
+    """The Gaussians of the whole scene, and their SH degree.
 
     Args:
         partition: The cells.
-        coarse: The coarse model, for what lies in no cell.
-        trained: What each block trained, without what it drew frozen.
+        read: As of ``own_pieces``.
 
     Raises:
-        ValueError: if a block is missing or unknown, or the SH degrees differ.
+        ValueError: if the SH degrees differ.
     """
-    if sorted(trained) != list(range(len(partition.cells))):
-        raise ValueError(f"blocks {sorted(trained)} of {len(partition.cells)} are there")
-    parts = [owned(partition, block, trained[block]) for block in range(len(partition.cells))]
-    return Gaussians.concat([*parts, owned(partition, BACKDROP, coarse)])
+    found = [_count(partition, block, read(block)) for block in _in_order(partition)]
+    if len({degree for _count_of_own, degree in found}) != 1:
+        raise ValueError("blocks are of several SH degrees")
+    return sum(count for count, _degree in found), found[0][1]
+
+
+def own_pieces(partition: Partition, read: Callable[[int], Gaussians]) -> Iterator[Gaussians]:
+    """The whole scene, piece by piece; each model is let go before the next is read.
+
+    Args:
+        partition: The cells.
+        read: Gives what the block of a number trained, without what it drew frozen; for `BACKDROP` the coarse model,
+            for what lies in no cell.
+    """
+    for block in _in_order(partition):
+        yield from (owned(partition, block, piece) for piece in read(block).pieces())
+
+
+def _in_order(partition: Partition) -> list[int]:
+    return [*range(len(partition.cells)), BACKDROP]
+
+
+def _count(partition: Partition, block: int, model: Gaussians) -> tuple[int, int]:
+    """A model's own Gaussians, and its degree."""
+    means = (piece.means.detach().double().numpy(force=True) for piece in model.pieces())
+    return sum(int((partition.owners(each) == block).sum()) for each in means), model.sh_degree
