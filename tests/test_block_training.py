@@ -25,7 +25,7 @@ from splatpipe.pipeline.splat.archives import read_archive
 from splatpipe.pipeline.splat.backdrop import backdrop_limit
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train import loop, memory
 from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
 from splatpipe.pipeline.train.blocks.needs import block_need
 from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
@@ -195,6 +195,17 @@ def test_killed_block_goes_on_with_other_threads_and_ends_with_the_same_bits(
         trained(site, tmp_path)
     assert (tmp_path / loop.CHECKPOINT).exists()
     assert digest(trained(site, tmp_path, threads=2)) == digest(undisturbed)
+
+
+def test_memory_of_the_process_does_not_end_a_blocks_growth(
+    site: SiteParts, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where one process trained other blocks before."""
+    monkeypatch.setattr(memory, "resident_bytes", lambda: 10**15)
+    recorder = tiny_scene.Recorder()
+    limited = CONFIG.model_copy(update={"max_memory_bytes": 2_000_000_000})
+    train_block(limited, site, TASK, Machine("cpu", 1), tmp_path, recorder)
+    assert digest(tmp_path) == digest(undisturbed) and not recorder.warnings
 
 
 def test_interrupt_leaves_a_checkpoint(site: SiteParts, tmp_path: Path) -> None:

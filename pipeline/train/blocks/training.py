@@ -143,7 +143,13 @@ class Block:
         trained_on = [view for view in views if view.camera.name in kept]
         exposures = _read_exposures(parts.coarse / "exposures.json")
         exposure = "affine" if exposures else "off"
-        decided = {"max_gaussians": task.trained, "time_budget_s": 0.0, "exposure": exposure}
+        # The cap keeps its memory: what the process holds besides, as of blocks before, is not to end its growth.
+        decided = {
+            "max_gaussians": task.trained,
+            "max_memory_bytes": 0,
+            "time_budget_s": 0.0,
+            "exposure": exposure,
+        }
         whole = make_plan(config.model_copy(update=decided), views, split, 0, task.window_pixels)
         cut = Cut.of(whole.options, whole.footage, whole.megapixels)
         surveyor = Surveyor(
