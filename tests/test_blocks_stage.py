@@ -12,12 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from splatpipe.pipeline.app.report import learning
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.lock import locked_shard
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks import assembly
 from splatpipe.pipeline.train.blocks.assembly import joint_history
 from splatpipe.pipeline.train.blocks.division import PHOTOS_A_BLOCK, Division, SceneSize, divided, memory_limit
 from splatpipe.pipeline.train.blocks.needs import need_of_blocks
@@ -238,3 +240,20 @@ def test_the_history_of_blocks_is_one_curve_after_the_coarse_pass() -> None:
     assert [(point["iteration"], point["gaussians"]) for point in joint["curve"]] == [(50, 10), (160, 12), (210, 16)]
     assert joint["curve"][-1]["loss"] == pytest.approx((100 * 0.2 + 60 * 0.3) / 160)
     assert joint["skipped_gradients"] == 3 and len(joint["blocks"]) == 2
+
+
+def test_why_blocks_trained_fewer_iterations_is_told(tmp_path: Path) -> None:
+    parts = [{"iterations": 90, "planned_iterations": 100, "flat_at": 80}, {"iterations": 70, "planned_iterations": 70}]
+    parts.append({"iterations": 60, "planned_iterations": 80, "sizes_ended": [30], "flat_at": 50})
+    summaries = {"blocks": {"coarse": {"iterations": 20, "planned_iterations": 30, "sizes_ended": [10]}}}
+    summaries |= {f"train.{number}": part for number, part in enumerate(parts, 1)}
+    given = replace(Inputs({}, tmp_path), summaries=summaries, shards=(tmp_path,) * 3)
+    told = assembly._told(given, {"curve": []}, 100) | {"blocks": 3}
+    assert (told["iterations"], told["planned_iterations"]) == (240, 280)
+    assert told["flat"] == {
+        "coarse": {"sizes_ended": [10]},
+        "1": {"flat_at": 80},
+        "3": {"flat_at": 50, "sizes_ended": [30]},
+    }
+    assert learning._why_earlier(told) == ": the loss was flat in the coarse pass and in 2 of 3 blocks"
+    assert "flat" not in assembly._told(replace(given, summaries={}), {"curve": []}, 100)

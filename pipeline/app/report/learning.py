@@ -173,6 +173,11 @@ def _last(curve: Mapping[float, float]) -> float | None:
 
 
 def _why_earlier(summary: Mapping[str, Any]) -> str:
+    if parts := summary.get("flat"):  # of a training in blocks
+        blocks = len(parts.keys() - {"coarse"})
+        told = ["in the coarse pass"] * ("coarse" in parts)
+        told += [f"in {count(blocks)} of {count(summary.get('blocks'))} blocks"] * bool(blocks)
+        return f": the loss was flat {' and '.join(told)}"
     flat, before = summary.get("flat_at"), summary.get("sizes_ended") or []
     told = [f"of smaller photos after {count(iteration)}" for iteration in before] + (
         [f"after {count(flat)}"] if flat else []

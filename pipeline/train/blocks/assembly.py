@@ -119,8 +119,19 @@ def _told(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JS
         "train_seconds": round(sum(float(part.get("train_seconds", 0.0)) for part in parts), 1),
         "peak_memory_bytes": max(int(part.get("peak_memory_bytes", 0)) for part in parts),
     }
+    if flat := {name: told for name, part in _named(first, each).items() if (told := _ended_flat(part))}:
+        found["flat"] = flat
     plan = {**first.get("plan", {}), "max_gaussians": most, "blocks": len(each)}
     return found | {name: first[name] for name in FROM_COARSE if name in first} | {"plan": plan}
+
+
+def _named(coarse: Summary, blocks: Sequence[Summary]) -> dict[str, Summary]:
+    return {"coarse": coarse, **{str(number): block for number, block in enumerate(blocks, 1)}}
+
+
+def _ended_flat(part: Summary) -> dict[str, JSON]:
+    """What a part's training says of having ended, or gone on to larger photos, because its loss was flat."""
+    return {name: part[name] for name in ("flat_at", "sizes_ended") if part.get(name)}
 
 
 def _read(path: Path) -> Any:
