@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.durable import sync_tree, write_durably
 from splatpipe.pipeline.engine.machine import available_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import load_split, load_views
@@ -58,6 +58,7 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     if not told.is_file():
         limits = Limits(division.coarse_cap, division.window_pixels)
         summary = train_coarse(train, inputs, limits, coarse, report)
+        sync_tree(coarse)  # what is told to be there is there, even after a power cut
         write_durably(told, json.dumps(dict(summary)))
     (coarse / "checkpoint.npz").unlink(missing_ok=True)
     site, told_of_blocks = lay_out(train, inputs, division, coarse, report)

@@ -216,6 +216,37 @@ def test_a_coarse_pass_that_is_done_is_not_made_again(
         assert (tmp_path / path).read_bytes() == part(undisturbed, f"blocks/{path}").read_bytes()
 
 
+def test_a_coarse_pass_is_told_to_be_done_once_its_files_are_on_the_disk(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed: list[Path] = []
+    flush, tell = os.fsync, blocks.write_durably
+
+    def noted(descriptor: int) -> None:
+        flushed.append(Path(f"/proc/self/fd/{descriptor}").readlink())
+        flush(descriptor)
+
+    def coarse(_train: object, _inputs: object, _limits: object, out: Path, _report: object) -> dict[str, object]:
+        (out / "model.ply").write_text("a model")
+        flushed.clear()
+        return {"iterations": 1}
+
+    def told(path: Path, content: str) -> None:
+        if path.name == "coarse.json":
+            assert {tmp_path / "coarse", tmp_path / "coarse" / "model.ply"} <= set(flushed)
+        tell(path, content)
+
+    def killed(*_arguments: object) -> None:
+        raise Killed
+
+    for name, stand_in in (("train_coarse", coarse), ("write_durably", told), ("lay_out", killed)):
+        monkeypatch.setattr(blocks, name, stand_in)
+    monkeypatch.setattr(os, "fsync", noted)
+    with pytest.raises(Killed):
+        blocks.run(BlocksConfig(least=3), inputs(scene, TrainConfig(**QUICK)), tmp_path, tiny_scene.Recorder())
+    assert json.loads((tmp_path / "coarse.json").read_text()) == {"iterations": 1}
+
+
 def test_two_makers_of_one_block_are_refused_and_of_two_are_not(
     scene: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

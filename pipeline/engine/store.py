@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import tempfile
 import time
@@ -12,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.digests import FileEntry, canonical, digest, part_digest, tree_entries
-from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, sync_folder, write_durably
+from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, sync_folder, sync_tree, write_durably
 from splatpipe.pipeline.engine.errors import MachineError, StageError, UsageError
 from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
@@ -155,7 +154,7 @@ class Store:
             "finished_s": time.time(),
             **run,
         }
-        _sync_tree(partial)
+        sync_tree(partial)
         write_durably(partial / "manifest.json", json.dumps(manifest, indent=1))
         _drop_strays(partial, {"manifest.json", *(entry["path"] for part in parts.values() for entry in part["files"])})
         return self._publish(partial)
@@ -267,16 +266,6 @@ def _drop_strays(folder: Path, keep: set[str]) -> None:
                 path.rmdir()
         elif path.relative_to(folder).as_posix() not in keep:
             path.unlink()
-
-
-def _sync_tree(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if path.is_dir():
-            sync_folder(path)
-        else:
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-    sync_folder(folder)
 
 
 def open_store(out: Path, *, create: bool) -> Store:
