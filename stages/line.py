@@ -147,7 +147,7 @@ BLOCKS = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=9,
+    version=10,
     config=TrainConfig,
     reads=(
         "undistort.dataset",

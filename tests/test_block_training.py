@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -30,6 +31,8 @@ from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
 from splatpipe.pipeline.train.blocks.needs import block_need
 from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
 from splatpipe.pipeline.train.blocks.partition import Cell, Partition
+from splatpipe.pipeline.train.blocks.sight import Sight
+from splatpipe.pipeline.train.blocks.sighted import MARGINS, sighted
 from splatpipe.pipeline.train.blocks.training import Block, BlockTask, SiteParts, train_block
 from splatpipe.pipeline.train.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.lengths import PART_VISITS
@@ -164,9 +167,9 @@ def test_windows_are_those_that_show_the_cell_each_as_often_as_without_blocks(si
     for number in range(2):
         block = Block.of(config, site, replace(TASK, number=number, window_pixels=400), cpu())
         windows = block.surveyor.parts(tmp_path, tiny_scene.Recorder())
-        (tmp_path / "seen.npz").unlink()
         plan = block.plan(windows)
         visits = block.course(plan, windows, tmp_path).visits(plan.schedule.looks_to(plan.last_iteration))
+        (tmp_path / "seen.npz").unlink()
         each = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
         times = Counter((visit.view, visit.level, visit.window) for visit in each)
         assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2
@@ -220,12 +223,70 @@ def test_interrupt_leaves_a_checkpoint(site: SiteParts, tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts["iteration"] == 10
 
 
+def sights_of(site: SiteParts) -> list[Sight]:
+    """What the photos that are trained on see."""
+    kept = set(load_split(site.split).train)
+    views = [view for view in load_views(site.dataset) if view.camera.name in kept]
+    _, tracks = load_points_and_tracks(site.dataset)
+    return coarse_sights(site.coarse, views, [tracks[view.camera.name] for view in views], Machine("cpu", 1))
+
+
+def test_what_counts_lies_near_the_cell_or_has_no_depth(site: SiteParts) -> None:
+    points, _ = load_points_and_tracks(site.dataset)
+    beside = np.ones((3, 3), np.uint8)
+    for sight in sights_of(site):
+        assert sight.depth is not None
+        rows, columns = np.indices(sight.depth.shape).reshape(2, -1)
+        depth = np.where(sight.depth > 0.0, sight.depth, 9.0)
+        places = sight.grid.unproject(np.stack([columns, rows], axis=1) + 0.5, depth.ravel().astype(np.float64))
+        distances = CELLS[0].distance(PARTITION.plan.places(places)).reshape(depth.shape)
+        depth[:4, :4] = 0.0
+        distances[:4, :4] = 0.0
+        blind = replace(sight, depth=depth, observed=np.zeros(0, np.int64))
+        found = sighted(PARTITION, 0, blind, points.xyz)
+        near = distances <= (MARGINS - 0.01) * PARTITION.margin
+        far = distances > MARGINS * PARTITION.margin * 2**0.5
+        assert found[near].all() and not found[cv2.erode(far.astype(np.uint8), beside) > 0].any()
+        assert 0.1 < found.mean() < 1.0
+        # Thin things that the depth has not: only what is beside a point counts.
+        lost = sighted(PARTITION, 0, replace(sight, depth=np.full_like(depth, 500.0)), points.xyz)
+        observed = sight.of_points(points.xyz)
+        inside = CELLS[0].contains(PARTITION.plan.places(observed.places))
+        across, down = observed.pixels[inside].astype(int).T
+        assert len(down) and lost[down, across].all() and lost.sum() <= 9 * len(observed.pixels)
+
+
+def test_photos_come_with_what_counts_and_their_part_of_the_whole(
+    site: SiteParts, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos: list[TrainingPhoto] = []
+
+    def look(state: TrainState, photo: TrainingPhoto) -> None:
+        photos.append(photo)
+        if len(photos) == 60:
+            raise Killed
+
+    step_with(monkeypatch, look)
+    for name in ("plan.json", "seen.npz", "frozen.ply"):
+        (tmp_path / name).write_bytes((undisturbed / name).read_bytes())
+    with pytest.raises(Killed):
+        trained(site, tmp_path)
+    half = "flight 1/photo_5.png"  # its mask leaves windows without a pixel
+    assert {photo.camera.name for photo in photos if photo.is_empty} <= {half}
+    for photo in photos:
+        here = photo.colour[photo.inside] if photo.mask is None else photo.mask[photo.inside]
+        number = here.shape[0] * here.shape[1] if photo.mask is None else int(here.sum())
+        counting = tiny_scene.WIDTH * tiny_scene.HEIGHT // (2 if photo.camera.name == half else 1)
+        assert photo.share == number / counting
+    cut = [photo for photo in photos if photo.mask is not None and not photo.mask.all()]
+    assert 0.2 * len(photos) < len(cut) < len(photos)
+
+
 def test_outlook_tells_what_a_block_does(site: SiteParts, undisturbed: Path) -> None:
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
-    points, tracks = load_points_and_tracks(site.dataset)
-    seen = coarse_sights(site.coarse, views, [tracks[view.camera.name] for view in views], Machine("cpu", 1))
-    outlook, _ = block_outlooks(CONFIG, views, seen, points.xyz, PARTITION, WINDOW)
+    points, _ = load_points_and_tracks(site.dataset)
+    outlook, _ = block_outlooks(CONFIG, views, sights_of(site), points.xyz, PARTITION, WINDOW)
     plan = Plan.from_json((undisturbed / "plan.json").read_text())
     assert (outlook.photos, outlook.iterations) == (len(plan.train_views), plan.schedule.iterations)
     assert outlook.parts == (len(read_archive(undisturbed / "seen.npz")["level_0"]),)

@@ -198,6 +198,7 @@ class PhotoStream:
         window, whole = visit.window, visit.camera
         cut = window.grown(whole.width, whole.height)
         pixels, mask, of_whole = self._decoded(visit, cut)
+        mask = visit.counted(mask, cut)
         left, top, right, bottom = inner = window.within(cut)
         here = window.pixels if mask is None else int(np.count_nonzero(mask[top:bottom, left:right]))
         return _Sent(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.photos.images import Mask, reduced_camera
 from splatpipe.pipeline.train.draws import WINDOW_ORDER, permutation, random_bits
 from splatpipe.pipeline.train.looks import Frame, Look, windows_of
 
@@ -27,12 +27,31 @@ class Visit:
         level: How often it is halved.
         camera: The whole photo's, of that size.
         window: What counts.
+        cells: What of the whole photo counts besides its mask, by the cells of a grid over it; None where all does.
     """
 
     view: int
     level: int
     camera: Camera
     window: Frame
+    cells: Bool[np.ndarray, "rows columns"] | None = field(default=None, compare=False)
+
+    def counted(self, mask: Mask | None, cut: Frame) -> Mask | None:
+        """Which pixels of a part count; None where all do.
+
+        Args:
+            mask: The photo's in that part.
+            cut: The part, in the camera's pixels.
+        """
+        if self.cells is None:
+            return mask
+        height, width = self.cells.shape
+        rows = np.arange(cut.top, cut.bottom) * height // self.camera.height
+        columns = np.arange(cut.left, cut.right) * width // self.camera.width
+        if self.cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
+            return mask
+        counted: Mask = self.cells[rows][:, columns]
+        return counted if mask is None else counted & mask
 
 
 @runtime_checkable
@@ -143,6 +162,7 @@ class PartVisits(Visits):
         seed: Of the orders.
         max_megapixels: As for ``PhotoVisits``.
         parts: By the level, each a photo's number and a window of it at that level; at least one where a look wants it.
+        cells: What of photos counts, by their numbers, as of ``Visit``; all of one that is not there.
     """
 
     def __init__(
@@ -152,8 +172,10 @@ class PartVisits(Visits):
         seed: int,
         max_megapixels: float | None,
         parts: Mapping[int, Sequence[tuple[int, Frame]]],
+        cells: Mapping[int, Bool[np.ndarray, "rows columns"]] | None = None,
     ) -> None:
         self._cameras, self._looks, self.max_megapixels, self._parts = cameras, looks, max_megapixels, parts
+        self._cells = cells or {}
         levels = np.array([look.level for look in looks], np.int64)
         self._rows = np.zeros(len(looks), np.int64)  # of the level's parts
         for level in np.unique(levels).tolist():
@@ -168,7 +190,7 @@ class PartVisits(Visits):
         """The visit of an iteration, from 1."""
         level = self._looks[iteration - 1].level
         view, window = self._parts[level][int(self._rows[iteration - 1])]
-        return Visit(view, level, self.camera(view, level), window)
+        return Visit(view, level, self.camera(view, level), window, self._cells.get(view))
 
     def camera(self, view: int, level: int) -> Camera:
         """A photo's camera at a level."""

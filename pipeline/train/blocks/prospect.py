@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from splatpipe.pipeline.engine.durable import write_durably
@@ -21,12 +22,14 @@ from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.train.blocks.outlook import Cut, Parts, each_sight, parts_of, seen_windows
 from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.blocks.sight import Sight
+from splatpipe.pipeline.train.blocks.sighted import Sighted, sighted
 from splatpipe.pipeline.train.blocks.surroundings import surroundings
 from splatpipe.pipeline.train.blocks.visibility import BlockPhoto, BlockViews
 
 SEEN = "seen.npz"
 FROZEN = "frozen.ply"
 _LEVEL = "level_"
+_COUNTED = "counted_"
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,8 @@ class Surveyor:
     def parts(self, out: Path, report: Reporter) -> Parts:
         """The windows that the block trains on; their rows are those of ``views``.
 
-        They and the frozen Gaussians (``frozen``) are kept in files: a run that goes on takes them as they are.
+        They, what of their photos counts (``counted``) and the frozen Gaussians (``frozen``) are kept in files: a run
+        that goes on takes them as they are.
 
         Args:
             out: The block's folder.
@@ -68,13 +72,17 @@ class Surveyor:
         try:
             arrays = read_archive(out / SEEN)
             read_splat(out / FROZEN)
-            return {int(name.removeprefix(_LEVEL)): array for name, array in arrays.items()}
+            return {int(number): array for number, array in _named(arrays, _LEVEL)}
         except (OSError, ValueError, SplatpipeError):
             return self._work_out(out, report)
 
     def frozen(self, out: Path) -> Gaussians:
         """What is drawn around the block."""
         return read_splat(out / FROZEN)
+
+    def counted(self, out: Path) -> dict[int, Sighted]:
+        """What counts of each photo that the windows are of, by its row."""
+        return {int(row): grid for row, grid in _named(read_archive(out / SEEN), _COUNTED)}
 
     def start(self, most: int) -> Gaussians:
         """What the coarse model has in the cell and its margin; the most opaque where it is more than ``most``."""
@@ -100,8 +108,12 @@ class Surveyor:
         parts = parts_of(shown, 0)
         write_splat(out / FROZEN, self._surroundings(coarse, parts, seen))
 
+        arrays = {f"{_LEVEL}{level}": pairs for level, pairs in parts.items()}
+        for row, sight in seen.items():
+            arrays[f"{_COUNTED}{row}"] = sighted(self.partition, self.number, sight, points.xyz)
+
         def write(file: IO[bytes]) -> None:
-            np.savez(file, allow_pickle=False, **{f"{_LEVEL}{level}": pairs for level, pairs in parts.items()})
+            np.savez_compressed(file, allow_pickle=False, **arrays)
 
         write_durably(out / SEEN, write)
         return parts
@@ -120,3 +132,8 @@ class Surveyor:
             windows.append(np.concatenate(each))
         view = (BlockViews(tuple(photos)), [seen[row] for row in rows], windows)
         return surroundings(self.partition, self.number, coarse, view, self.most_frozen).frozen
+
+
+def _named(arrays: dict[str, npt.NDArray[Any]], prefix: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """The arrays whose names begin so, with the rest of the name."""
+    return ((name.removeprefix(prefix), array) for name, array in arrays.items() if name.startswith(prefix))

@@ -192,10 +192,11 @@ class Block:
         Args:
             plan: Its plan.
             windows: That it trains on.
-            out: Has its surroundings.
+            out: Has its surroundings, and what of the photos counts.
         """
         views, place = self.views(windows), {row: place for place, row in enumerate(rows_of(windows))}
         cut, every = self.surveyor.cut, self.surveyor.views
+        cells = {place[row]: grid for row, grid in self.surveyor.counted(out).items()}
         pieces = {
             level: [(place[row], cut.frames(every[row].camera, level)[window]) for row, window in pairs.tolist()]
             for level, pairs in windows.items()
@@ -203,7 +204,7 @@ class Block:
 
         def visits(looks: Sequence[Look]) -> Visits:
             cameras = [view.camera for view in views]
-            return PartVisits(cameras, looks, plan.options.seed, plan.megapixels, pieces)
+            return PartVisits(cameras, looks, plan.options.seed, plan.megapixels, pieces, cells)
 
         return Course(
             plan,
