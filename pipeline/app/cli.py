@@ -168,7 +168,7 @@ def stage(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run one stage again on an existing OUT, and nothing else; or make one of its shards, if it is not there."""
+    """Run one stage again on an existing OUT, and nothing else but what divides it; or make one of its shards."""
     with Ending(out, as_json) as done:
         done.notify_by(notify)
         check_stage(name)

@@ -107,20 +107,25 @@ class Runner:
         return outcome
 
     def run_alone(self, name: str) -> Outcome:
-        """Run one stage again, whether or not it is valid, and nothing else but those of its shards that are missing.
+        """Run one stage again, whether or not it is valid, and nothing else but what of its shards is missing.
+
+        To its shards belongs the stage that counts them.
 
         Raises:
             UsageError: if a stage that it reads from is not valid.
         """
         with self._explained():
             self.store.recover()
-        stage, parts = self._ready(name)
+        stage, parts, counting = self._ready(name)
         with self._explained():
             self.save_config(self.line.config)
-        with self._told([name]):
-            artifact = self._make(Job(stage, self.line.inputs_of(stage, parts)), parts)
-            with self._explained():
-                self.store.deliver(artifact, stage)
+        needed = [*counting, stage]
+        with self._told([each.name for each in needed]):
+            for each in needed:
+                artifact = self._make(Job(each, self.line.inputs_of(each, parts)), parts)
+                parts.update(artifact.parts)
+                with self._explained():
+                    self.store.deliver(artifact, each)
         return self.outcome
 
     def run_shard(self, name: str, number: int) -> Outcome:
@@ -135,7 +140,9 @@ class Runner:
         """
         with self._explained():
             self.store.recover(f"{name}.{number}")
-        stage, parts = self._ready(name)
+        stage, parts, counting = self._ready(name)
+        if counting:
+            raise self._unready(name, counting)
         jobs = self.line.shards_of(stage, parts)
         if not 1 <= number <= len(jobs):
             has = f"{len(jobs)} here" if stage.shards else "none"
@@ -148,8 +155,8 @@ class Runner:
             self._found(job) or self._run(job, parts)
         return self.outcome
 
-    def _ready(self, name: str) -> tuple[Stage, dict[str, Part]]:
-        """A stage, and the parts that valid stages before it left.
+    def _ready(self, name: str) -> tuple[Stage, dict[str, Part], list[Stage]]:
+        """A stage, the parts that valid stages before it left, and what has to be made first: what counts its shards.
 
         Raises:
             UsageError: if one of them is not valid.
@@ -163,13 +170,20 @@ class Runner:
                 parts.update(standing.artifact.parts)
         stage = next(stage for stage in self.line.stages if stage.name == name)
         absent = {stage_name(part) for part in stage.reads if part not in parts}
-        missing = [earlier.name for earlier in self.line.stages if earlier.name in absent]
-        if missing:
-            raise UsageError(
-                f"The stage {name} reads what {', '.join(missing)} leaves, and that is not there or no longer valid.",
-                hint=f"Run the line up to there first: splatpipe run PHOTOS {self.store.out} --until {missing[-1]}",
-            )
-        return stage, parts
+        missing = [earlier for earlier in self.line.stages if earlier.name in absent]
+        counts = stage_name(stage.shards.counted_by) if stage.shards else ""
+        if missing and [earlier.name for earlier in missing] != [counts]:
+            raise self._unready(name, missing)
+        for counting in missing:
+            self._ready(counting.name)
+        return stage, parts, missing
+
+    def _unready(self, name: str, missing: Sequence[Stage]) -> UsageError:
+        names = [stage.name for stage in missing]
+        return UsageError(
+            f"The stage {name} reads what {', '.join(names)} leaves, and that is not there or no longer valid.",
+            hint=f"Run the line up to there first: splatpipe run PHOTOS {self.store.out} --until {names[-1]}",
+        )
 
     @contextmanager
     def _told(self, stages: Sequence[str]) -> Iterator[None]:
