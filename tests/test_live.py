@@ -86,7 +86,7 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         assert first.shape == photo.shape
         follow_the_curves(page, len(told["curves"]["loss"]))
         before = page.evaluate("document.getElementById('render').src")
-        told = wait(page, lambda told: told["model"]["kind"] == "checkpoint" and told["model"]["iteration"] > 200)
+        told = wait(page, lambda told: told["model"]["kind"] == "checkpoint" and told["model"]["iteration"] > 800)
         wait_for_picture(page, "(before) => document.getElementById('render').src !== before", before)
         assert page.locator("#iteration").inner_text().startswith("iteration ")
         assert psnr(shown(page, "render"), photo) > psnr(first, photo) + 3.0
