@@ -108,3 +108,16 @@ def building_corners(paint: Painter | None = None) -> Array:
     corners = np.concatenate([face.vertices[face.triangles] for face in faces])
     turned = corners.astype(np.float32).astype(np.float64) @ _turn(PLOT_YAW_DEG).T
     return np.asarray(turned.astype(np.float32), np.float64)
+
+
+def surface_of(scene: Scene) -> tuple[Array, np.ndarray[tuple[int, int], np.dtype[np.int64]]]:
+    """All triangles of the scene as one mesh: vertices (n, 3) and triangles (m, 3), equal vertices joined."""
+    vertices, triangles, count = [], [], 0
+    for mesh in scene.meshes:
+        vertices.append(mesh.vertices)
+        triangles.append(mesh.triangles.astype(np.int64) + count)
+        count += len(mesh.vertices)
+    joined, index = np.unique(np.vstack(vertices), axis=0, return_inverse=True)
+    corners = index.reshape(-1)[np.vstack(triangles)]
+    whole = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
+    return joined.astype(np.float64), corners[whole]
