@@ -34,6 +34,26 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--captures", default=None, help="Folder of real captures, for the tests marked captures.")
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run what asks for ``isa`` on each instruction set that this CPU has; kernels load only where they are tested."""
+    if "isa" in metafunc.fixturenames:
+        from splatpipe.pipeline.raster.isa import isa_names
+
+        metafunc.parametrize("isa", isa_names(), indirect=True)
+
+
+@pytest.fixture
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """What the native kernels run on during a test, which may change that, and their threads, too."""
+    from splatpipe.pipeline.raster import _native
+
+    before, threads = _native.isa(), _native.threads()
+    _native.set_isa(request.param)
+    yield request.param
+    _native.set_isa(before)
+    _native.set_threads(threads)
+
+
 @pytest.fixture(scope="session")
 def captures(request: pytest.FixtureRequest) -> Path:
     """The folder of real captures."""

@@ -1,23 +1,13 @@
 """Affine maps of a picture's colours: on every instruction set that this CPU has."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 
-from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.raster.rasterizer import set_threads
 
-
-@pytest.fixture(params=_native.isas(), autouse=True)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-    set_threads(2)
+pytestmark = pytest.mark.usefixtures("isa")
 
 
 def gradients(

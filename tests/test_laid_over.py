@@ -1,6 +1,5 @@
 """A render laid over the sky by the kernels of the CPU: each instruction set that it has, beside the definition."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -19,13 +18,7 @@ BACKGROUND = (0.2, 0.5, 0.1)
 SIZES = [(1, 1), (17, 33), (18, 34), (1, 40), (40, 1), (9, 15), (50, 64), (23, 700)]
 
 
-@pytest.fixture(params=_native.isas(), autouse=True)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-    set_threads(2)
+pytestmark = pytest.mark.usefixtures("isa")
 
 
 class Given:

@@ -84,14 +84,6 @@ def assert_as_reference(kind: str, size: tuple[int, int], weight: float = 0.2, m
     assert error <= GRADIENT_RTOL * torch.linalg.vector_norm(exact[1])
 
 
-@pytest.fixture(params=_native.isas())
-def isa(request):
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("kind", ["random", "smooth", "nearly equal", "black", "white", "photo"])
 def test_native_loss_and_gradient_are_the_reference(isa, kind, size):
@@ -155,13 +147,10 @@ def test_equal_images_have_no_gradient_but_rounding():
 def test_same_bits_for_any_number_of_threads(isa, masked):
     render, photo = pair("random", 300, 600)
     mask = torch.rand(300, 600) > 0.2 if masked else None
-    results, before = [], _native.threads()
-    try:
-        for threads in (1, 2, 3, 8):
-            _native.set_threads(threads)
-            results.append(loss_and_gradient(photo_loss, render, photo, 0.2, mask))
-    finally:
-        _native.set_threads(before)
+    results = []
+    for threads in (1, 2, 3, 8):
+        _native.set_threads(threads)
+        results.append(loss_and_gradient(photo_loss, render, photo, 0.2, mask))
     for loss, gradient in results[1:]:
         assert loss == results[0][0]
         assert torch.equal(gradient, results[0][1])

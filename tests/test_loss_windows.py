@@ -81,14 +81,6 @@ def relative(found: Tensor, exact: Tensor) -> float:
     return float(torch.linalg.vector_norm(found.double() - exact.double()) / torch.linalg.vector_norm(exact.double()))
 
 
-@pytest.fixture(params=_native.isas())
-def isa(request: pytest.FixtureRequest):
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
 def check_parts(function: Callable[..., Tensor], dtype: torch.dtype, cut: tuple, masked: bool) -> None:
     (height, width), rows, columns = cut
     render, photo, mask = pair(height, width)
@@ -155,15 +147,12 @@ def test_nothing_that_counts_inside_gives_zero(function):
     assert not gradient.any()
 
 
-def test_parts_have_the_same_bits_for_any_number_of_threads():
+def test_parts_have_the_same_bits_for_any_number_of_threads(isa):
     render, photo, mask = pair(280, 560)
-    results, before = [], _native.threads()
-    try:
-        for threads in (1, 2, 3):
-            _native.set_threads(threads)
-            results.append(of_whole(photo_loss, render.float(), photo.float(), 0.2, mask, (5, 5, 555, 275)))
-    finally:
-        _native.set_threads(before)
+    results = []
+    for threads in (1, 2, 3):
+        _native.set_threads(threads)
+        results.append(of_whole(photo_loss, render.float(), photo.float(), 0.2, mask, (5, 5, 555, 275)))
     for loss, gradient in results[1:]:
         assert loss == results[0][0]
         assert torch.equal(gradient, results[0][1])

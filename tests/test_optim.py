@@ -16,14 +16,6 @@ SHAPES = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": ()
 RATES = {"means": 1.6e-4, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2}
 
 
-@pytest.fixture(params=_native.isas())
-def isa(request):
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
 def parameters(n: int, coefficients: int = 16) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(n)
     shapes = SHAPES | {"sh": (coefficients, 3)}
@@ -127,19 +119,16 @@ def test_row_with_a_gradient_that_is_not_finite_is_left_out_and_counted(isa, bad
 
 
 def test_same_bits_for_any_number_of_threads(isa):
-    results, before = [], _native.threads()
+    results = []
     visible = torch.rand(3000) > 0.5
-    try:
-        for threads in (1, 2, 5):
-            _native.set_threads(threads)
-            tensors = parameters(3000)
-            optimizer = Adam(tensors)
-            for step in range(2):
-                set_gradients(tensors, step)
-                optimizer.step(tensors, rates(), visible)
-            results.append(snapshot(tensors))
-    finally:
-        _native.set_threads(before)
+    for threads in (1, 2, 5):
+        _native.set_threads(threads)
+        tensors = parameters(3000)
+        optimizer = Adam(tensors)
+        for step in range(2):
+            set_gradients(tensors, step)
+            optimizer.step(tensors, rates(), visible)
+        results.append(snapshot(tensors))
     for name in SHAPES:
         assert all(torch.equal(result[name], results[0][name]) for result in results)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,13 +34,7 @@ FLIPPED = 4  # pixels in which one rounding decides whether a Gaussian at a thre
 FLIP = 1e-3  # how much larger than a rounding such a pixel's difference is
 
 
-@pytest.fixture(params=_native.isas(), autouse=True)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-    set_threads(2)
+pytestmark = pytest.mark.usefixtures("isa")
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render, set_threads
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -25,13 +23,7 @@ WIDE, TALL = random_camera(0), random_camera(3, 31, 64)
 STEPS = 4
 
 
-@pytest.fixture(params=_native.isas(), autouse=True)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-    set_threads(2)
+pytestmark = pytest.mark.usefixtures("isa")
 
 
 def rates_of(scene: Gaussians) -> dict[str, float | Tensor]:

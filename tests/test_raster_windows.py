@@ -95,14 +95,6 @@ def check_part(part: tuple[int, int, int, int], dtype: torch.dtype, options: Ren
     torch.testing.assert_close(made.radii, torch.where(made.visible, whole.radii, 0.0), rtol=RTOL[dtype], atol=0.0)
 
 
-@pytest.fixture(params=_native.isas())
-def isa(request: pytest.FixtureRequest):
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
 @pytest.fixture(scope="module")
 def cuda() -> CudaKernels:
     return CudaKernels(CudaLibrary(build_on_cpu()), torch.device("cpu"))
