@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.train import flatness, loop
+from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.lengths import Stretch
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
@@ -115,6 +117,15 @@ def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None
     assert set(np.diff(places[10:])) == {4}
     assert plan.schedule.at(5500, 5000).means_rate == plan.schedule.at(7000).means_rate
     assert plan.schedule.place(6000, 0) == 6000
+
+
+def test_an_epoch_of_windows_counts_as_one_with_its_own_middle() -> None:
+    plan, history = make_plan(1000, 0.1), History()
+    history.add_loss(torch.tensor(0.5))
+    flatness.end_epoch(history, plan, 700, 90)
+    flatness.end_epoch(history, plan, 700, 101)  # it began before losses count
+    assert flatness.judged_from(plan.schedule, 700, []) == 600
+    assert history.epochs == [(655, 0.5)]
 
 
 @pytest.fixture(scope="module")

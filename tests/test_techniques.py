@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -86,8 +87,8 @@ def photos() -> list[TrainingPhoto]:
 def test_an_iteration_calls_every_hook_in_order(plan: Plan) -> None:
     tint = Tint()
     state = TrainState.begin(tiny_scene.true_model(), plan, Techniques((tint,)))
-    for photo in photos():
-        iterate(state, plan, photo)
+    for photo, ended in zip(photos(), (0, 2), strict=True):
+        iterate(state, plan, replace(photo, round=ended))
     once = ["before_render", "shown", "counted", "penalty", "after_step"]
     assert tint.calls == ["settings 1", *once, "unwanted", "settings 2", *once, "after_epoch 2", "unwanted"]
     assert len(state.gaussians) == tiny_scene.GAUSSIANS - 1  # the second time one was unwanted

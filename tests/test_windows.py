@@ -17,7 +17,7 @@ from splatpipe.pipeline.splat.panorama import STEP_PX
 from splatpipe.pipeline.train import looks
 from splatpipe.pipeline.train.looks import Frame, Look, windows_of
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.visits import PhotoVisits
+from splatpipe.pipeline.train.visits import PartVisits, PhotoVisits, Visits
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -104,6 +104,35 @@ def test_windows_of_photos_of_several_sizes_are_seen_equally_often() -> None:
     rounds = [seen[6 + start : 6 + start + sum(cells)] for start in range(0, 3 * sum(cells), sum(cells))]
     shown = [[(visit.view, visit.window) for visit in each] for each in rounds]
     assert all(len(set(each)) == sum(cells) for each in shown) and len({tuple(each) for each in shown}) == 3
+
+
+def rounds_of(visits: Visits) -> dict[int, int]:
+    """How many visits each round has, by the iteration that ends it."""
+    seen = {iteration: visits.at(iteration).round for iteration in range(1, len(visits) + 1)}
+    return {iteration: count for iteration, count in seen.items() if count}
+
+
+def test_a_round_ends_when_every_photo_has_been_seen_and_of_larger_ones_every_window() -> None:
+    cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
+    look, windows = Look(0, 70_000), len(windows_of(720, 540, 70_000))
+    whole = PhotoVisits(cameras, [Look(2)] * 12 + [Look(1)] * 17, 0)  # epochs of photos, whatever their size
+    assert rounds_of(whole) == {9: 9, 18: 9, 27: 9}
+    visits = PhotoVisits(cameras, [Look(1)] * 12 + [look] * (18 * windows + 10), 0)
+    ends = [9, 18, 18 + 9 * windows, 18 + 18 * windows]
+    assert rounds_of(visits) == dict(zip(ends, (9, 9, 9 * windows, 9 * windows), strict=True))
+    seen = Counter(visits.at(iteration).view for iteration in range(ends[1] + 1, ends[2] + 1))
+    assert set(seen.values()) == {windows}
+
+
+def test_rounds_of_windows_that_are_mixed_or_chosen_begin_with_their_size() -> None:
+    small, large = tiny_scene.cameras()[:2]
+    cameras, look = [small.scaled(640, 480), large.scaled(2000, 1500)], Look(0, 100_000)
+    count = sum(len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras)
+    mixed = PhotoVisits(cameras, [Look(2)] * 5 + [look] * (2 * count + 1), 0)
+    assert rounds_of(mixed) == {2: 2, 4: 2, 5: 1, 5 + count: count, 5 + 2 * count: count}
+    parts = {1: [(0, Frame(0, 0, 9, 9))], 0: [(view, Frame(0, 0, 9, 9)) for view in (0, 1, 1)]}
+    chosen = PartVisits(cameras, [Look(1)] * 2 + [look] * 7, 0, None, parts)
+    assert rounds_of(chosen) == {1: 1, 2: 1, 5: 3, 8: 3}
 
 
 @pytest.mark.parametrize("fill", [False, True])

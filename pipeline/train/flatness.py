@@ -1,11 +1,11 @@
 """Early end: where the loss on the training photos is flat, larger photos come at once, or the schedule is run down.
 
 A size is flat where training on with it, for all iterations that are left, would take too little off its loss.
-Epochs are compared, in which every photo counts once, by a straight line through the logarithms of their mean losses
-over the logarithm of the iteration. Such a power law has no unit, and it foretells too much gain rather than too
-little, for a real curve bends towards its floor: on four captures it was 1.5 to 2 times what came. Learning rates that
-have not fallen yet hide a part of the gain, so the end is not abrupt: the schedule's remainder is compressed into a
-short tail. Only losses and iterations have a say, no clock and no held-out photo.
+Epochs are compared, in which every photo counts once with all of its windows, by a straight line through the logarithms
+of their mean losses over the logarithm of the iteration. Such a power law has no unit, and it foretells too much gain
+rather than too little, for a real curve bends towards its floor: on four captures it was 1.5 to 2 times what came.
+Learning rates that have not fallen yet hide a part of the gain, so the end is not abrupt: the schedule's remainder is
+compressed into a short tail. Only losses and iterations have a say, no clock and no held-out photo.
 """
 
 from __future__ import annotations
@@ -92,16 +92,17 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> 
     return expected_gain(recent, scheduled) < plan.options.stop_when_flat
 
 
-def end_epoch(history: History, plan: Plan, iteration: int) -> None:
+def end_epoch(history: History, plan: Plan, iteration: int, length: int) -> None:
     """Close an epoch, and note where its loss ends a size or begins the training's tail.
 
     Args:
         history: Changed in place.
         plan: The training's, as it is by now.
         iteration: The last one of an epoch.
+        length: Iterations that the epoch has.
     """
-    photos, since = len(plan.train_views), judged_from(plan.schedule, iteration, history.resets)
-    history.end_epoch(iteration - photos // 2, iteration - photos >= since)
+    since = judged_from(plan.schedule, iteration, history.resets)
+    history.end_epoch(iteration - length // 2, iteration - length >= since)
     if history.flat_at or not is_flat([each for each in history.epochs if each[0] > since], plan, iteration):
         return
     if plan.schedule.stretch_at(iteration) < len(plan.schedule.stretches) - 1:

@@ -90,7 +90,7 @@ class History:
         self.loss_sum, self.loss_count = 0.0, 0
 
     def end_epoch(self, middle: int, judged: bool) -> None:
-        """Close an epoch, in which every photo was trained on once.
+        """Close an epoch, in which every photo was trained on once, with all of its windows.
 
         Args:
             middle: Its middle iteration.

@@ -82,7 +82,7 @@ class Technique:
         """Step what is trained beside the Gaussians."""
 
     def after_epoch(self, iteration: int) -> None:
-        """Every photo was trained on once more."""
+        """Every photo was trained on once more, with all of its windows."""
 
     def ranked(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule

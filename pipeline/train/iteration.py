@@ -35,7 +35,7 @@ def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     if not photo.is_empty:
         learn(state, plan, photo, now)
     # Density.
-    if now.iteration % len(plan.train_views) == 0:
+    if photo.round:
         state.techniques.after_epoch(now.iteration)
     state.control_density(plan, now.iteration)
     close(state, plan, photo, now)
@@ -91,14 +91,14 @@ def render_options(plan: Plan, now: Moment, magnitudes: bool) -> rasterizer.Rend
 
 def close(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> None:
     """Count the iteration, and note what followed from it: the memory's end of growth, a flat loss, the curve."""
-    history, photos = state.history, len(plan.train_views)
+    history = state.history
     if not history.growth_ended and plan.schedule.density.is_step(now.iteration):
         # A device's memory is looked at before anything grows (see ``within_room``).
         on_cpu = state.gaussians.means.device.type == "cpu"
         history.growth_ended = now.iteration if on_cpu and over_memory(plan.options) else 0
     state.iteration = now.iteration
-    if plan.options.stop_when_flat > 0.0 and now.iteration % photos == 0:
-        end_epoch(history, plan, now.iteration)
+    if plan.options.stop_when_flat > 0.0 and photo.round:
+        end_epoch(history, plan, now.iteration, photo.round)
     is_last = now.iteration == ends_at(plan, history.flat_at)
     history.end_iteration(now.iteration, is_last, curve_facts(state, plan, photo))
 

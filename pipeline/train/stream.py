@@ -38,6 +38,7 @@ class TrainingPhoto:
         inner: Left, top, right and bottom of what counts, in the pixels of ``colour``: around it is what SSIM looks at
             beside; None where all is inside.
         share: Of the pixels of the whole photo that count, how many are inside: a window's part in the photo's loss.
+        round: How many visits the round took that ends with it, as of ``Visit``; 0 where none does.
     """
 
     camera: Camera
@@ -46,6 +47,7 @@ class TrainingPhoto:
     is_empty: bool = False
     inner: tuple[int, int, int, int] | None = None
     share: float = 1.0
+    round: int = 0
 
     @property
     def inside(self) -> tuple[slice, slice]:
@@ -65,6 +67,7 @@ class _Sent:
     is_empty: bool
     inner: tuple[int, int, int, int] | None
     share: float
+    round: int
 
 
 class PhotoStream:
@@ -151,7 +154,8 @@ class PhotoStream:
         if not self._pending:
             raise StopIteration
         sent = self._pending.popleft().result()
-        return TrainingPhoto(sent.camera, *self._uploader.end(sent.upload), sent.is_empty, sent.inner, sent.share)
+        pixels = self._uploader.end(sent.upload)
+        return TrainingPhoto(sent.camera, *pixels, sent.is_empty, sent.inner, sent.share, sent.round)
 
     def fill(self, report: Reporter) -> None:
         """Decode all photos before the first iteration: one at full size beside the model would take more memory.
@@ -207,6 +211,7 @@ class PhotoStream:
             here == 0,
             None if cut == window else inner,
             here / max(1, of_whole),
+            visit.round,
         )
 
     def _decoded(self, visit: Visit, cut: Frame) -> tuple[Pixels, Mask | None, int]:

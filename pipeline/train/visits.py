@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -28,6 +29,8 @@ class Visit:
         camera: The whole photo's, of that size.
         window: What counts.
         cells: What of the whole photo counts besides its mask, by the cells of a grid over it; None where all does.
+        round: Where all that there is to see at this size has been seen once since the last such visit: how many visits
+            that took; 0 elsewhere. What a change of size cuts short counts as a round, too.
     """
 
     view: int
@@ -35,6 +38,7 @@ class Visit:
     camera: Camera
     window: Frame
     cells: Bool[np.ndarray, "rows columns"] | None = field(default=None, compare=False)
+    round: int = field(default=0, compare=False)
 
     def counted(self, mask: Mask | None, cut: Frame) -> Mask | None:
         """Which pixels of a part count; None where all do.
@@ -112,6 +116,19 @@ class PhotoVisits(Visits):
         for place, key in enumerate(zip(self._views.tolist(), looks, strict=True)):
             self._turns[place] = before[key]
             before[key] += 1
+        self._rounds = rounds_ended(self._ends(), len(looks))
+
+    def _ends(self) -> Iterable[int]:
+        """The iterations that end rounds: of photos, then of their windows where they have several."""
+        photos = max(1, len(self._cameras))
+        for look, begun, until in runs(self._looks):
+            counts = {len(self._windows_at(view, look)) for view in range(len(self._cameras))}
+            if len(counts) == 1:  # photos go on by epochs, which a change of size does not begin anew
+                begun = photos * -(-begun // photos)
+            yield from range(begun, until + 1, self._count(look))
+
+    def _count(self, look: Look) -> int:
+        return max(1, sum(len(self._windows_at(view, look)) for view in range(len(self._cameras))))
 
     def _mix(self, look: Look) -> None:
         """Let the windows of all photos go by rounds, where photos have different numbers of them."""
@@ -134,13 +151,13 @@ class PhotoVisits(Visits):
     def at(self, iteration: int) -> Visit:
         """The visit of an iteration, from 1."""
         view, look = int(self._views[iteration - 1]), self._looks[iteration - 1]
-        camera = self.camera(view, look.level)
+        camera, ended = self.camera(view, look.level), int(self._rounds[iteration - 1])
         windows, given = self._windows_at(view, look), int(self._given[iteration - 1])
         if len(windows) == 1 or given >= 0:
-            return Visit(view, look.level, camera, windows[max(0, given)])
+            return Visit(view, look.level, camera, windows[max(0, given)], round=ended)
         past, place = divmod(int(self._turns[iteration - 1]), len(windows))
         drawn = random_bits(self._seed, past, WINDOW_ORDER, view * MOST_WINDOWS + np.arange(len(windows)))
-        return Visit(view, look.level, camera, windows[int(np.argsort(drawn, kind="stable")[place])])
+        return Visit(view, look.level, camera, windows[int(np.argsort(drawn, kind="stable")[place])], round=ended)
 
     def camera(self, view: int, level: int) -> Camera:
         """A photo's camera at a level."""
@@ -181,6 +198,8 @@ class PartVisits(Visits):
         for level in np.unique(levels).tolist():
             wanted, count = np.flatnonzero(levels == level), len(parts[level])
             self._rows[wanted] = in_rounds(seed, count, len(wanted))
+        ends = (range(begun, until + 1, len(parts[look.level])) for look, begun, until in runs(looks))
+        self._rounds = rounds_ended((end for each in ends for end in each), len(looks))
 
     def __len__(self) -> int:
         """How many iterations there are."""
@@ -190,7 +209,8 @@ class PartVisits(Visits):
         """The visit of an iteration, from 1."""
         level = self._looks[iteration - 1].level
         view, window = self._parts[level][int(self._rows[iteration - 1])]
-        return Visit(view, level, self.camera(view, level), window, self._cells.get(view))
+        ended = int(self._rounds[iteration - 1])
+        return Visit(view, level, self.camera(view, level), window, self._cells.get(view), ended)
 
     def camera(self, view: int, level: int) -> Camera:
         """A photo's camera at a level."""
@@ -206,6 +226,27 @@ def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"
     """Numbers below a count, each once a round; every round has an order of its own."""
     rounds = [permutation(seed, turn, count) for turn in range(-(-visits // count))]
     return np.concatenate(rounds)[:visits]
+
+
+def runs(looks: Sequence[Look]) -> Iterable[tuple[Look, int, int]]:
+    """The looks one after the other, each with the iterations that were done before it and that are done after it."""
+    done = 0
+    for look, same in groupby(looks):
+        begun, done = done, done + sum(1 for _ in same)
+        yield look, begun, done
+
+
+def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits"]:
+    """For each visit that ends a round the visits since the one before; 0 for all others.
+
+    Args:
+        ends: The iterations that end rounds, from 1, in any order and number; 0 is none.
+        visits: How many there are.
+    """
+    found = np.zeros(visits, np.int64)
+    places = np.array(sorted({0, *ends}), np.int64)
+    found[places[1:] - 1] = np.diff(places)
+    return found
 
 
 def _wanted_again(views: Sequence[int], looks: Sequence[Look]) -> dict[int, list[int]]:
