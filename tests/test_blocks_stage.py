@@ -10,13 +10,18 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from splatpipe.pipeline.app.report import learning
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.lock import locked_shard
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.blocks import assembly
@@ -33,6 +38,7 @@ sys.path.insert(0, str(Path(__file__).parent / "lines"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import block_line
 import building_site
+import skies
 import tiny_scene
 
 LINE = Path(__file__).parent / "lines" / "block_line.py"
@@ -46,8 +52,13 @@ SHARDS = ("train.1", "train.2", "train.3")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What comes before blocks: a dataset of 30 photos, its split, the initial Gaussians."""
     folder = tmp_path_factory.mktemp("scene")
-    dataset = building_site.write_dataset(folder / "dataset")
-    parts = {"undistort.dataset": dataset, **tiny_scene.split_part(dataset, 8)}
+    return prepared(building_site.write_dataset(folder / "dataset"), 8)
+
+
+def prepared(dataset: Path, every: int) -> Path:
+    """The folder of a dataset, with what else comes before blocks."""
+    folder = dataset.parent
+    parts = {"undistort.dataset": dataset, **tiny_scene.split_part(dataset, every)}
     parts["split.views"].rename(folder / "split.json")
     (folder / "boundary.json").write_text(json.dumps({"model": None, "world": None}))
     initialize.run(InitializeConfig(dense=False), Inputs(parts, folder), folder, tiny_scene.Recorder())
@@ -174,6 +185,26 @@ def test_blocks_are_joined_to_what_a_training_leaves(undisturbed: Path) -> None:
     assert manifest["summary"]["blocks"] == len(history["blocks"]) == 3
     assert manifest["summary"]["gaussians"] == len(model) and manifest["summary"]["plan"]["max_gaussians"] <= 6000
     assert manifest["summary"]["loss"] < history["curve"][0]["loss"]
+
+
+def test_blocks_know_the_sky_and_leave_out_what_moves(tmp_path: Path) -> None:
+    folder = prepared(skies.write_dataset(tmp_path / "dataset"), 3)
+    config = tiny_scene.plain(iterations=40, max_gaussians=3000, sh_degree=0, sky="model", robust=0.05)
+    block_line.make(folder, tmp_path, {"train": config.model_dump(), "blocks": {"least": 2}})
+    summary = json.loads(part(tmp_path, "train/manifest.json").read_text())["summary"]
+    assert summary["blocks"] == 2 and summary["sky_photos"] == 4
+    each = [json.loads(part(tmp_path, f"train.{number}/manifest.json").read_text())["summary"] for number in (1, 2)]
+    left_out = [block["robust_left_out"] for block in each]
+    assert 0.0 < min(left_out) <= summary["robust_left_out"] <= max(left_out) < 0.1
+    panorama = read_panorama(part(tmp_path, "train/sky.npz"))
+    model = read_splat(part(tmp_path, "train/model.ply"))
+    assert panorama is not None
+    for view in load_views(folder / "dataset"):
+        photo, sky = skies.trace(view.camera)
+        shown = rasterizer.render(model, view.camera, rasterizer.RenderOptions(0))
+        assert float(shown.alpha[torch.from_numpy(sky)].mean()) < 0.05  # no block has put Gaussians there
+        behind = panorama.behind(view.camera, (0.0, 0.0, 0.0)).numpy()
+        assert np.abs(behind - photo.pixels / 255.0)[sky].mean() < 0.03
 
 
 def test_any_order_any_threads_and_a_kill_in_a_block_give_the_same_bits(

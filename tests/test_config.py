@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from splatpipe.pipeline.app.cli_runs import overrides, with_budgets
 from splatpipe.pipeline.engine.config import (
     dump,
     known,
@@ -47,6 +48,15 @@ def test_later_layers_win() -> None:
 def test_a_resolved_configuration_survives_its_file() -> None:
     resolved = resolve(LineConfig, [load_preset("high")])
     assert resolve(LineConfig, [tomllib.loads(dump(resolved.model_dump(mode="json")))]) == resolved
+
+
+@pytest.mark.parametrize("own", [[], ["train.max_megapixels=1.5"]], ids=("of the preset", "one's own"))
+def test_the_file_of_a_run_with_budgets_asks_for_the_same_again(tmp_path: Path, own: list[str]) -> None:
+    first = overrides(None, with_budgets(own, "10m", "4GB"), 3).resolve(load_preset("standard"))
+    assert first.train.max_megapixels == (1.5 if own else 0.0) and first.train.time_budget_s == 600.0
+    kept = tmp_path / "config.toml"
+    kept.write_text(dump(first.model_dump(mode="json") | {"photos": "photos", "splatpipe": "0.1"}))
+    assert overrides(kept, [], None).resolve(load_preset("preview")) == first
 
 
 def test_every_option_has_a_help_text() -> None:

@@ -121,6 +121,9 @@ def _told(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JS
     }
     if flat := {name: told for name, part in _named(first, each).items() if (told := _ended_flat(part))}:
         found["flat"] = flat
+    if robust := [part for part in each if "robust_left_out" in part]:
+        photos = sum(part["photos"] for part in robust)
+        found["robust_left_out"] = round(sum(part["photos"] * part["robust_left_out"] for part in robust) / photos, 5)
     plan = {**first.get("plan", {}), "max_gaussians": most, "blocks": len(each)}
     return found | {name: first[name] for name in FROM_COARSE if name in first} | {"plan": plan}
 
