@@ -29,7 +29,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.train.blocks.cutting import cut, site, work_map
-from splatpipe.pipeline.train.blocks.partition import BACKDROP, Border, Partition
+from splatpipe.pipeline.train.blocks.partition import Border, Partition
 from splatpipe.pipeline.train.blocks.sight import sights
 
 GRADES = {  # what is planted: pixels empty, pixels higher, of the colour's range
@@ -153,7 +153,7 @@ def main() -> None:
         with same_bits(arguments.threads):
             place = open_site(arguments)
             splat = place.run.model[0] if arguments.merged is None else read_splat(arguments.merged)
-            inner = [border for border in place.partition.borders() if border.blocks[1] != BACKDROP]
+            inner = place.partition.borders()
             rows = [row for border in inner for row in judged(place, splat, border)]
             longest = sorted(inner, key=lambda border: -border.line.length)[:PLANTED_BORDERS]
             rows += [row for border in longest if arguments.plant for row in planted(place, splat, border)]

@@ -137,7 +137,7 @@ INITIALIZE = Stage(
 )
 BLOCKS = Stage(
     "blocks",
-    version=4,
+    version=5,
     config=BlocksConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={"plan": "blocks.json", "coarse": "coarse"},
@@ -147,7 +147,7 @@ BLOCKS = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=11,
+    version=12,
     config=TrainConfig,
     reads=(
         "undistort.dataset",

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import signal
 import sys
@@ -31,15 +32,18 @@ from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
 from splatpipe.pipeline.train.blocks.needs import block_need
 from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
 from splatpipe.pipeline.train.blocks.partition import Cell, Partition
+from splatpipe.pipeline.train.blocks.schedules import block_schedule, share_at
 from splatpipe.pipeline.train.blocks.sight import Sight
 from splatpipe.pipeline.train.blocks.sighted import MARGINS, sighted
 from splatpipe.pipeline.train.blocks.training import Block, BlockTask, SiteParts, train_block
 from splatpipe.pipeline.train.checkpoint import load_checkpoint
-from splatpipe.pipeline.train.lengths import PART_VISITS
+from splatpipe.pipeline.train.densify import room_at
+from splatpipe.pipeline.train.lengths import PART_VISITS, Footage
 from splatpipe.pipeline.train.limits import FIXED_BYTES, PIXEL_BYTES
 from splatpipe.pipeline.train.looks import windows_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.schedule import resolve_schedule
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize
@@ -234,12 +238,17 @@ def sights_of(site: SiteParts) -> list[Sight]:
 def test_what_counts_lies_near_the_cell_or_has_no_depth(site: SiteParts) -> None:
     points, _ = load_points_and_tracks(site.dataset)
     beside = np.ones((3, 3), np.uint8)
+    (x0, y0), (x1, y1) = CELLS[0].low, CELLS[0].high
+    end = 999.0
+    around = ((-end, -end, x0, end), (x1, -end, end, end), (x0, -end, x1, y0), (x0, y1, x1, end))
+    cells = (CELLS[0], *(Cell((left, low), (right, high)) for left, low, right, high in around))
+    enclosed = replace(PARTITION, cells=cells)  # whose first cell does not reach outward
     for sight in sights_of(site):
         assert sight.depth is not None
         rows, columns = np.indices(sight.depth.shape).reshape(2, -1)
         depth = np.where(sight.depth > 0.0, sight.depth, 9.0)
         places = sight.grid.unproject(np.stack([columns, rows], axis=1) + 0.5, depth.ravel().astype(np.float64))
-        distances = CELLS[0].distance(PARTITION.plan.places(places)).reshape(depth.shape)
+        distances = CELLS[0].distance(PARTITION.places(places)).reshape(depth.shape)
         depth[:4, :4] = 0.0
         distances[:4, :4] = 0.0
         blind = replace(sight, depth=depth, observed=np.zeros(0, np.int64))
@@ -249,7 +258,7 @@ def test_what_counts_lies_near_the_cell_or_has_no_depth(site: SiteParts) -> None
         assert found[near].all() and not found[cv2.erode(far.astype(np.uint8), beside) > 0].any()
         assert 0.1 < found.mean() < 1.0
         # Thin things that the depth has not: only what is beside a point counts.
-        lost = sighted(PARTITION, 0, replace(sight, depth=np.full_like(depth, 500.0)), points.xyz)
+        lost = sighted(enclosed, 0, replace(sight, depth=np.full_like(depth, 500.0)), points.xyz)
         observed = sight.of_points(points.xyz)
         inside = CELLS[0].contains(PARTITION.plan.places(observed.places))
         across, down = observed.pixels[inside].astype(int).T
@@ -291,6 +300,22 @@ def test_outlook_tells_what_a_block_does(site: SiteParts, undisturbed: Path) -> 
     assert (outlook.photos, outlook.iterations) == (len(plan.train_views), plan.schedule.iterations)
     assert outlook.parts == (len(read_archive(undisturbed / "seen.npz")["level_0"]),)
     assert outlook.pixels[0] <= WINDOW * outlook.parts[0]
+
+
+def test_positions_move_as_fast_as_where_the_whole_has_as_many_gaussians() -> None:
+    config = TrainConfig(iterations=1600, max_gaussians=60_000)
+    footage = Footage(((640, 420, 40),))
+    whole = resolve_schedule(config, footage)
+    # 800 of the iterations are the coarse pass's, and the whole has all of its Gaussians by then.
+    assert share_at(config, footage, 1.0) == whole.density.last / 1600 == 0.5
+    assert share_at(config, footage, 0.0) == whole.density.first / 1600
+    for part in (0.1, 0.36, 0.9):
+        at = 1600 * share_at(config, footage, part)
+        room = room_at(replace(whole.density, every=0), 0, round(at))
+        assert abs(room / 60_000 - part) < 0.01
+        begun = block_schedule(config, footage, footage, {0: 40}, part)
+        assert math.isclose(begun.at(0).means_rate, whole.rates.means_at(at / 1600), rel_tol=1e-12)
+        assert math.isclose(begun.at(800).means_rate, whole.at(1600).means_rate, rel_tol=1e-12)
 
 
 def test_a_cell_that_nobody_sees_keeps_what_the_coarse_pass_has(site: SiteParts, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from splatpipe.pipeline.train.blocks.needs import (
     shared_cap,
     with_margin,
 )
-from splatpipe.pipeline.train.blocks.partition import BACKDROP, Border, Cell, Partition
+from splatpipe.pipeline.train.blocks.partition import NOBODY, Border, Cell, Partition
 from splatpipe.pipeline.train.blocks.sight import Sight, sights
 from splatpipe.pipeline.train.blocks.surroundings import surroundings
 from splatpipe.pipeline.train.blocks.thinning import thinned
@@ -107,11 +107,31 @@ def test_every_place_of_the_site_has_one_owner(seen: list[Sight], sparse: Float6
     inside = np.array([cell.contains(places[:, :2]) for cell in partition.cells])
     assert inside.sum(axis=0).max() == 1
     owners = partition.owners(places)
-    assert np.array_equal(owners, np.where(inside.any(axis=0), inside.argmax(axis=0), BACKDROP))
+    within = inside.any(axis=0)
+    assert np.array_equal(owners[within], inside.argmax(axis=0)[within])
     bounds = np.array([[*cell.low, *cell.high] for cell in partition.cells])
     low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
-    assert np.array_equal(owners == BACKDROP, ((places[:, :2] < low) | (places[:, :2] >= high)).any(axis=1))
-    assert partition.owners(np.full((1, 3), math.nan))[0] == BACKDROP
+    assert np.array_equal(within, ((places[:, :2] >= low) & (places[:, :2] < high)).all(axis=1))
+
+
+def test_what_lies_beyond_the_site_belongs_to_the_nearest_cell(
+    seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]
+) -> None:
+    partition = divided(seen, sparse, 7)
+    bounds = np.array([[*cell.low, *cell.high] for cell in partition.cells])
+    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    places = np.random.default_rng(3).uniform([-1e4, -1e4, -30.0], [1e4, 1e4, 900.0], (4000, 3))
+    beyond = places[((places[:, :2] < low) | (places[:, :2] >= high)).any(axis=1)]
+    assert len(beyond) > 3900
+    distances = np.array([cell.distance(beyond[:, :2]) for cell in partition.cells])
+    owners = partition.owners(beyond)
+    owned_at = distances[owners, np.arange(len(beyond))]
+    assert np.allclose(owned_at, distances.min(axis=0), rtol=1e-12)
+    for block in range(len(partition.cells)):
+        assert partition.trained_by(block, beyond)[owners == block].all()
+    broken = np.array([[math.nan] * 3, [math.inf, 0.0, 0.0], [0.0, -math.inf, 0.0]])
+    assert partition.owners(broken).tolist() == 3 * [NOBODY]
+    assert not partition.trained_by(0, broken).any()
 
 
 def test_borders_are_where_owners_change(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
@@ -124,17 +144,14 @@ def test_borders_are_where_owners_change(seen: list[Sight], sparse: Float64[np.n
     ends = np.array([[*cell.low, *cell.high] for cell in partition.cells])
     around = 2.0 * float((ends[:, 2:].max(axis=0) - ends[:, :2].min(axis=0)).sum())
     every = sum(2.0 * (x1 - x0 + y1 - y0) for x0, y0, x1, y1 in ends.tolist())
-    outer = sum(border.line.length for border in borders if border.blocks[1] == BACKDROP)
-    inner = sum(border.line.length for border in borders if border.blocks[1] != BACKDROP)
-    assert math.isclose(outer, around) and math.isclose(2.0 * inner + outer, every)
+    assert math.isclose(2.0 * sum(border.line.length for border in borders) + around, every)
 
 
-def test_a_neighbour_in_the_middle_of_an_edge_leaves_two_pieces_of_backdrop() -> None:
-    partition = Partition(PLAN, (Cell((0.0, 0.0), (1.0, 3.0)), Cell((1.0, 1.0), (2.0, 2.0))), 0.1)
-    lines = {(border.blocks, border.line.start, border.line.end) for border in partition.borders()}
-    assert ((0, 1), (1.0, 1.0), (1.0, 2.0)) in lines
-    assert {((0, BACKDROP), (1.0, 0.0), (1.0, 1.0)), ((0, BACKDROP), (1.0, 2.0), (1.0, 3.0))} <= lines
-    assert len(lines) == len(partition.borders()) == 3 + 3 + 1 + 2
+def test_neighbours_along_one_edge_have_a_border_each() -> None:
+    cells = (Cell((0.0, 0.0), (1.0, 3.0)), Cell((1.0, 0.0), (2.0, 2.0)), Cell((1.0, 2.0), (2.0, 3.0)))
+    lines = {(border.blocks, border.line.start, border.line.end) for border in Partition(PLAN, cells, 0.1).borders()}
+    along = {((0, 1), (1.0, 0.0), (1.0, 2.0)), ((0, 2), (1.0, 2.0), (1.0, 3.0))}
+    assert lines == along | {((1, 2), (1.0, 2.0), (2.0, 2.0))}
 
 
 def test_partition_is_the_same_again_and_reads_back(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
@@ -325,10 +342,9 @@ def _covariance(gaussians: Gaussians, row: int) -> torch.Tensor:
     return axes @ axes.T
 
 
-def merged(partition: Partition, coarse: Gaussians, trained: Mapping[int, Gaussians]) -> Gaussians:
-    models = {**trained, BACKDROP: coarse}
-    count, degree = counted(partition, models.__getitem__)
-    whole = Gaussians.concat(list(own_pieces(partition, models.__getitem__)))
+def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:
+    count, degree = counted(partition, trained.__getitem__)
+    whole = Gaussians.concat(list(own_pieces(partition, trained.__getitem__)))
     assert (len(whole), whole.sh_degree) == (count, degree)
     return whole
 
@@ -358,18 +374,18 @@ def test_merge_takes_each_gaussian_once_in_any_order(
         part = coarse.select(torch.from_numpy(partition.trained_by(block, means)))
         part.sh = part.sh + 0.01 * (block + 1)  # each block learns something else, also of its margin
         trained[block] = part
-    whole = merged(partition, coarse, trained)
+    whole = merged(partition, trained)
     assert len(whole) == len(coarse)
     assert torch.equal(torch.unique(whole.means, dim=0), torch.unique(coarse.means, dim=0))  # none lost, none twice
     for order in ((3, 2, 1, 0), (1, 3, 0, 2)):
-        again = merged(partition, coarse, {block: trained[block] for block in order})
+        again = merged(partition, {block: trained[block] for block in order})
         for a, b in zip(whole.tensors().values(), again.tensors().values(), strict=True):
             assert a.numpy().tobytes() == b.numpy().tobytes()
-    learnt = whole.sh[:, 0, 0] - merged(partition, coarse, dict.fromkeys(range(4), coarse)).sh[:, 0, 0]
+    learnt = whole.sh[:, 0, 0] - merged(partition, dict.fromkeys(range(4), coarse)).sh[:, 0, 0]
     owners = partition.owners(whole.means.double().numpy())
-    assert np.allclose(learnt.numpy(), np.where(owners == BACKDROP, 0.0, 0.01 * (owners + 1)), atol=1e-6)
+    assert np.allclose(learnt.numpy(), 0.01 * (owners + 1), atol=1e-6)
     with pytest.raises(KeyError):
-        merged(partition, coarse, {0: coarse})
+        merged(partition, {0: coarse})
 
 
 def test_blocks_are_merged_one_at_a_time_to_the_bytes_of_all_at_once(
@@ -378,17 +394,17 @@ def test_blocks_are_merged_one_at_a_time_to_the_bytes_of_all_at_once(
     partition = divided(seen, sparse, 4)
     means = coarse.means.double().numpy()
     trained = {n: coarse.select(torch.from_numpy(partition.trained_by(n, means))) for n in range(4)}
-    read = Read({**trained, BACKDROP: coarse})
+    read = Read(trained)
     count, degree = counted(partition, read)
     write_splat_parts(tmp_path / "merged.ply", own_pieces(partition, read), count, degree, ["a comment"])
-    assert read.order == 2 * [0, 1, 2, 3, BACKDROP] and read.alive == 0
-    whole = Gaussians.concat([owned(partition, block, read.models[block]) for block in (0, 1, 2, 3, BACKDROP)])
+    assert read.order == 2 * [0, 1, 2, 3] and read.alive == 0
+    whole = Gaussians.concat([owned(partition, block, read.models[block]) for block in range(4)])
     write_splat(tmp_path / "whole.ply", whole, ["a comment"])
     assert (tmp_path / "merged.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     held = read(0)
     assert read(1) is not held and read.alive == len(held.tensors())  # it would have been noticed
     with pytest.raises(ValueError, match="degrees"):
-        counted(partition, {**trained, BACKDROP: Gaussians.empty(3, 0 if degree else 1)}.__getitem__)
+        counted(partition, {**trained, 3: Gaussians.empty(3, 0 if degree else 1)}.__getitem__)
 
 
 def test_what_wanders_into_a_neighbours_cell_is_left_to_it(coarse: Gaussians) -> None:
@@ -446,10 +462,9 @@ def test_demo_is_cut_seen_and_put_together(demo_run: Path) -> None:
     partition = cut(work, 4)
     found = shares(work, partition)
     assert found.max() <= 1.5 / 4 and found.min() >= 0.5 / 4
-    assert (partition.owners(points.xyz) != BACKDROP).mean() > 0.8
     views = block_views(partition, seen, points.xyz, lambda camera: windows(camera, camera.width * camera.height // 6))
     assert min(view.covered for view in views) >= 0.95
-    whole = merged(partition, coarse, dict.fromkeys(range(4), coarse))
+    whole = merged(partition, dict.fromkeys(range(4), coarse))
     assert len(whole) == len(coarse)
     assert all(isinstance(border, Border) for border in partition.borders())
     pictures = [render(model, cameras[3], options).colour.numpy() for model in (coarse, whole)]

@@ -29,7 +29,6 @@ from splatpipe.pipeline.train.blocks.assembly import joint_history
 from splatpipe.pipeline.train.blocks.division import PHOTOS_A_BLOCK, Division, SceneSize, divided, memory_limit
 from splatpipe.pipeline.train.blocks.needs import need_of_blocks
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
-from splatpipe.pipeline.train.blocks.partition import BACKDROP
 from splatpipe.pipeline.train.blocks.site_plan import block_limits, capped_shares, load_site_plan
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.stages import blocks, initialize, train
@@ -132,7 +131,7 @@ def test_shares_add_up_to_the_cap_and_no_block_has_more_than_fits() -> None:
     assert capped_shares(100, [1.0, 1.0], [10, 10]) == [10, 10]
     division = divided(SITE, 1_500_000_000)
     counted = [(1.0, 1000, 1400), (3.0, 2000, 2300), (1.0, 0, 0), *[(1.0, 1000, 1400)] * (division.blocks - 3)]
-    limits = block_limits(division, SITE.cap, SITE.sh_degree, counted)
+    limits = block_limits(division, SITE.sh_degree, counted)
     assert sum(each.share for each in limits) == SITE.cap
     for each in limits:
         assert 0 < each.share <= each.trained <= division.need.trained and each.frozen > 0
@@ -170,11 +169,9 @@ def test_a_machine_with_other_memory_goes_on_with_the_division_that_was_made(
 def test_blocks_are_joined_to_what_a_training_leaves(undisturbed: Path) -> None:
     site = load_site_plan(part(undisturbed, "blocks/blocks.json"))
     model = read_splat(part(undisturbed, "train/model.ply"))
-    coarse = read_splat(part(undisturbed, "blocks/coarse/model.ply"))
-    backdrop = int((site.partition.owners(coarse.means.double().numpy()) == BACKDROP).sum())
-    assert len(site.blocks) == 3 and sum(each.share for each in site.blocks) + backdrop == 6000 >= len(model)
+    assert len(site.blocks) == 3 and sum(each.share for each in site.blocks) == 6000 >= len(model)
     each = [len(read_splat(part(undisturbed, f"{name}/model.ply"))) for name in SHARDS]
-    assert 0 < len(model) <= sum(each) + backdrop
+    assert 0 < len(model) <= sum(each)
     for name in ("sky.npz", "exposures.json", "rendering.json"):
         before = part(undisturbed, f"blocks/coarse/{name}")
         assert part(undisturbed, f"train/{name}").read_bytes() == before.read_bytes()

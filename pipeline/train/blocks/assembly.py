@@ -16,7 +16,6 @@ from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat_parts
 from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
-from splatpipe.pipeline.train.blocks.partition import BACKDROP
 from splatpipe.pipeline.train.blocks.site_plan import load_site_plan
 
 OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # are the coarse pass's, which looked at the whole
@@ -35,7 +34,7 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
         StageError: if a part of a block is broken.
     """
     site, coarse = load_site_plan(inputs["blocks.plan"]), inputs["blocks.coarse"]
-    read = _Reader(inputs.shards, coarse, report)
+    read = _Reader(inputs.shards, report)
     count, sh_degree = counted(site.partition, read)
     comments = [MIP_COMMENT] if load_rendering(coarse / "rendering.json").antialias else []
     write_splat_parts(out / "model.ply", own_pieces(site.partition, read), count, sh_degree, comments)
@@ -51,11 +50,10 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
 
 
 class _Reader:
-    """Reads what a block trained or the coarse model, and tells how far that is: each is read to count and to write."""
+    """Reads what a block trained, and tells how far that is: each is read to count and to write."""
 
-    def __init__(self, folders: Sequence[Path], coarse: Path, report: Reporter) -> None:
-        self._folders = {**dict(enumerate(folders)), BACKDROP: coarse}
-        self._report, self._done = report, 0
+    def __init__(self, folders: Sequence[Path], report: Reporter) -> None:
+        self._folders, self._report, self._done = folders, report, 0
 
     def __call__(self, block: int) -> Gaussians:
         self._report.progress(self._done, 2 * len(self._folders), "merging blocks", "steps")

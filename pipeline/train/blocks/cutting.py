@@ -52,7 +52,7 @@ class WorkMap:
 def site(
     plan: GroundPlan, seen: Sequence[Sight], xyz: Float64[np.ndarray, "p 3"], area: PlanArea | None = None
 ) -> Cell:
-    """The rectangle that is worth cells: what photos see, and not from too far; beyond it is backdrop.
+    """The rectangle that is cut: what photos see, and not from too far; beyond it the outer cells go on.
 
     Args:
         plan: The ground's.

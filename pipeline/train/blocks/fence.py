@@ -58,7 +58,7 @@ class Fence(Technique):
         """Which Gaussians are in the cell and which in the margin, and how many each may have."""
         means = gaussians.means.detach()
         points = means.double().cpu().numpy()
-        cell = self._partition.cells[self._block].contains(self._partition.plan.places(points))
+        cell = self._partition.owners(points) == self._block
         margin = self._partition.trained_by(self._block, points) & ~cell
         masks = (torch.from_numpy(np.ascontiguousarray(mask)).to(means.device) for mask in (cell, margin))
         return list(zip(masks, (self._share, max(0, self._density.cap - self._share)), strict=True))

@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.division import Division
 from splatpipe.pipeline.train.blocks.needs import work_bytes
 from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
-from splatpipe.pipeline.train.blocks.partition import BACKDROP, Partition
+from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan, block_limits
 from splatpipe.pipeline.train.options import TrainConfig
 
@@ -55,9 +55,8 @@ def lay_out(
         means = read_splat(coarse / "model.ply").means.double().numpy()
         weights = shares(work, partition).mean(axis=0).tolist()
         counted = [(weight, *_counted(partition, k, means)) for k, weight in enumerate(weights)]
-        outside = int((partition.owners(means) == BACKDROP).sum())
         outlooks = block_outlooks(train, views, seen, xyz, partition, division.window_pixels)
-    limits = block_limits(division, max(len(counted), division.cap - outside), train.sh_degree, counted)
+    limits = block_limits(division, train.sh_degree, counted)
     told: Mapping[str, JSON] = {
         "limit_bytes": division.limit_bytes,
         "margin": partition.margin,
@@ -88,5 +87,4 @@ def upward(views: Sequence[View], xyz: Float64[np.ndarray, "p 3"], threads: int)
 
 def _counted(partition: Partition, block: int, means: Float64[np.ndarray, "n 3"]) -> tuple[int, int]:
     """Gaussians in a block's cell, and in its cell and margin."""
-    places = partition.plan.places(means)
-    return int(partition.cells[block].contains(places).sum()), int(partition.trained_by(block, means).sum())
+    return int((partition.owners(means) == block).sum()), int(partition.trained_by(block, means).sum())

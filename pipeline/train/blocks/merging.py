@@ -1,8 +1,8 @@
 """Trained blocks put together: each Gaussian belongs to one block, by where its centre lies.
 
 A block trains its cell and a margin, so that what is at its border has seen what is on the other side; of its result
-only the cell is taken. What lies in no cell is the coarse model's. The blocks come in the order of their numbers,
-whatever the order in which they were trained. Models are read one at a time, to be counted and to be written.
+only the cell is taken. The blocks come in the order of their numbers, whatever the order in which they were trained.
+Models are read one at a time, to be counted and to be written.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.blocks.partition import BACKDROP, Partition
+from splatpipe.pipeline.train.blocks.partition import Partition
 
 
 def owned(partition: Partition, block: int, gaussians: Gaussians) -> Gaussians:
-    """Those of a block's, or of the backdrop's, Gaussians that are its own, in their order.
+    """Those of a block's Gaussians that are its own, in their order.
 
     Args:
         partition: The cells.
-        block: Its number, or `BACKDROP`.
-        gaussians: What it trained: cell and margin, and what wandered off; for the backdrop the coarse model.
+        block: Its number.
+        gaussians: What it trained: cell and margin, and what wandered off.
     """
     owners = partition.owners(gaussians.means.detach().double().numpy(force=True))
     return gaussians.select(torch.from_numpy(np.flatnonzero(owners == block)))
@@ -38,7 +38,7 @@ def counted(partition: Partition, read: Callable[[int], Gaussians]) -> tuple[int
     Raises:
         ValueError: if the SH degrees differ.
     """
-    found = [_count(partition, block, read(block)) for block in _in_order(partition)]
+    found = [_count(partition, block, read(block)) for block in range(len(partition.cells))]
     if len({degree for _count_of_own, degree in found}) != 1:
         raise ValueError("blocks are of several SH degrees")
     return sum(count for count, _degree in found), found[0][1]
@@ -49,15 +49,10 @@ def own_pieces(partition: Partition, read: Callable[[int], Gaussians]) -> Iterat
 
     Args:
         partition: The cells.
-        read: Gives what the block of a number trained, without what it drew frozen; for `BACKDROP` the coarse model,
-            for what lies in no cell.
+        read: Gives what the block of a number trained, without what it drew frozen.
     """
-    for block in _in_order(partition):
+    for block in range(len(partition.cells)):
         yield from (owned(partition, block, piece) for piece in read(block).pieces())
-
-
-def _in_order(partition: Partition) -> list[int]:
-    return [*range(len(partition.cells)), BACKDROP]
 
 
 def _count(partition: Partition, block: int, model: Gaussians) -> tuple[int, int]:

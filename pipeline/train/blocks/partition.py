@@ -1,8 +1,9 @@
 """The ground plan cut into cells, one a block: who owns a place, and who trains it.
 
 Cells are rectangles of the plan, each with its lower and without its upper edges, so that a place has one owner and two
-neighbours share no Gaussian. What lies outside of all of them is backdrop. Heights do not count: a wall and the ground
-before it belong together, and photos of a flight see all heights of a place from alike distances.
+neighbours share no Gaussian. Those at the site's edge reach outward without end: what lies outside belongs to the cell
+that is nearest to it, so that the horizon is trained as all else is. Heights do not count: a wall and the ground before
+it belong together, and photos of a flight see all heights of a place from alike distances.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine, PlanPoints
 
-BACKDROP = -1  # the owner of what lies in no cell
+NOBODY = -1  # the owner of what has no place: a point that is not finite
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Border:
     """Where two blocks meet.
 
     Attributes:
-        blocks: Their numbers, the smaller first, or a block's and `BACKDROP`.
+        blocks: Their numbers, the smaller first.
         line: Between them.
     """
 
@@ -81,24 +82,40 @@ class Partition:
     cells: tuple[Cell, ...]
     margin: float
 
-    def owners(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-        """The cell that each point lies in, `BACKDROP` for none.
+    def places(self, points: Float64[np.ndarray, "n 3"]) -> PlanPoints:
+        """Plan coordinates of the nearest places of the site, the rectangle around all cells: what cells own.
 
         Args:
-            points: In the model's frame; one that is not finite is backdrop.
+            points: In the model's frame; one that is not finite has none, NaN.
         """
-        places = self.plan.places(points)
-        owners = np.full(len(points), BACKDROP, np.int64)
+        there = np.isfinite(points).all(axis=1)
+        places = self.plan.places(np.where(there[:, None], points, math.nan))
+        low = np.min([cell.low for cell in self.cells], axis=0)
+        high = np.nextafter(np.max([cell.high for cell in self.cells], axis=0), low)  # upper edges are nobody's
+        return np.asarray(np.clip(places, low, high))
+
+    def owners(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+        """The cell that each point belongs to, `NOBODY` for none.
+
+        Args:
+            points: In the model's frame; one that is not finite is nobody's.
+        """
+        places = self.places(points)
+        owners = np.full(len(points), NOBODY, np.int64)
         for number, cell in enumerate(self.cells):
             owners[cell.contains(places)] = number
         return owners
 
     def trained_by(self, block: int, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points lie in a block's cell or its margin."""
-        return self.cells[block].grown(self.margin).contains(self.plan.places(points))
+        """Which points belong to a block's cell or its margin."""
+        return self.near(block, self.margin, points)
+
+    def near(self, block: int, distance: float, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Which points belong to a block's cell, or to others up to a distance from it, plan units."""
+        return self.cells[block].grown(distance).contains(self.places(points))
 
     def borders(self) -> list[Border]:
-        """All lines where two blocks meet, and those where a block meets the backdrop."""
+        """All lines where two blocks meet, within the site; outside of it those that come to its edge go on."""
         found = []
         for number, cell in enumerate(self.cells):
             for axis in (0, 1):
@@ -107,20 +124,15 @@ class Partition:
         return found
 
     def _edge(self, number: int, axis: int, at: float, side: str) -> Iterator[Border]:
-        """One edge of a cell: a border with each neighbour whose number is greater, and with what nobody owns."""
-        cell, free = self.cells[number], [(self.cells[number].low[1 - axis], self.cells[number].high[1 - axis])]
+        """One edge of a cell: a border with each neighbour whose number is greater."""
+        cell = self.cells[number]
         for other, neighbour in enumerate(self.cells):
             if other == number or getattr(neighbour, side)[axis] != at:
                 continue
             low = max(cell.low[1 - axis], neighbour.low[1 - axis])
             high = min(cell.high[1 - axis], neighbour.high[1 - axis])
-            if low >= high:
-                continue
-            if other > number:
+            if low < high and other > number:
                 yield Border((number, other), _line(axis, at, low, high))
-            free = [part for a, b in free for part in ((a, min(b, low)), (max(a, high), b)) if part[0] < part[1]]
-        for low, high in free:
-            yield Border((number, BACKDROP), _line(axis, at, low, high))
 
     def facts(self) -> dict[str, Any]:
         """As JSON, whose numbers read back as the same float64."""

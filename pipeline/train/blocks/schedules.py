@@ -2,8 +2,11 @@
 
 The coarse pass takes those at the first size, whole photos. A block goes on from there with the finer sizes, window by
 window: as many visits of each of its windows as without blocks. Where photos have one size only, the coarse pass takes
-a part of its iterations, and the blocks go on at the same size with the rest. Rates go on where they would be by then;
-that of positions has to rise for it, for the coarse pass has run down its own: it is a model that is drawn.
+a part of its iterations, and the blocks go on at the same size with the rest.
+
+The rate of positions, which the coarse pass has run down, for it is a model that is drawn, rises to where it is in a
+training of the whole that has as large a part of its Gaussians: what a block grows has to find its place, too, and one
+of many blocks begins with few.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths, finer_lengths
-from splatpipe.pipeline.train.lengths import Footage, Length
+from splatpipe.pipeline.train.lengths import Footage, Length, lengths_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import Rates
 from splatpipe.pipeline.train.schedule import Schedule, schedule_of
@@ -44,7 +47,9 @@ def coarse_schedule(config: TrainConfig, footage: Footage) -> Schedule:
     return schedule_of(config, footage, coarse_lengths(config, footage))
 
 
-def block_schedule(config: TrainConfig, footage: Footage, seen: Footage, parts: Mapping[int, int]) -> Schedule:
+def block_schedule(
+    config: TrainConfig, footage: Footage, seen: Footage, parts: Mapping[int, int], begun: float
+) -> Schedule:
     """That of a block.
 
     Args:
@@ -52,12 +57,31 @@ def block_schedule(config: TrainConfig, footage: Footage, seen: Footage, parts: 
         footage: All photos.
         seen: Those that the block sees.
         parts: The block's windows at each level.
+        begun: The part of its Gaussians that it begins with, 0..1.
     """
     made = schedule_of(config.model_copy(update={"coarse_levels": 0}), seen, block_lengths(config, footage, parts))
-    done, left = (sum(n for _, n in each(config, footage)) for each in (coarse_lengths, finer_lengths))
     density = replace(made.density, first=made.density.every, reset_every=0)
     dropout = coarse_schedule(config, footage).dropout  # a block sees few photos where the site has many
-    return replace(made, sh_every=1, dropout=dropout, density=density, rates=_begun(made.rates, done / (done + left)))
+    rates = _begun(made.rates, share_at(config, footage, begun))
+    return replace(made, sh_every=1, dropout=dropout, density=density, rates=rates)
+
+
+def share_at(config: TrainConfig, footage: Footage, begun: float) -> float:
+    """How much of its schedule a training of the whole has done when it has that part of its Gaussians.
+
+    That is ``densify.room_at`` turned around, for a training that begins with hardly any; no more than is done when
+    blocks begin.
+
+    Args:
+        config: The options.
+        footage: All photos.
+        begun: The part, 0..1.
+    """
+    done, left = (sum(n for _, n in each(config, footage)) for each in (coarse_lengths, finer_lengths))
+    growth = schedule_of(config, footage, lengths_of(config, footage)).density
+    steps = 1.0 - math.sqrt(1.0 - min(1.0, max(0.0, begun)))
+    iteration = growth.first + steps * max(0, growth.last - growth.first)
+    return min(iteration, done) / (done + left)
 
 
 def _begun(rates: Rates, share: float) -> Rates:

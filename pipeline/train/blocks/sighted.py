@@ -35,16 +35,16 @@ def sighted(partition: Partition, block: int, sight: Sight, xyz: Float64[np.ndar
     shape = (sight.grid.height, sight.grid.width)
     if sight.depth is None:
         return np.ones(shape, np.bool_)
-    near = partition.cells[block].grown(MARGINS * partition.margin)
+    reach = MARGINS * partition.margin
     there = (sight.depth > 0.0) & np.isfinite(sight.depth)
     rows, columns = np.nonzero(there)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     places = sight.grid.unproject(pixels, sight.depth[rows, columns].astype(np.float64))
     found = ~there
-    found[rows, columns] = near.contains(partition.plan.places(places))
+    found[rows, columns] = partition.near(block, reach, places)
     points = sight.of_points(xyz)
     scale = np.array([shape[1] / sight.camera.width, shape[0] / sight.camera.height])
-    inside = near.contains(partition.plan.places(points.places))
+    inside = partition.near(block, reach, points.places)
     across, down = np.clip((points.pixels[inside] * scale).astype(np.int64), 0, np.array(shape[::-1]) - 1).T
     found[down, across] = True
     return np.asarray(cv2.dilate(found.view(np.uint8), np.ones((3, 3), np.uint8))).view(np.bool_)

@@ -83,18 +83,15 @@ def load_site_plan(path: Path) -> SitePlan:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
 
 
-def block_limits(
-    division: Division, cap: int, sh_degree: int, counted: Sequence[tuple[float, int, int]]
-) -> list[BlockLimits]:
+def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[float, int, int]]) -> list[BlockLimits]:
     """Share the cap among blocks, so that each keeps to the limit of memory.
 
     Args:
         division: How the scene is divided.
-        cap: Gaussians of all cells together: those of the scene but for its backdrop, which is the coarse model's.
         sh_degree: Of the model.
         counted: Of each block its weight, and the coarse model's Gaussians in its cell, and in cell and margin.
     """
-    most = _most(division, sh_degree)
+    cap, most = division.cap, _most(division, sh_degree)
     top = max(1, int(most / MARGIN_GROWTH)) if division.limit_bytes else cap
     found = []
     shares = capped_shares(cap, [weight for weight, _, _ in counted], [top] * len(counted))

@@ -182,7 +182,7 @@ class Block:
             return replace(planned, schedule=replace(planned.schedule, iterations=0))
         seen = footage_of(sizes, self.whole.megapixels, self.whole.window_pixels)
         pieces = {level: len(pairs) for level, pairs in windows.items()}
-        schedule = block_schedule(options, self.whole.footage, seen, pieces)
+        schedule = block_schedule(options, self.whole.footage, seen, pieces, count / self.task.trained)
         size = round(1e-6 * seen.pixels(Look(schedule.finest.level)), 4)
         return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
 

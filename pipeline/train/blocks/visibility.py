@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.train.blocks.partition import BACKDROP, Partition
+from splatpipe.pipeline.train.blocks.partition import NOBODY, Partition
 from splatpipe.pipeline.train.blocks.sight import Samples, Sight
 from splatpipe.pipeline.train.looks import windows_of
 
@@ -112,7 +112,7 @@ def _counted(partition: Partition, samples: Samples, parts: Windows) -> Float64[
     """Weights of the samples of each cell in each window."""
     owners = partition.owners(samples.places)
     inside = _window_of(samples.pixels, parts)
-    rows = (owners != BACKDROP) & (inside >= 0)
+    rows = (owners != NOBODY) & (inside >= 0)
     flat = owners[rows] * len(parts) + inside[rows]
     size = len(partition.cells) * len(parts)
     return np.bincount(flat, samples.weights[rows], minlength=size).reshape(-1, len(parts))
