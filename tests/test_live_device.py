@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from splatpipe.pipeline.app.view import checkpoint_render
-from splatpipe.pipeline.app.view.checkpoint_render import LEFT_SHARE, RENDER_BYTES, Shown, Source, device_of, pictures
+from splatpipe.pipeline.app.view.checkpoint_render import (
+    LEFT_SHARE,
+    RENDER_BYTES,
+    Shown,
+    Source,
+    device_of,
+    newest,
+    pictures,
+)
 from splatpipe.pipeline.app.view.live import Live
 from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
 from splatpipe.pipeline.engine.store import Artifact
@@ -107,3 +115,34 @@ def test_the_page_renders_as_the_run_at_work_was_told(
         finally:
             live.close()
         assert card == [asked]
+
+
+def written(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    return path
+
+
+def left(stage: str, name: str, path: Path, digest: str) -> dict[str, Artifact]:
+    manifest = {"stage": stage, "parts": {name: {"path": path.name, "digest": digest}}}
+    return {stage: Artifact(path.parent, manifest)}
+
+
+def test_of_a_scene_in_blocks_the_coarse_model_then_that_of_a_block_is_shown(tmp_path: Path) -> None:
+    begun = left("initialize", "splat", written(tmp_path / "init.ply"), "1" * 64)
+    blocks = tmp_path / "blocks"
+    checkpoint, model = (written(blocks / "coarse" / name) for name in ("checkpoint.npz", "model.ply"))
+    opened = Contents(begun, {"blocks": blocks})
+    found = newest(opened)
+    assert found is not None and (found.kind, found.path, found.block) == ("checkpoint", checkpoint, 0)
+    checkpoint.unlink()
+    assert (found := newest(opened)) is not None and found.kind == "initial"  # nobody says that the model is whole
+    written(blocks / "coarse.json")  # what comes now, cutting the site, takes a while
+    assert (found := newest(opened)) is not None
+    assert (found.kind, found.path, found.rendering) == ("coarse", model, blocks / "coarse" / "rendering.json")
+    coarse = left("blocks", "coarse", blocks / "coarse", "2" * 64)
+    block = written(tmp_path / "train.12" / "checkpoint.npz")
+    assert (found := newest(Contents(begun | coarse, {"train.12": block.parent}))) is not None
+    assert (found.kind, found.path, found.block) == ("checkpoint", block, 12)
+    assert (found := newest(Contents(begun | coarse))) is not None
+    assert (found.kind, found.stamp) == ("coarse", "2" * 16)

@@ -30,6 +30,7 @@ from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, viewer_splat
 
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
+COARSE_TOLD = "coarse.json"  # in the folder of blocks that are not laid out yet: the coarse pass is done
 FROZEN = "frozen.ply"  # beside a block's checkpoint: what is drawn around it
 COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # of a scene in blocks
 JPEG_QUALITY = 92
@@ -50,6 +51,7 @@ class Source:
         stamp: Changes with its content.
         rendering: How it is rendered; None before training has begun.
         sky: The finished sky, beside a finished model, or of a block.
+        block: Whose checkpoint it is; 0 for that of the whole.
     """
 
     path: Path
@@ -57,6 +59,7 @@ class Source:
     stamp: str
     rendering: Path | None
     sky: Path | None = None
+    block: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,17 +82,18 @@ def newest(opened: Contents) -> Source | None:
         rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
         return Source(part.path, "model", part.digest[:16], rendering, sky)
     folder = opened.working.get("train")
-    for at_work, rendering in _trainings(opened):
+    for at_work, rendering, block in _trainings(opened):
         try:
             facts = (at_work / CHECKPOINT).stat()
             stamp = f"{facts.st_ino:x}-{facts.st_mtime_ns:x}"
             sky = rendering.with_name(COARSE_SKY)
-            return Source(at_work / CHECKPOINT, "checkpoint", stamp, rendering, sky if sky.is_file() else None)
+            return Source(at_work / CHECKPOINT, "checkpoint", stamp, rendering, sky if sky.is_file() else None, block)
         except OSError:
             continue
     coarse = _coarse(opened)
     if coarse is not None:
-        stamp = opened.parts["blocks.coarse"].digest[:16]
+        done = {part.path: part.digest[:16] for name, part in opened.parts.items() if name == "blocks.coarse"}
+        stamp = done.get(coarse) or f"{_moved(coarse / COARSE_MODEL):x}"
         return Source(coarse / COARSE_MODEL, "coarse", stamp, coarse / RENDERING, coarse / COARSE_SKY)
     if "initialize.splat" in opened.parts:
         part = opened.parts["initialize.splat"]
@@ -101,29 +105,33 @@ def newest(opened: Contents) -> Source | None:
 def _coarse(opened: Contents) -> Path | None:
     """Where the coarse pass of a scene in blocks left its model; None without blocks, or before it is done."""
     part = opened.parts.get("blocks.coarse")
-    return None if part is None or not (part.path / COARSE_MODEL).is_file() else part.path
+    if part is not None and (part.path / COARSE_MODEL).is_file():
+        return part.path
+    folder = opened.working.get("blocks")
+    return folder / "coarse" if folder is not None and (folder / COARSE_TOLD).is_file() else None
 
 
-def _trainings(opened: Contents) -> list[tuple[Path, Path]]:
-    """Where trainings are at work, and how what they train is rendered: the whole, blocks, or the coarse pass.
+def _trainings(opened: Contents) -> list[tuple[Path, Path, int]]:
+    """Where trainings are at work, how what they train is rendered, which block it is: 0 for the whole, a coarse pass.
 
     Of blocks the one that moved last comes first.
     """
     found = []
     if "train" in opened.working:
-        found.append((opened.working["train"], opened.working["train"] / RENDERING))
+        found.append((opened.working["train"], opened.working["train"] / RENDERING, 0))
     if (coarse := _coarse(opened)) is not None:
-        blocks = [folder for name, folder in opened.working.items() if name.startswith("train.")]
-        found += [(folder, coarse / RENDERING) for folder in sorted(blocks, key=_moved, reverse=True)]
+        blocks = [(_moved(folder / CHECKPOINT), name, folder) for name, folder in opened.working.items()]
+        blocks = [each for each in blocks if each[1].startswith("train.")]
+        found += [(folder, coarse / RENDERING, int(name[6:])) for _, name, folder in sorted(blocks, reverse=True)]
     if "blocks" in opened.working:
         folder = opened.working["blocks"] / "coarse"
-        found.append((folder, folder / RENDERING))
+        found.append((folder, folder / RENDERING, 0))
     return found
 
 
-def _moved(folder: Path) -> int:
+def _moved(path: Path) -> int:
     try:
-        return (folder / CHECKPOINT).stat().st_mtime_ns
+        return path.stat().st_mtime_ns
     except OSError:
         return 0
 

@@ -64,6 +64,7 @@ class Live:
                     "kind": source.kind,
                     "stamp": source.stamp,
                     "iteration": checkpoint_render.iteration_of(source),
+                    "block": source.block,
                 }
                 model["in_3d"] = source.rendering is not None
             return {
@@ -76,6 +77,7 @@ class Live:
                 "stages": [stage.told() for stage in log.stages.values()],
                 "left_after_s": log.left_after_s,
                 "curves": {name: log.curves[name].points for name in CURVES if name in log.curves},
+                "curves_of": log.curves_of,
                 "notes": log.notes[-20:],
                 "model": model,
                 "views": [

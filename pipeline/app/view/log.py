@@ -116,6 +116,7 @@ class RunLog:
     def _begin(self) -> None:
         self.stages: dict[str, StageState] = {}
         self.curves: dict[str, Curve] = {}
+        self.curves_of = ""  # the stage, or the shard, whose they are
         self.notes: list[dict[str, JSON]] = []
         self.device = "auto"  # as the run was given it
         self.started_s: float | None = None
@@ -171,6 +172,7 @@ class RunLog:
         elif kind == "metric":
             value, step = float(data["value"]), data["step"]
             if step is not None and math.isfinite(value):
+                self.curves_of = stage
                 self.curves.setdefault(str(data["name"]), Curve()).add(int(step), value)
         elif kind in ("note", "warning"):
             told = {"kind": kind, "stage": stage, "message": str(data["message"]), "hint": str(data.get("hint", ""))}

@@ -7,6 +7,7 @@ import uPlot from "uplot";
 const $ = (id) => document.getElementById(id);
 const EVERY_MS = 2000;
 const NAMES = { waiting: "waits", running: "at work", done: "done", reused: "reused", failed: "failed" };
+const CURVES = { loss: "Loss", gaussians: "Gaussians" };
 const MODELS = {
   initial: "the start, before training",
   coarse: "the whole, which blocks go on from",
@@ -106,10 +107,15 @@ function showViews() {
   const model = told.model;
   for (const id of ["view", "previous", "next"]) $(id).disabled = number < 0;
   $("nothing").hidden = Boolean(model);
-  $("iteration").textContent = model ? [MODELS[model.kind], ["initial", "coarse"].includes(model.kind) ? "" : model.iteration?.toLocaleString("en")].join(" ") : "";
+  $("iteration").textContent = model ? tellModel(model) : "";
   $("viewer").hidden = !model?.in_3d;
   $("viewer").href = `/live/${model?.stamp}/viewer.html`;
   if (model && number >= 0) picture(model.stamp, number);
+}
+
+function tellModel(model) {
+  const count = ["initial", "coarse"].includes(model.kind) ? "" : ` ${model.iteration?.toLocaleString("en")}`;
+  return `${model.block ? `block ${model.block}, ` : ""}${MODELS[model.kind]}${count}`;
 }
 
 // The picture before stays until the new one is there; one at a time.
@@ -136,10 +142,15 @@ function showCurves() {
   for (const [name, points] of Object.entries(told.curves)) {
     const node = $(name);
     if (!node || !points.length) continue;
+    node.previousElementSibling.textContent = CURVES[name] + tellPart(told.curves_of);
     const data = [points.map((point) => point[0]), points.map((point) => point[1])];
     plots[name] ??= plot(node, name);
     plots[name].setData(data);
   }
+}
+
+function tellPart(stage) {
+  return stage === "blocks" ? ", before blocks" : stage.includes(".") ? `, block ${stage.split(".")[1]}` : "";
 }
 
 function plot(node, name) {
