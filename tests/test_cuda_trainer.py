@@ -78,7 +78,8 @@ def photos(device: Device, count: int) -> list[TrainingPhoto]:
         camera = views()[number % 4].camera
         pixels = generator.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
         mask = generator.random((camera.height, camera.width)) < 0.9 if number % 2 else None
-        found.append(TrainingPhoto(camera, *uploader.end(uploader.begin(pixels, mask))))
+        photo = TrainingPhoto(camera, *uploader.end(uploader.begin(pixels, mask)))
+        found.append(replace(photo, round=4 if number % 4 == 3 else 0))
     return found
 
 
