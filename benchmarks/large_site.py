@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -32,10 +33,10 @@ from splatpipe.pipeline.engine.quantities import parse_bytes
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Shard
 from splatpipe.pipeline.engine.worker import Task
 from splatpipe.pipeline.photos.dataset import load_views
-from splatpipe.pipeline.train.blocks.layout import lay_out
+from splatpipe.pipeline.train.blocks.layout import COARSE, PROSPECTS, lay_out
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan
 from splatpipe.stages.costs import REFERENCE
-from splatpipe.stages.forecast import forecast, machine_speed, needs_of_blocks
+from splatpipe.stages.forecast import machine_speed, needs_of, needs_of_blocks
 from splatpipe.stages.line import TRAIN
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import MEGA, CaptureSize, Work
@@ -45,6 +46,7 @@ COLUMNS = {
     "block": "block:",
     "photos": "photos:,",
     "iterations": "iterations:,",
+    "Gaussians": "gaussians:,",
     "memory told MB": "memory_told:MB",
     "measured": "memory:MB",
     "ratio": "memory_ratio:.2f",
@@ -191,7 +193,7 @@ def main() -> None:
     size = CaptureSize(tiling.photos, sum(sizes) / len(sizes) / MEGA, positions=True)
     speed = machine_speed()
     work = Work.of(size, config, REFERENCE, arguments.threads)
-    needs = forecast(size, config, arguments.threads, speed=speed)
+    needs = needs_of(work, speed)
     if work.blocks is None:
         options.exit(2, "That much memory holds the site in one: lower --max-memory, or raise --gaussians.\n")
     print(
@@ -203,18 +205,22 @@ def main() -> None:
 
     began = time.process_time()
     parts = write_site(tiling, arguments.work)
-    coarse = arguments.work / "coarse"
+    coarse = arguments.work / COARSE
     write_coarse(tiling, work.blocks.division.coarse_cap, coarse, arguments.threads)
     inputs = Inputs(parts, arguments.work, machine=Machine("cpu", arguments.threads))
-    site, told = lay_out(config.train, inputs, work.blocks.division, coarse, Quiet())
+    shutil.rmtree(arguments.work / PROSPECTS, ignore_errors=True)
+    (arguments.work / PROSPECTS).mkdir()
+    site, told = lay_out(config.train, inputs, work.blocks.division, arguments.work, Quiet())
     (arguments.work / "blocks.json").write_text(site.to_json(), encoding="utf-8")
     print(
         f"{len(load_views(parts['undistort.dataset'])):,} photos laid out and cut: {time.process_time() - began:.0f} s"
     )
     parts |= {"blocks.plan": arguments.work / "blocks.json", "blocks.coarse": coarse}
+    parts["blocks.prospects"] = arguments.work / PROSPECTS
     of_blocks = told["of_blocks"]
     print(f"photos a block: {of_blocks['photos']}; iterations: {of_blocks['iterations']}")
-    own = needs_of_blocks(needs["train"], of_blocks, sum(count for _level, count in work.blocks.lengths))
+    print(f"Gaussians that each begins with: {of_blocks['start']}; around it: {of_blocks['frozen']}")
+    own = needs_of_blocks(work, of_blocks, speed)
     rows = []
     for place, block in zip(("middle", "edge"), middle_and_edge(site.partition.cells), strict=True):
         took = trained(block + 1, site, parts, config, arguments.work, arguments.threads)
@@ -237,6 +243,7 @@ def _row(name: str, need: Need, took: Row, of_blocks: dict[str, list[int]], bloc
         "block": name,
         "photos": of_blocks["photos"][block],
         "iterations": took["summary"]["iterations"],
+        "gaussians": took["summary"]["gaussians"],
         "memory_told": need.memory_bytes,
         "memory": took["memory"],
         "memory_ratio": took["memory"] / need.memory_bytes,

@@ -18,7 +18,7 @@ from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.splat.ply import read_splat_header
 from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
 from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divided, memory_limit
-from splatpipe.pipeline.train.blocks.layout import lay_out
+from splatpipe.pipeline.train.blocks.layout import COARSE, PROSPECTS, lay_out
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.blocks.site_plan import whole_json
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
@@ -33,7 +33,9 @@ LARGEST_PHOTO = 200.0  # megapixels: the dataset's own size is what counts
 
 
 def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `blocks.json` and `coarse/`: model, sky and exposures of the whole, as blocks begin; empty without blocks.
+    """Write `blocks.json`, `coarse/` (model, sky and exposures of the whole, as blocks begin) and `prospects/`.
+
+    The last has what each block looks at. Without blocks both folders are empty.
 
     What was decided lies in `division.json` before anything is trained, so a run that goes on elsewhere goes on alike.
 
@@ -48,11 +50,13 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     plan = _whole_plan(train, inputs, device)
     division = kept_division(out / "division.json", lambda: _division(config, train, plan, device))
     report.progress(1, 1, "choosing blocks")
-    coarse = out / "coarse"
-    coarse.mkdir(exist_ok=True)
+    coarse = out / COARSE
+    for folder in (coarse, out / PROSPECTS):
+        folder.mkdir(exist_ok=True)
     if division.is_whole:
-        (out / "blocks.json").write_text(whole_json(), encoding="utf-8")
-        return {"blocks": 1}
+        limit = _unasked_limit(division, train, device, report)
+        (out / "blocks.json").write_text(whole_json(limit), encoding="utf-8")
+        return {"blocks": 1} | ({"limit_bytes": limit} if limit else {})
     _tell(division, train, division.limit_bytes and division.limit_bytes - _beside(device), report)
     told = out / "coarse.json"
     if not told.is_file():
@@ -61,9 +65,14 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         sync_tree(coarse)  # what is told to be there is there, even after a power cut
         write_durably(told, json.dumps(dict(summary)))
     (coarse / "checkpoint.npz").unlink(missing_ok=True)
-    site, told_of_blocks = lay_out(train, inputs, division, coarse, report)
+    site, told_of_blocks = lay_out(train, inputs, division, out, report)
     (out / "blocks.json").write_text(site.to_json(), encoding="utf-8")
-    return {"blocks": division.blocks, **told_of_blocks, "coarse": json.loads(told.read_text(encoding="utf-8"))}
+    return {
+        "blocks": division.blocks,
+        "division": asdict(division),
+        **told_of_blocks,
+        "coarse": json.loads(told.read_text(encoding="utf-8")),
+    }
 
 
 def kept_division(path: Path, make: Callable[[], Division]) -> Division:
@@ -93,6 +102,19 @@ def _division(config: BlocksConfig, train: TrainConfig, plan: Plan, device: Devi
         return divided(_scene(train, plan), 0)
     limit = memory_limit(train.max_memory_bytes, _memory_of(device))
     return divided(_scene(train, plan), limit and limit + _beside(device), config.least)
+
+
+def _unasked_limit(division: Division, train: TrainConfig, device: Device, report: Reporter) -> int:
+    """Of memory, that a training in one has to keep to where nobody asked for one; 0 where it will not come near.
+
+    A device's own memory ends growth by itself.
+    """
+    if not division.is_near or train.max_memory_bytes or device.name == "cuda":
+        return 0
+    report.note(
+        f"too few photos for blocks: one training, within {division.limit_bytes / 1e9:.1f} GB of this machine's memory"
+    )
+    return division.limit_bytes
 
 
 def _beside(device: Device) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,13 +19,16 @@ from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.needs import whole as whole
 from splatpipe.pipeline.engine.source import Source
 from splatpipe.pipeline.engine.stage import Summary
+from splatpipe.pipeline.train.blocks.division import Division
+from splatpipe.pipeline.train.blocks.needs import MARGIN_GROWTH, grown_from
 from splatpipe.pipeline.train.limits import (
     FIXED_BYTES,
-    MACHINE_SHARE,
+    LIBRARIES_BYTES,
     PIXEL_BYTES,
     SMALLEST_WINDOW,
     bytes_per_gaussian,
 )
+from splatpipe.stages.block_work import BEGINNING_S, BlockLoad
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import FEWEST_GAUSSIANS, LEAST_SHARE, MEGA, CaptureSize, Work
@@ -56,9 +59,18 @@ def forecast(
         costs: Of a unit of each stage's work.
         machine_bytes: Memory of the machine that decides on blocks; 0 where nobody knows.
     """
-    work = Work.of(size, config, costs, threads, machine_bytes)
-    needs = work.needs(speed)
-    budget = config.train.time_budget_s
+    return needs_of(Work.of(size, config, costs, threads, machine_bytes), speed)
+
+
+def needs_of(work: Work, speed: float) -> dict[str, Need]:
+    """What each stage of a work takes, by its name.
+
+    Args:
+        work: The line's.
+        speed: Of this machine's cores, as ``machine_speed`` says.
+    """
+    needs, threads = work.needs(speed), work.threads
+    budget = work.config.train.time_budget_s
     if not budget:
         return needs
     others = sum(need.seconds(threads) for stage, need in needs.items() if stage != "train")
@@ -68,10 +80,10 @@ def forecast(
     return {**filled, "train": replace(filled["train"], cpu_seconds=whole_time)}
 
 
-def least_memory_bytes(config: LineConfig, costs: Costs = REFERENCE) -> int:
+def least_memory_bytes(config: LineConfig) -> int:
     """Least limit of memory that a training can keep to: its libraries, the smallest window, the fewest Gaussians."""
     model = FEWEST_GAUSSIANS * bytes_per_gaussian(config.train.sh_degree)
-    return int(costs.stages["train"].resident) + FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + model
+    return LIBRARIES_BYTES + FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + model
 
 
 @dataclass(frozen=True)
@@ -85,6 +97,7 @@ class Forecaster:
 
     config: LineConfig
     threads: int
+    _works: dict[object, Work] = field(default_factory=dict, compare=False, repr=False)
 
     @cached_property
     def speed(self) -> float:
@@ -100,39 +113,71 @@ class Forecaster:
         if size is None:
             return {}
         decided = summaries.get("blocks")
-        memory = available_memory_bytes()
-        if decided is not None:  # on whatever machine
-            memory = int(decided.get("of_blocks", {}).get("limit_bytes", 0) / MACHINE_SHARE)
-        needs = forecast(size, self.config, self.threads, speed=self.speed, machine_bytes=memory)
-        work = Work.of(size, self.config, REFERENCE, self.threads, memory)
-        if decided is None or work.blocks is None:
-            return needs
-        planned = sum(count for _level, count in work.blocks.lengths)
-        return needs | needs_of_blocks(needs["train"], decided.get("of_blocks", {}), planned)
+        work = self._work(size, decided)
+        told = {} if decided is None else decided.get("of_blocks", {})
+        return needs_of(work, self.speed) | needs_of_blocks(work, told, self.speed)
+
+    def _work(self, size: CaptureSize, decided: Summary | None) -> Work:
+        """The line's, made once as long as nothing more is known."""
+        key = size, decided is None
+        if key not in self._works:
+            self._works[key] = work_as_decided(size, self.config, self.threads, decided)
+        return self._works[key]
 
 
-def needs_of_blocks(train: Need, told: Mapping[str, Any], planned: int) -> dict[str, Need]:
-    """Each block's need by its name, and that of all of them, once it is known what each looks at.
+def work_as_decided(size: CaptureSize, config: LineConfig, threads: int, decided: Summary | None) -> Work:
+    """The work as the stage ``blocks`` decided on it, on whatever machine; None: as it would decide on this one.
 
     Args:
-        train: The need of all of them as it was forecast.
-        told: What ``blocks`` said of them; nothing without blocks.
-        planned: Iterations of all of them that the forecast took.
+        size: Of the capture.
+        config: The options, resolved.
+        threads: That the run is given.
+        decided: What the stage said.
     """
-    iterations, disk, around = (told.get(name, ()) for name in ("iterations", "disk_bytes", "work_bytes"))
-    whole, planned = max(1, sum(iterations)), max(1, planned)
-    each = {
-        f"train.{number}": replace(
-            train,
-            cpu_seconds=train.cpu_seconds * own / planned,
-            disk_bytes=round(train.disk_bytes * own / whole),
-            scratch_bytes=int(decoded) + int(beside),
-        )
-        for number, (own, decoded, beside) in enumerate(zip(iterations, disk, around, strict=True), 1)
-    }
-    if not each:
+    if decided is None:
+        return Work.of(size, config, REFERENCE, threads, available_memory_bytes())
+    whole_scene = Work.of_whole(size, config, REFERENCE, threads, int(decided.get("limit_bytes", 0)))
+    division = decided.get("division")
+    return whole_scene if division is None else whole_scene.divided_as(Division.of_facts(division))
+
+
+def needs_of_blocks(work: Work, told: Mapping[str, Any], speed: float) -> dict[str, Need]:
+    """Each block's need by its name, and that of all of them, once it is known what each looks at and begins with.
+
+    Args:
+        work: The line's.
+        told: What ``blocks`` said of them; nothing without blocks.
+        speed: Of this machine's cores.
+    """
+    blocks = work.blocks
+    if blocks is None or not told:
         return {}
-    return each | {"train": replace(train, cpu_seconds=sum(need.cpu_seconds for need in each.values()))}
+    train, cost, planned = work.needs(speed)["train"], work.costs.stages["train"], work.blocks_iterations
+    loads = [
+        BlockLoad(float(grown_from(*figures)), float(frozen))
+        for *figures, frozen in zip(told["start"], told["steps"], told["trained"], told["frozen"], strict=True)
+    ]
+    found = {}
+    for number, load in enumerate(loads):
+        own = int(told["iterations"][number])
+        cpu = cost.cpu * work.done * work.blocks_training(blocks.lengths, load) * own / max(1, planned)
+        found[f"train.{number + 1}"] = replace(
+            train,
+            memory_bytes=work.block_memory_bytes(load),
+            cpu_seconds=(cpu + BEGINNING_S) / speed,
+            disk_bytes=load.left_bytes,
+            scratch_bytes=int(told["disk_bytes"][number]) + load.work_bytes,
+        )
+    each = list(found.values())
+    merged = sum(load.trained for load in loads) / MARGIN_GROWTH
+    of_all = replace(
+        train,
+        memory_bytes=max(need.memory_bytes for need in each),
+        cpu_seconds=sum(need.cpu_seconds for need in each),
+        disk_bytes=int(cost.disk * merged) + sum(need.disk_bytes for need in each),
+        scratch_bytes=max(need.scratch_bytes for need in each),
+    )
+    return found | {"train": of_all}
 
 
 def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:

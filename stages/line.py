@@ -140,7 +140,7 @@ BLOCKS = Stage(
     version=5,
     config=BlocksConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
-    parts={"plan": "blocks.json", "coarse": "coarse"},
+    parts={"plan": "blocks.json", "coarse": "coarse", "prospects": "prospects"},
     entry="splatpipe.stages.blocks:run",
     borrows=tuple(f"train.{name}" for name in TrainConfig.model_fields),
     resumable=True,
@@ -156,6 +156,7 @@ TRAIN = Stage(
         "georef.boundary",
         "blocks.plan",
         "blocks.coarse",
+        "blocks.prospects",
     ),
     parts={
         "model": "model.ply",

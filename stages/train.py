@@ -8,7 +8,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shard, Summary
 from splatpipe.pipeline.geometry.plan_area import read_model_area
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.blocks.assembly import assemble
-from splatpipe.pipeline.train.blocks.site_plan import load_site_plan
+from splatpipe.pipeline.train.blocks.site_plan import limit_of_whole, load_site_plan
 from splatpipe.pipeline.train.blocks.training import BlockTask, SiteParts, train_block
 from splatpipe.pipeline.train.options import TrainConfig
 
@@ -17,11 +17,17 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     """Write the model, its history, its plan and side models: trained here, or merged from blocks where there are any.
 
     Raises:
-        SplatpipeError: if nothing is left to train on.
+        SplatpipeError: if nothing is left to train on, or a block is missing.
         MachineError: if the device asked for is not there.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
-    return assemble(inputs, out, report) if inputs.shards else loop.run(config, inputs, out, report)
+    if inputs.shards:
+        return assemble(inputs, out, report)
+    decided = inputs.parts.get("blocks.plan")
+    limit = 0 if decided is None else limit_of_whole(decided)
+    if limit and not config.max_memory_bytes:
+        config = config.model_copy(update={"max_memory_bytes": limit})
+    return loop.run(config, inputs, out, report)
 
 
 class BlockReporter:
@@ -63,7 +69,14 @@ def run_block(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) 
     assert inputs.shard is not None
     site, number = load_site_plan(inputs["blocks.plan"]), inputs.shard.index
     area = read_model_area(inputs.parts.get("georef.boundary"))
-    parts = SiteParts(inputs["undistort.dataset"], inputs["split.views"], inputs["blocks.coarse"], site.partition, area)
+    parts = SiteParts(
+        inputs["undistort.dataset"],
+        inputs["split.views"],
+        inputs["blocks.coarse"],
+        inputs["blocks.prospects"],
+        site.partition,
+        area,
+    )
     limits = site.blocks[number]
     task = BlockTask(number, limits.share, limits.trained, limits.frozen, site.window_pixels)
     return train_block(config, parts, task, inputs.machine, out, BlockReporter(report, inputs.shard))

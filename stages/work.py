@@ -22,13 +22,14 @@ from splatpipe.pipeline.train.lengths import (
 )
 from splatpipe.pipeline.train.limits import (
     FIXED_BYTES,
+    LIBRARIES_BYTES,
     PIXEL_BYTES,
     bytes_per_gaussian,
     window_within,
     worthwhile_iterations,
 )
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
-from splatpipe.stages.block_work import BEGINNING_S, BlockWork
+from splatpipe.stages.block_work import BEGINNING_S, LAYOUT_S, BlockLoad, BlockWork
 from splatpipe.stages.costs import Costs
 from splatpipe.stages.options import LineConfig
 
@@ -139,15 +140,43 @@ class Work:
             threads: Of the run.
             machine_bytes: The machine's memory, where it may decide on blocks; 0 where it is not to.
         """
-        work = Work(size, config, costs, threads, (), 0.0)
-        work = replace(work, lengths=tuple(lengths_of(config.train, work.footage)))
+        work = Work._undivided(size, config, costs, threads)
         division = work.division(machine_bytes)
+        if division.is_near and not config.train.max_memory_bytes:
+            return Work.of_whole(size, config, costs, threads, division.limit_bytes)
+        return work.divided_as(division)
+
+    @staticmethod
+    def of_whole(size: CaptureSize, config: LineConfig, costs: Costs, threads: int, limit_bytes: int = 0) -> Work:
+        """The work where the scene is trained whole, whatever its size.
+
+        Args:
+            size: Of the capture.
+            config: The options, resolved.
+            costs: What a unit costs.
+            threads: Of the run.
+            limit_bytes: Of memory, that its training keeps to though nobody asked for it; 0 for none.
+        """
+        if limit_bytes:
+            train = config.train.model_copy(update={"max_memory_bytes": limit_bytes})
+            config = config.model_copy(update={"train": train})
+        work = Work._undivided(size, config, costs, threads)
+        return replace(work, gaussians=min(work.most_gaussians, work.grown))
+
+    def divided_as(self, division: Division) -> Work:
+        """The same with the scene cut as it was decided."""
         if division.is_whole:
-            return replace(work, gaussians=min(work.most_gaussians, work.grown))
-        footage = replace(work.footage, window_pixels=division.window_pixels)
-        coarse, finer = (tuple(each(config.train, footage)) for each in (coarse_lengths, finer_lengths))
-        blocks = BlockWork(division, footage, coarse, finer)
-        return replace(work, gaussians=min(float(division.cap), work.grown), blocks=blocks)
+            return replace(self, gaussians=min(self.most_gaussians, self.grown), blocks=None)
+        train, footage = self.config.train, replace(self.footage, window_pixels=division.window_pixels)
+        coarse, finer = (tuple(each(train, footage)) for each in (coarse_lengths, finer_lengths))
+        pace = train.least_iterations if train.iterations == "auto" else 0
+        blocks = BlockWork(division, footage, coarse, finer, self.grown, train.sh_degree, pace)
+        return replace(self, gaussians=blocks.merged, blocks=blocks)
+
+    @staticmethod
+    def _undivided(size: CaptureSize, config: LineConfig, costs: Costs, threads: int) -> Work:
+        work = Work(size, config, costs, threads, (), 0.0)
+        return replace(work, lengths=tuple(lengths_of(config.train, work.footage)))
 
     def division(self, machine_bytes: int) -> Division:
         """Into how many blocks the scene is cut, by its options and what it is thought to grow to."""
@@ -206,7 +235,7 @@ class Work:
         height = math.sqrt(MEGA * self.trained_at * self.size.shape)
         window, limit = WINDOW_PIXELS["cpu"], self.config.train.max_memory_bytes
         if limit:
-            window = window_within(int(limit - self.costs.stages["train"].resident) - FIXED_BYTES, window)
+            window = window_within(limit - LIBRARIES_BYTES - FIXED_BYTES, window)
         return Footage(((max(1, round(height / self.size.shape)), max(1, round(height)), self.size.photos),), window)
 
     @property
@@ -226,25 +255,27 @@ class Work:
         """Of all iterations: megapixels, and Gaussians as megapixels that cost as much; of blocks, of all of them."""
         if self.blocks is None:
             return self._training(self.footage, self.lengths, self.gaussians)
-        need = self.blocks.division.need
-        there = min(float(need.trained), self.gaussians) + need.frozen
-        return self._training(self.blocks.footage, self.blocks.lengths, there)
+        return self.blocks_training(self.blocks.lengths, self.blocks.load)
+
+    def blocks_training(self, lengths: Sequence[Length], load: BlockLoad) -> float:
+        """The same of iterations of blocks that have so many Gaussians."""
+        assert self.blocks is not None
+        return self._training(self.blocks.footage, lengths, load.trained, load.frozen)
 
     @property
     def coarse_training(self) -> float:
         """The same of the pass over the whole before blocks; 0 without them."""
         if self.blocks is None:
             return 0.0
-        gaussians = min(float(self.blocks.division.coarse_cap), self.gaussians)
-        return self._training(self.blocks.footage, self.blocks.coarse, gaussians)
+        return self._training(self.blocks.footage, self.blocks.coarse, self.blocks.coarse_gaussians)
 
     @staticmethod
-    def _training(footage: Footage, lengths: Sequence[Length], gaussians: float) -> float:
+    def _training(footage: Footage, lengths: Sequence[Length], gaussians: float, frozen: float = 0.0) -> float:
         done, total = 0, 0.0
         for stretch in stretches(footage, lengths):
             count, share = stretch.until - done, footage.share(stretch.look)
             cost = GAUSSIAN_MEGAPIXELS * (UNSEEN_SHARE + (1.0 - UNSEEN_SHARE) * share)
-            there = gaussians * _mean_growth(lengths, done, stretch.until)
+            there = gaussians * _mean_growth(lengths, done, stretch.until) + frozen
             total += count * (footage.pixels(stretch.look) / MEGA + cost * there)
             done = stretch.until
         return total
@@ -255,7 +286,7 @@ class Work:
         options = self.config.train
         if not options.max_memory_bytes:
             return float(options.max_gaussians)
-        taken = self.costs.stages["train"].resident + FIXED_BYTES + PIXEL_BYTES * MEGA * self.window
+        taken = LIBRARIES_BYTES + FIXED_BYTES + PIXEL_BYTES * MEGA * self.window
         room = max(0.0, options.max_memory_bytes - taken)
         return min(float(options.max_gaussians), room / bytes_per_gaussian(options.sh_degree))
 
@@ -287,10 +318,13 @@ class Work:
         judged = photos * min(self.kept_at, JUDGED_MEGAPIXELS)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
-        done = self.costs.flat if train.stop_when_flat and not train.time_budget_s else 1.0
+        done = self.done
         state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.window
+        coarse_state = state
         if self.blocks is not None:
-            state = self.blocks.division.memory_bytes - self.costs.stages["train"].resident
+            resident = self.costs.stages["train"].resident
+            coarse_load = BlockLoad(self.blocks.coarse_gaussians, 0.0)
+            state, coarse_state = (self.block_memory_bytes(load) - resident for load in (self.blocks.load, coarse_load))
         looked = photos * self.looked_at * SIFT_WORK[extractor]
         looked_at_once = self.threads * self.looked_at * SIFT_MEMORY[extractor]
         controlled = float(size.control)
@@ -306,12 +340,31 @@ class Work:
             "undistort": Units(pixels, at_once, photos * self.kept_at),
             "split": Units(photos, 0.0, photos),
             "initialize": Units(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
-            "blocks": Units(done * self.coarse_training, state, 0.0),
+            "blocks": Units(done * self.coarse_training, coarse_state, 0.0),
             "train": Units(done * self.training, state, gaussians),
             "evaluate": Units(judged, gaussians, judged),
             "export": Units(gaussians, gaussians, gaussians),
             "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
         }
+
+    @property
+    def done(self) -> float:
+        """Share of its iterations after which a training ends; blocks see each window some ten times, and do all."""
+        train = self.config.train
+        ends_flat = train.stop_when_flat and not train.time_budget_s and self.blocks is None
+        return self.costs.flat if ends_flat else 1.0
+
+    def block_memory_bytes(self, load: BlockLoad) -> int:
+        """Expected of the process that trains a block with so many Gaussians; never more than its limit."""
+        assert self.blocks is not None
+        limit = self.blocks.division.limit_bytes
+        taken = int(self.costs.stages["train"].resident) + self.blocks.memory_bytes(load)
+        return min(taken, limit) if limit else taken
+
+    @property
+    def blocks_iterations(self) -> int:
+        """Of all blocks together."""
+        return 0 if self.blocks is None else sum(count for _level, count in self.blocks.lengths)
 
     def needs(self, speed: float) -> dict[str, Need]:
         """What the units cost, by stage, on a machine of that speed."""
@@ -331,8 +384,13 @@ class Work:
         return found
 
     def _beginning_s(self, stage: str) -> float:
-        """CPU seconds of blocks before their first iterations, however few these are."""
-        return 0.0 if self.blocks is None or stage != "train" else BEGINNING_S * self.blocks.division.blocks
+        """CPU seconds of blocks before their first iterations, however few these are, and of what is cut for them."""
+        if self.blocks is None:
+            return 0.0
+        return {
+            "blocks": LAYOUT_S * self.size.photos * self.blocks.looks,
+            "train": BEGINNING_S * self.blocks.division.blocks,
+        }.get(stage, 0.0)
 
     def _disk_of_blocks(self, stage: str) -> int:
         """Bytes that a stage leaves besides where the scene is trained in blocks."""
@@ -348,10 +406,11 @@ class Work:
         if stage == "train" and self.blocks is None:
             return int(decoded * self.size.photos + units.memory)
         if stage == "train" and self.blocks is not None:
-            return int(decoded * self.blocks.photos) + self.blocks.work_bytes
+            return int(decoded * self.blocks.photos) + self.blocks.load.work_bytes
         if stage == "blocks" and self.blocks is not None:
             (first, _count), *_ = self.blocks.coarse
-            return int(decoded * self.size.photos / 4**first) + self.blocks.work_bytes
+            coarse = BlockLoad(self.blocks.coarse_gaussians, 0.0)
+            return int(decoded * self.size.photos / 4**first) + coarse.work_bytes
         return 0
 
 

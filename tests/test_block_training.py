@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.geometry.plan_area import PlanArea
@@ -23,15 +24,16 @@ from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_split, load_views
 from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import cpu
-from splatpipe.pipeline.splat.archives import read_archive
 from splatpipe.pipeline.splat.backdrop import backdrop_limit
+from splatpipe.pipeline.splat.free_space import free_space
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop, memory
 from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
 from splatpipe.pipeline.train.blocks.needs import block_need
-from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
+from splatpipe.pipeline.train.blocks.outlook import Cut, block_outlooks, coarse_sights, footage_on
 from splatpipe.pipeline.train.blocks.partition import Cell, Partition
+from splatpipe.pipeline.train.blocks.prospect import Prospect, read_free_space, rows_of, write_free_space
 from splatpipe.pipeline.train.blocks.schedules import block_schedule, share_at
 from splatpipe.pipeline.train.blocks.sight import Sight
 from splatpipe.pipeline.train.blocks.sighted import MARGINS, sighted
@@ -74,7 +76,25 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SiteParts:
     (folder / "coarse").mkdir()
     inputs = Inputs(parts, folder, machine=Machine("cpu", 1))
     train_coarse(CONFIG, inputs, Limits(150, WINDOW), folder / "coarse", tiny_scene.Recorder())
-    return SiteParts(folder / "dataset", parts["split.views"], folder / "coarse", PARTITION)
+    return surveyed(
+        SiteParts(folder / "dataset", parts["split.views"], folder / "coarse", folder / "prospects", PARTITION)
+    )
+
+
+def surveyed(site: SiteParts, config: TrainConfig = CONFIG, window: int = WINDOW) -> SiteParts:
+    """The same with what its blocks look at, kept as the stage `blocks` does."""
+    kept = set(load_split(site.split).train)
+    views = [view for view in load_views(site.dataset) if view.camera.name in kept]
+    points, tracks = load_points_and_tracks(site.dataset)
+    cameras, seen = [view.camera for view in views], sights_of(site)
+    outlooks = block_outlooks(config, views, seen, points.xyz, site.partition, window)
+    cut = Cut.of(config, *footage_on(config, cameras, window))
+    site.prospects.mkdir(exist_ok=True)
+    for number, outlook in enumerate(outlooks):
+        scene = (read_splat(site.coarse / "model.ply"), seen, points.xyz)
+        Prospect.of(site.partition, number, outlook.windows, cut, scene).write(site.prospects, number)
+    write_free_space(site.prospects, free_space(cameras, points.xyz, [tracks[each.name] for each in cameras]))
+    return site
 
 
 def trained(site: SiteParts, out: Path, threads: int = 1) -> Path:
@@ -167,13 +187,13 @@ def test_frozen_gaussians_stay_to_the_bit_and_have_no_moments(
 
 def test_windows_are_those_that_show_the_cell_each_as_often_as_without_blocks(site: SiteParts, tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"iterations": "auto", "least_iterations": 1})
+    other = surveyed(replace(site, prospects=tmp_path / "prospects"), config, 400)
     looked = []
     for number in range(2):
-        block = Block.of(config, site, replace(TASK, number=number, window_pixels=400), cpu())
-        windows = block.surveyor.parts(tmp_path, tiny_scene.Recorder())
-        plan = block.plan(windows)
-        visits = block.course(plan, windows, tmp_path).visits(plan.schedule.looks_to(plan.last_iteration))
-        (tmp_path / "seen.npz").unlink()
+        block = Block.of(config, other, replace(TASK, number=number, window_pixels=400), cpu())
+        prospect = block.surveyor.prospect()
+        plan = block.plan(prospect.windows)
+        visits = block.course(plan, prospect, tmp_path).visits(plan.schedule.looks_to(plan.last_iteration))
         each = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
         times = Counter((visit.view, visit.level, visit.window) for visit in each)
         assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2
@@ -213,6 +233,26 @@ def test_memory_of_the_process_does_not_end_a_blocks_growth(
     limited = CONFIG.model_copy(update={"max_memory_bytes": 2_000_000_000})
     train_block(limited, site, TASK, Machine("cpu", 1), tmp_path, recorder)
     assert digest(tmp_path) == digest(undisturbed) and not recorder.warnings
+
+
+def test_what_a_block_looks_at_reads_back_and_a_missing_file_is_told(site: SiteParts, tmp_path: Path) -> None:
+    views = [view for view in load_views(site.dataset) if view.camera.name in set(load_split(site.split).train)]
+    points, tracks = load_points_and_tracks(site.dataset)
+    cameras = [view.camera for view in views]
+    made = free_space(cameras, points.xyz, [tracks[camera.name] for camera in cameras])
+    read = read_free_space(site.prospects, cameras)
+    assert np.array_equal(read.support, made.support) and len(read.photos) == len(cameras)
+    for ours, theirs in zip(read.photos, made.photos, strict=True):
+        assert ours.camera is theirs.camera and ours.near == theirs.near
+        assert np.array_equal(ours.depth, theirs.depth) and np.array_equal(ours.box, theirs.box)
+    read_back = Prospect.read(site.prospects, 0)
+    read_back.write(tmp_path, 0)
+    assert (tmp_path / "block_1.npz").read_bytes() == (site.prospects / "block_1.npz").read_bytes()
+    assert sorted(read_back.counted) == rows_of(read_back.windows) and len(read_back.around.rows) > 0
+    for read_missing in (lambda: Prospect.read(tmp_path, 1), lambda: read_free_space(tmp_path, cameras)):
+        with pytest.raises(StageError, match="cannot be read") as raised:
+            read_missing()
+        assert "blocks" in raised.value.hint
 
 
 def test_interrupt_leaves_a_checkpoint(site: SiteParts, tmp_path: Path) -> None:
@@ -276,7 +316,7 @@ def test_photos_come_with_what_counts_and_their_part_of_the_whole(
             raise Killed
 
     step_with(monkeypatch, look)
-    for name in ("plan.json", "seen.npz", "frozen.ply"):
+    for name in ("plan.json", "frozen.ply"):
         (tmp_path / name).write_bytes((undisturbed / name).read_bytes())
     with pytest.raises(Killed):
         trained(site, tmp_path)
@@ -298,7 +338,9 @@ def test_outlook_tells_what_a_block_does(site: SiteParts, undisturbed: Path) -> 
     outlook, _ = block_outlooks(CONFIG, views, sights_of(site), points.xyz, PARTITION, WINDOW)
     plan = Plan.from_json((undisturbed / "plan.json").read_text())
     assert (outlook.photos, outlook.iterations) == (len(plan.train_views), plan.schedule.iterations)
-    assert outlook.parts == (len(read_archive(undisturbed / "seen.npz")["level_0"]),)
+    assert outlook.parts == (len(Prospect.read(site.prospects, 0).windows[0]),)
+    density = plan.schedule.density
+    assert outlook.steps == sum(map(density.is_step, range(1, plan.schedule.iterations + 1))) > 0
     assert outlook.pixels[0] <= WINDOW * outlook.parts[0]
 
 
@@ -322,7 +364,7 @@ def test_a_cell_that_nobody_sees_keeps_what_the_coarse_pass_has(site: SiteParts,
     far = Partition(PARTITION.plan, (*CELLS, Cell((90.0, 90.0), (99.0, 99.0))), PARTITION.margin)
     summary = train_block(
         CONFIG,
-        replace(site, partition=far),
+        surveyed(replace(site, partition=far, prospects=tmp_path / "prospects")),
         replace(TASK, number=2),
         Machine("cpu", 1),
         tmp_path,
@@ -345,7 +387,7 @@ def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturb
     for kernels in (kernels_on_cpu(), None):
         out = tmp_path / str(len(models))
         out.mkdir()
-        for name in ("plan.json", "seen.npz", "frozen.ply"):
+        for name in ("plan.json", "frozen.ply"):
             (out / name).write_bytes((undisturbed / name).read_bytes())
         with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed), use_kernels(kernels):
             step_with(patch, look)

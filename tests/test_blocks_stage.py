@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from splatpipe.pipeline.app.report import learning
-from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.errors import StageError, UsageError
 from splatpipe.pipeline.engine.lock import locked_shard
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
@@ -273,6 +273,40 @@ def test_a_coarse_pass_is_told_to_be_done_once_its_files_are_on_the_disk(
     with pytest.raises(Killed):
         blocks.run(BlocksConfig(least=3), inputs(scene, TrainConfig(**QUICK)), tmp_path, tiny_scene.Recorder())
     assert json.loads((tmp_path / "coarse.json").read_text()) == {"iterations": 1}
+
+
+def test_blocks_that_are_missing_are_named_before_anything_is_merged(
+    scene: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    plan, coarse = (part(undisturbed, f"blocks/{name}") for name in ("blocks.json", "coarse"))
+    given = inputs(scene, TrainConfig(**QUICK), blocks_plan=plan, blocks_coarse=coarse)
+    shards = [part(undisturbed, f"{name}/model.ply").parent for name in SHARDS]
+    for there, named in ((shards[:2], "block 3 left"), ([shards[0], tmp_path, shards[2]], "block 2 left")):
+        with pytest.raises(StageError, match=named) as raised:
+            train.run(TrainConfig(**QUICK), replace(given, shards=tuple(there)), tmp_path, tiny_scene.Recorder())
+        assert "--rerun-from train" in raised.value.hint
+    with pytest.raises(StageError, match="None of the 3 blocks"):
+        train.run(TrainConfig(**QUICK), given, tmp_path, tiny_scene.Recorder())
+
+
+def test_too_few_photos_for_blocks_are_trained_within_the_machines_memory(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = replace(SITE, photos=PHOTOS_A_BLOCK)
+    assert divided(few, 1_500_000_000).is_near and not divided(few, 8_000_000_000).is_near
+    assert not divided(SITE, 1_500_000_000).is_near
+    near = divided(few, 1_500_000_000)
+    monkeypatch.setattr(blocks, "_division", lambda *_: near)
+    config = tiny_scene.plain(iterations=12, sh_degree=0)
+    summary = blocks.run(BlocksConfig(), inputs(scene, config), tmp_path, tiny_scene.Recorder())
+    assert summary == {"blocks": 1, "limit_bytes": near.limit_bytes}
+    seen: list[TrainConfig] = []
+    monkeypatch.setattr(loop, "run", lambda config, *_: seen.append(config) or {})
+    more = {"blocks_plan": tmp_path / "blocks.json", "blocks_coarse": tmp_path / "coarse"}
+    for asked in (0, 900_000_000):
+        own = config.model_copy(update={"max_memory_bytes": asked})
+        train.run(own, inputs(scene, own, **more), tmp_path, tiny_scene.Recorder())
+    assert [each.max_memory_bytes for each in seen] == [near.limit_bytes, 900_000_000]
 
 
 def test_two_makers_of_one_block_are_refused_and_of_two_are_not(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,23 @@ from forecast_fit import compared, fit, left_out, scene_of
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.needs import Need, whole
+from splatpipe.pipeline.train.blocks.division import Division, SceneSize
+from splatpipe.pipeline.train.limits import bytes_per_gaussian
+from splatpipe.stages import work as work_module
+from splatpipe.stages.block_work import BEGINNING_S
 from splatpipe.stages.costs import REFERENCE
-from splatpipe.stages.forecast import CaptureSize, Forecaster, forecast, machine_speed, seconds
+from splatpipe.stages.forecast import (
+    CaptureSize,
+    Forecaster,
+    forecast,
+    machine_speed,
+    needs_of_blocks,
+    seconds,
+    work_as_decided,
+)
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
+from splatpipe.stages.work import Work
 
 SIZE = CaptureSize(photos=80, megapixels=12.0, positions=True)
 
@@ -88,6 +101,61 @@ def test_a_run_forecasts_from_what_ingest_counted() -> None:
     groups = [{"photos": 3, "size": [640, 480]}, {"photos": 77, "size": [3000, 4000]}]
     needs = forecaster({"ingest": {"photos": 80, "positions": 80, "camera_groups": groups}})
     assert needs == forecast(replace(SIZE, shape=0.75), configured("preview"), 2, speed=forecaster.speed)
+
+
+LARGE = CaptureSize(photos=1000, megapixels=1.1, positions=True)
+LIMITED = {"max_gaussians": 4_000_000, "max_memory_bytes": 1_500_000_000}
+
+
+def test_blocks_are_forecast_by_what_each_begins_with_and_sees_around_itself() -> None:
+    work = Work.of(LARGE, configured("standard", **LIMITED), REFERENCE, 1)
+    assert work.blocks is not None
+    most, limit = work.blocks.division.need.trained, LIMITED["max_memory_bytes"]
+    told = {
+        "iterations": [1000, 1000, 1000, 2000],
+        "start": [10_000, 20_000, 10 * most, 10_000],
+        "steps": [4, 4, 4, 4],
+        "trained": [most] * 4,
+        "frozen": [50_000, 50_000, most, 90_000],
+        "disk_bytes": [10**8, 10**8, 10**8, 3 * 10**8],
+    }
+    needs = needs_of_blocks(work, told, 1.0)
+    few, more, full, longer = (needs[f"train.{number}"] for number in (1, 2, 3, 4))
+    assert few.memory_bytes < more.memory_bytes < full.memory_bytes <= limit
+    assert more.memory_bytes - few.memory_bytes == pytest.approx(10_000 * 1.25**4 * bytes_per_gaussian(3), rel=0.01)
+    assert full.memory_bytes > 0.8 * work.blocks.division.memory_bytes - 240_000_000  # the bound is of more libraries
+    assert 1.9 * few.cpu_seconds < longer.cpu_seconds + BEGINNING_S and longer.scratch_bytes > few.scratch_bytes + 10**8
+    assert few.disk_bytes < more.disk_bytes and needs["train"].memory_bytes == full.memory_bytes
+    assert needs["train"].cpu_seconds == pytest.approx(sum(need.cpu_seconds for need in (few, more, full, longer)))
+    assert needs_of_blocks(work, {}, 1.0) == {}
+
+
+def test_a_run_goes_by_what_blocks_decided_and_decides_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    divide = work_module.divided
+
+    def counting(*arguments: Any) -> Division:
+        asked.append(1)
+        return divide(*arguments)
+
+    monkeypatch.setattr(work_module, "divided", counting)
+    forecaster = Forecaster(configured("standard", **LIMITED), 2)
+    groups = [{"photos": 1000, "size": [1200, 900]}]
+    before = {"ingest": {"photos": 1000, "positions": 1000, "camera_groups": groups}}
+    needs = [forecaster(before) for _ in range(3)]
+    assert len(asked) == 1 and needs[0] == needs[1] == needs[2]
+    division = divide(SceneSize(4_000_000, 1e7, 500_000, 3, 1000), 1_500_000_000, 40)
+    decided = {"blocks": 40, "division": json.loads(json.dumps(asdict(division)))}
+    work = work_as_decided(LARGE, forecaster.config, 2, decided)
+    assert len(asked) == 1 and work.blocks is not None and work.blocks.division == division
+    assert work_as_decided(LARGE, forecaster.config, 2, {"blocks": 1}).blocks is None
+    free = configured("standard", max_gaussians=4_000_000)
+    kept = work_as_decided(LARGE, free, 2, {"blocks": 1, "limit_bytes": 1_500_000_000})
+    assert (
+        kept.needs(1.0)["train"].memory_bytes
+        <= 1_500_000_000
+        < Work.of_whole(LARGE, free, REFERENCE, 2).needs(1.0)["train"].memory_bytes
+    )
 
 
 def test_the_costs_are_what_the_runs_say_and_hold_for_captures_left_out() -> None:

@@ -168,7 +168,7 @@ def forecast_presets(
 ) -> tuple[tuple[PresetForecast, ...], MachineFacts]:
     """What a run with each preset would need, and whether this machine has it."""
     from splatpipe.stages.costs import REFERENCE
-    from splatpipe.stages.forecast import forecast, machine_speed
+    from splatpipe.stages.forecast import machine_speed, needs_of
     from splatpipe.stages.work import CaptureSize, Work
 
     disk = shutil.disk_usage(Path.cwd())
@@ -181,9 +181,9 @@ def forecast_presets(
     speed = machine_speed()
     told = []
     for preset, config in configs.items():
-        need = whole(forecast(size, config, threads, speed=speed, machine_bytes=machine.memory_bytes))
+        work = Work.of(size, config, REFERENCE, threads, machine.memory_bytes)
+        need, blocks = whole(needs_of(work, speed)), work.blocks
         disk_bytes = need.disk_bytes + need.scratch_bytes
-        blocks = Work.of(size, config, REFERENCE, threads, machine.memory_bytes).blocks
         lacking = []
         if 0 < machine.memory_bytes < need.memory_bytes:
             lacking.append(

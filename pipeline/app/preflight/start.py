@@ -57,7 +57,7 @@ def told_beforehand(request: Request) -> str:
     from splatpipe.pipeline.engine.needs import whole
     from splatpipe.pipeline.engine.source import open_source
     from splatpipe.stages.costs import REFERENCE
-    from splatpipe.stages.forecast import forecast, machine_speed
+    from splatpipe.stages.forecast import machine_speed, needs_of
     from splatpipe.stages.work import Work
 
     config, threads = cast("LineConfig", request.config), request.machine.threads
@@ -66,8 +66,9 @@ def told_beforehand(request: Request) -> str:
     if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request):
         return ""
     memory = available_memory_bytes()
-    needs = forecast(size, config, threads, speed=machine_speed(), machine_bytes=memory)
-    need, work = whole(needs), Work.of(size, config, REFERENCE, threads, memory)
+    work = Work.of(size, config, REFERENCE, threads, memory)
+    needs = needs_of(work, machine_speed())
+    need = whole(needs)
     seconds = sum(each.seconds(threads) for each in needs.values())
     told = f"{size.photos:,} photos of {size.megapixels:.1f} megapixels take about {roughly(seconds)}, "
     told += (
@@ -87,8 +88,9 @@ def told_beforehand(request: Request) -> str:
 def told_of_blocks(blocks: BlockWork) -> str:
     """How a scene is cut, and what a block takes, in words."""
     division = blocks.division
-    told = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians at most"
-    return f"{told}, {division.memory_bytes / 1e9:.1f} GB of memory and about {blocks.photos:.0f} photos each"
+    told = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians and "
+    told += f"{division.memory_bytes / 1e9:.1f} GB of memory at most"
+    return f"{told}, about {round(blocks.load.trained, -3):,.0f} Gaussians and {blocks.photos:.0f} photos each"
 
 
 def _on_cuda(request: Request) -> bool:

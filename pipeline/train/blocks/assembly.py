@@ -16,7 +16,7 @@ from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat_parts
 from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
-from splatpipe.pipeline.train.blocks.site_plan import load_site_plan
+from splatpipe.pipeline.train.blocks.site_plan import SitePlan, load_site_plan
 
 OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # are the coarse pass's, which looked at the whole
 FROM_COARSE = ("train_megapixels", "sky_photos", "device", "instruction_set", "mode")
@@ -31,10 +31,11 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
         report: Told of progress.
 
     Raises:
-        StageError: if a part of a block is broken.
+        StageError: if a block is missing, or a part of one is broken.
     """
     site, coarse = load_site_plan(inputs["blocks.plan"]), inputs["blocks.coarse"]
     read = _Reader(inputs.shards, report)
+    _require_all(site, inputs.shards)
     count, sh_degree = counted(site.partition, read)
     comments = [MIP_COMMENT] if load_rendering(coarse / "rendering.json").antialias else []
     write_splat_parts(out / "model.ply", own_pieces(site.partition, read), count, sh_degree, comments)
@@ -47,6 +48,22 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
     (out / "plan.json").write_text(json_text(plans), encoding="utf-8")
     most = sum(block.share for block in site.blocks)
     return {"gaussians": count, "blocks": len(inputs.shards), **_told(inputs, history, most)}
+
+
+def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:
+    """Refuse to merge unless each block left its model.
+
+    Raises:
+        StageError: if one did not.
+    """
+    there = {number for number, folder in enumerate(shards, 1) if (folder / "model.ply").is_file()}
+    missing = [str(number) for number in range(1, len(site.blocks) + 1) if number not in there]
+    if missing or len(shards) > len(site.blocks):
+        told = f"block {', '.join(missing)} left no model" if missing else f"{len(shards)} models are here"
+        raise StageError(
+            f"The {len(site.blocks)} blocks cannot be merged: {told}.",
+            hint="Run again with --rerun-from train: blocks that are missing are trained.",
+        )
 
 
 class _Reader:

@@ -6,7 +6,7 @@ and the scene is cut, into blocks of some photos each at least; only where that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from splatpipe.pipeline.train.blocks.needs import (
@@ -61,6 +61,7 @@ class Division:
         window_pixels: That an iteration looks at, at most.
         need: What one of the blocks takes, without the libraries.
         coarse_cap: On Gaussians of the pass over the whole that comes before blocks.
+        is_near: Whether a whole one may come near the limit: of too few photos for blocks, its training keeps to it.
     """
 
     blocks: int
@@ -69,6 +70,7 @@ class Division:
     window_pixels: int
     need: BlockNeed
     coarse_cap: int
+    is_near: bool = False
 
     @property
     def is_whole(self) -> bool:
@@ -122,7 +124,7 @@ def divided(scene: SceneSize, limit_bytes: int, least: int = 0) -> Division:
         blocks, cap = most, _most_gaussians(most, room, window, scene.sh_degree)
         if cap < FEWEST_GAUSSIANS * blocks:  # the training of the whole says what is too little
             blocks, cap = 1, _most_gaussians(1, room, window, scene.sh_degree)
-    return _of(scene, blocks, min(cap, scene.cap), limit_bytes, window)
+    return replace(_of(scene, blocks, min(cap, scene.cap), limit_bytes, window), is_near=blocks == 1)
 
 
 def _of(scene: SceneSize, blocks: int, cap: int, limit_bytes: int, window: int) -> Division:

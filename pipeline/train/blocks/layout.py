@@ -14,33 +14,38 @@ from splatpipe.pipeline.geometry.plan_area import read_model_area
 from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_split, load_views
 from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.free_space import free_space
+from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
 from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.division import Division
-from splatpipe.pipeline.train.blocks.needs import work_bytes
-from splatpipe.pipeline.train.blocks.outlook import block_outlooks, coarse_sights
+from splatpipe.pipeline.train.blocks.outlook import Cut, Outlook, block_outlooks, coarse_sights, footage_on
 from splatpipe.pipeline.train.blocks.partition import Partition
+from splatpipe.pipeline.train.blocks.prospect import Prospect, write_free_space
+from splatpipe.pipeline.train.blocks.sight import Sight
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan, block_limits
 from splatpipe.pipeline.train.options import TrainConfig
 
+COARSE, PROSPECTS = "coarse", "prospects"  # folders of the stage's
+
 
 def lay_out(
-    train: TrainConfig, inputs: Inputs, division: Division, coarse: Path, report: Reporter
+    train: TrainConfig, inputs: Inputs, division: Division, out: Path, report: Reporter
 ) -> tuple[SitePlan, dict[str, JSON]]:
-    """Cut a site into cells and share the cap among them.
+    """Cut a site into cells, share the cap among them, and keep what each looks at.
 
     Args:
         train: Options of training.
         inputs: The stage's.
         division: Into how many blocks, and what one may take.
-        coarse: Folder of the coarse pass.
+        out: The stage's folder: has that of the coarse pass, and takes what blocks look at.
         report: Told of what is being done.
 
     Returns:
         The plan, and what people are told of its blocks.
     """
-    dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
+    dataset, threads, coarse = inputs["undistort.dataset"], inputs.machine.threads, out / COARSE
     kept = set(load_split(inputs["split.views"]).train)
     views = [view for view in load_views(dataset) if view.camera.name in kept]
     points, tracks = load_points_and_tracks(dataset)
@@ -52,21 +57,58 @@ def lay_out(
         plan = GroundPlan.across(upward(views, xyz, threads))
         work = work_map(plan, site(plan, seen, xyz, area), seen, xyz)
         partition = cut(work, division.blocks)
-        means = read_splat(coarse / "model.ply").means.double().numpy()
+        gaussians = read_splat(coarse / "model.ply")
+        means = gaussians.means.double().numpy()
         weights = shares(work, partition).mean(axis=0).tolist()
         counted = [(weight, *_counted(partition, k, means)) for k, weight in enumerate(weights)]
         outlooks = block_outlooks(train, views, seen, xyz, partition, division.window_pixels)
-    limits = block_limits(division, train.sh_degree, counted)
+        limits = block_limits(division, train.sh_degree, counted)
+        cameras = [view.camera for view in views]
+        parts = Cut.of(train, *footage_on(train, cameras, division.window_pixels))
+        scene = (gaussians, seen, xyz)
+        around = _look_around(partition, parts, outlooks, scene, out / PROSPECTS, report)
+        if train.prune_free_space:
+            write_free_space(out / PROSPECTS, free_space(cameras, xyz, observed))
     told: Mapping[str, JSON] = {
         "limit_bytes": division.limit_bytes,
         "margin": partition.margin,
         "photos": [outlook.photos for outlook in outlooks],
         "iterations": [outlook.iterations for outlook in outlooks],
         "gaussians": [limit.share for limit in limits],
+        "trained": [limit.trained for limit in limits],
+        "start": [min(limit.trained, inside) for limit, (_, _, inside) in zip(limits, counted, strict=True)],
+        "steps": [outlook.steps for outlook in outlooks],
+        "frozen": [min(limit.frozen, count) for limit, count in zip(limits, around, strict=True)],
         "disk_bytes": [outlook.disk_bytes for outlook in outlooks],
-        "work_bytes": [work_bytes(limit.trained, limit.frozen) for limit in limits],
     }
     return SitePlan(partition, tuple(limits), division.window_pixels, division.limit_bytes), {"of_blocks": told}
+
+
+def _look_around(
+    partition: Partition,
+    parts: Cut,
+    outlooks: Sequence[Outlook],
+    scene: tuple[Gaussians, Sequence[Sight], Float64[np.ndarray, "p 3"]],
+    folder: Path,
+    report: Reporter,
+) -> list[int]:
+    """Keep what each block looks at; the coarse Gaussians that each sees around itself.
+
+    Args:
+        partition: The cells.
+        parts: How photos are cut.
+        outlooks: What blocks do.
+        scene: The coarse model, what all photos see, all sparse points.
+        folder: Takes the files.
+        report: Told of progress.
+    """
+    found = []
+    for number, outlook in enumerate(outlooks):
+        report.progress(number, len(outlooks), "looking around blocks", "blocks")
+        prospect = Prospect.of(partition, number, outlook.windows, parts, scene)
+        prospect.write(folder, number)
+        found.append(len(prospect.around.rows))
+    return found
 
 
 def upward(views: Sequence[View], xyz: Float64[np.ndarray, "p 3"], threads: int) -> Float64[np.ndarray, " 3"]:

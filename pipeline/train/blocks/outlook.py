@@ -22,7 +22,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.blocks.lengths import finer_lengths
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.schedules import block_lengths
+from splatpipe.pipeline.train.blocks.schedules import block_lengths, block_schedule
 from splatpipe.pipeline.train.blocks.sight import Sight, sights
 from splatpipe.pipeline.train.blocks.visibility import Windows, block_views
 from splatpipe.pipeline.train.lengths import Footage
@@ -79,22 +79,26 @@ Parts = dict[int, Int64[np.ndarray, "k 2"]]
 """By the level, each a photo's row and the number of one of its windows."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outlook:
     """What a block will do.
 
     Attributes:
+        windows: That it trains on; their rows are those of the photos.
         photos: That it sees.
         parts: Windows that it trains on at each of its sizes, the first size first.
         pixels: Of all of them, at that size.
         iterations: Of its plan.
+        steps: Of density control in them.
         disk_bytes: Of decoded photos while it trains, at most.
     """
 
+    windows: Parts
     photos: int
     parts: tuple[int, ...]
     pixels: tuple[int, ...]
     iterations: int
+    steps: int
     disk_bytes: int
 
 
@@ -178,7 +182,22 @@ def _outlook(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[Vi
         for row in np.unique(pairs[:, 0]).tolist():
             stored += stored_bytes(cut.camera(views[row].camera, level), views[row].mask_path is not None)
     counts = tuple(len(parts[level]) for level, _count in each)
-    return Outlook(len(rows), counts, tuple(pixels), sum(count for _level, count in each), stored)
+    iterations = sum(count for _level, count in each)
+    return Outlook(
+        parts, len(rows), counts, tuple(pixels), iterations, _steps(config, footage, cut, views, parts), stored
+    )
+
+
+def _steps(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[View], parts: Parts) -> int:
+    """Steps of density control of a block."""
+    pieces = {level: len(pairs) for level, pairs in parts.items()}
+    rows = {row for pairs in parts.values() for row in pairs[:, 0].tolist()}
+    if not rows:
+        return 0
+    sizes = Counter((views[row].camera.width, views[row].camera.height) for row in rows)
+    seen = footage_of([(*size, sizes[size]) for size in sorted(sizes)], cut.max_megapixels, cut.window_pixels)
+    density = block_schedule(config, footage, seen, pieces, 1.0).density
+    return sum(density.is_step(iteration) for iteration in range(density.first, density.last + 1))
 
 
 def coarse_sights(

@@ -1,4 +1,8 @@
-"""What a block looks at and what it draws around itself, worked out once and kept beside its checkpoint."""
+"""What each block looks at and sees around itself: worked out once for all blocks, from what all photos see.
+
+It lies in the artifact of the stage `blocks`, a file a block, and one for all of what photos say is free: no block
+renders depths of photos again, or reads all sparse points with their tracks, which takes memory by the photo.
+"""
 
 from __future__ import annotations
 
@@ -10,79 +14,147 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks
-from splatpipe.pipeline.raster.device import Device
+from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.splat.archives import read_archive
+from splatpipe.pipeline.splat.free_space import FreeSpace, PhotoBounds
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
-from splatpipe.pipeline.train.blocks.outlook import Cut, Parts, each_sight, parts_of, seen_windows
+from splatpipe.pipeline.train.blocks.outlook import Cut, Parts
 from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.blocks.sight import Sight
 from splatpipe.pipeline.train.blocks.sighted import Sighted, sighted
-from splatpipe.pipeline.train.blocks.surroundings import surroundings
+from splatpipe.pipeline.train.blocks.surroundings import Around, seen_around
 from splatpipe.pipeline.train.blocks.visibility import BlockPhoto, BlockViews
 
-SEEN = "seen.npz"
 FROZEN = "frozen.ply"
+FREE = "free_space.npz"
 _LEVEL = "level_"
 _COUNTED = "counted_"
 
 
 @dataclass(frozen=True, eq=False)
-class Surveyor:
-    """Who works it out.
+class Prospect:
+    """What one block looks at; photos by their rows among those trained on.
 
     Attributes:
-        dataset: The photos and the sparse points.
+        windows: That it trains on.
+        counted: What of each of their photos counts.
+        around: What they see of the coarse model besides.
+    """
+
+    windows: Parts
+    counted: dict[int, Sighted]
+    around: Around
+
+    @staticmethod
+    def of(
+        partition: Partition,
+        block: int,
+        windows: Parts,
+        cut: Cut,
+        scene: tuple[Gaussians, Sequence[Sight], Float64[np.ndarray, "p 3"]],
+    ) -> Prospect:
+        """Work it out.
+
+        Args:
+            partition: The cells.
+            block: The number of one.
+            windows: That it trains on.
+            cut: How photos are cut.
+            scene: The coarse model, what all photos see, all sparse points.
+        """
+        coarse, seen, xyz = scene
+        rows, photos, frames = rows_of(windows), [], []
+        for place, row in enumerate(rows):
+            each = [cut.windows(seen[row].camera, level) for level in windows]
+            chosen = []
+            for pairs, at_level in zip(windows.values(), each, strict=True):
+                mask = np.zeros(len(at_level), np.bool_)
+                mask[pairs[pairs[:, 0] == row, 1]] = True
+                chosen.append(mask)
+            photos.append(BlockPhoto(place, np.concatenate(chosen), 0, 0.0, 0.0))
+            frames.append(np.concatenate(each))
+        view = (BlockViews(tuple(photos)), [seen[row] for row in rows], frames)
+        counted = {row: sighted(partition, block, seen[row], xyz) for row in rows}
+        return Prospect(windows, counted, seen_around(partition, block, coarse, view))
+
+    def write(self, folder: Path, block: int) -> None:
+        """Keep it in a folder of all blocks."""
+        arrays: dict[str, npt.NDArray[Any]] = {f"{_LEVEL}{level}": pairs for level, pairs in self.windows.items()}
+        arrays |= {f"{_COUNTED}{row}": grid for row, grid in self.counted.items()}
+        arrays |= {"rows": self.around.rows.astype(np.int32), "units": self.around.units}
+
+        def write(file: IO[bytes]) -> None:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+        write_durably(_path(folder, block), write)
+
+    @staticmethod
+    def read(folder: Path, block: int) -> Prospect:
+        """The inverse of ``write``.
+
+        Raises:
+            StageError: if it is not there, or broken.
+        """
+        path = _path(folder, block)
+        try:
+            arrays = read_archive(path)
+            windows = {int(level): pairs for level, pairs in _named(arrays, _LEVEL)}
+            counted = {int(row): grid for row, grid in _named(arrays, _COUNTED)}
+            if sorted(counted) != rows_of(windows):
+                raise ValueError("other photos count than are looked at")
+            return Prospect(windows, counted, Around(arrays["rows"].astype(np.int64), arrays["units"]))
+        except (OSError, ValueError, KeyError, IndexError) as error:
+            raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Surveyor:
+    """Who knows it of a block that is trained.
+
+    Attributes:
+        prospects: The folder that has them.
         coarse: The folder that the coarse pass left.
         partition: The cells.
         number: Of the block.
         views: All photos trained on.
         cut: How they are cut into windows.
         most_frozen: Gaussians that are drawn around the block.
-        device: Renders what photos see.
     """
 
-    dataset: Path
+    prospects: Path
     coarse: Path
     partition: Partition
     number: int
     views: Sequence[View]
     cut: Cut
     most_frozen: int
-    device: Device
 
-    def parts(self, out: Path, report: Reporter) -> Parts:
-        """The windows that the block trains on; their rows are those of ``views``.
+    def prospect(self) -> Prospect:
+        """What the block looks at.
 
-        They, what of their photos counts (``counted``) and the frozen Gaussians (``frozen``) are kept in files: a run
-        that goes on takes them as they are.
+        Raises:
+            StageError: if it is not there, or broken.
+        """
+        return Prospect.read(self.prospects, self.number)
+
+    def frozen(self, out: Path) -> Gaussians:
+        """What is drawn around the block, kept in its folder for those who look at its checkpoints.
 
         Args:
             out: The block's folder.
-            report: Takes progress.
-
-        Raises:
-            StageError: if the dataset or the coarse pass is broken.
         """
         try:
-            arrays = read_archive(out / SEEN)
-            read_splat(out / FROZEN)
-            return {int(number): array for number, array in _named(arrays, _LEVEL)}
-        except (OSError, ValueError, SplatpipeError):
-            return self._work_out(out, report)
-
-    def frozen(self, out: Path) -> Gaussians:
-        """What is drawn around the block."""
-        return read_splat(out / FROZEN)
-
-    def counted(self, out: Path) -> dict[int, Sighted]:
-        """What counts of each photo that the windows are of, by its row."""
-        return {int(row): grid for row, grid in _named(read_archive(out / SEEN), _COUNTED)}
+            return read_splat(out / FROZEN)
+        except (OSError, SplatpipeError):
+            made = self.prospect().around.within(read_splat(self.coarse / "model.ply"), self.most_frozen)
+            write_splat(out / FROZEN, made)
+            return read_splat(out / FROZEN)
 
     def start(self, most: int) -> Gaussians:
         """What the coarse model has in the cell and its margin; the most opaque where it is more than ``most``."""
@@ -94,44 +166,56 @@ class Surveyor:
             rows = rows[order[:most]].sort().values
         return coarse.select(rows)
 
-    def _work_out(self, out: Path, report: Reporter) -> Parts:
-        coarse = read_splat(self.coarse / "model.ply")
-        points, tracks = load_points_and_tracks(self.dataset)
-        observed = [tracks[view.camera.name] for view in self.views]
-        shown, seen = [], {}
-        for row, sight in enumerate(each_sight(self.coarse, coarse, self.views, observed, self.device)):
-            by_level = seen_windows(self.partition, sight, points.xyz, self.cut)
-            shown.append({level: cells[self.number : self.number + 1].copy() for level, cells in by_level.items()})
-            if any(cells.any() for cells in shown[-1].values()):
-                seen[row] = sight
-            report.progress(row + 1, len(self.views), "looking for what shows the block", "photos")
-        parts = parts_of(shown, 0)
-        write_splat(out / FROZEN, self._surroundings(coarse, parts, seen))
 
-        arrays = {f"{_LEVEL}{level}": pairs for level, pairs in parts.items()}
-        for row, sight in seen.items():
-            arrays[f"{_COUNTED}{row}"] = sighted(self.partition, self.number, sight, points.xyz)
+def write_free_space(folder: Path, space: FreeSpace) -> None:
+    """Keep what all photos say is free."""
+    photos = space.photos
+    arrays = {
+        "support": space.support,
+        "near": np.array([photo.near for photo in photos], np.float64),
+        "shapes": np.array([photo.depth.shape for photo in photos], np.int64).reshape(-1, 2),
+        "depths": np.concatenate([np.zeros(0), *(photo.depth.ravel() for photo in photos)]),
+        "boxes": np.concatenate([np.zeros((4, 0)), *(photo.box.reshape(4, -1) for photo in photos)], axis=1),
+    }
 
-        def write(file: IO[bytes]) -> None:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+    def write(file: IO[bytes]) -> None:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
-        write_durably(out / SEEN, write)
-        return parts
+    write_durably(folder / FREE, write)
 
-    def _surroundings(self, coarse: Gaussians, parts: Parts, seen: dict[int, Sight]) -> Gaussians:
-        """What the block's windows, at any level, see of the coarse model besides."""
-        rows, photos, windows = sorted(seen), [], []
-        for place, row in enumerate(rows):
-            each = [self.cut.windows(seen[row].camera, level) for level in parts]
-            chosen = []
-            for pairs, at_level in zip(parts.values(), each, strict=True):
-                mask = np.zeros(len(at_level), np.bool_)
-                mask[pairs[pairs[:, 0] == row, 1]] = True
-                chosen.append(mask)
-            photos.append(BlockPhoto(place, np.concatenate(chosen), 0, 0.0, 0.0))
-            windows.append(np.concatenate(each))
-        view = (BlockViews(tuple(photos)), [seen[row] for row in rows], windows)
-        return surroundings(self.partition, self.number, coarse, view, self.most_frozen).frozen
+
+def read_free_space(folder: Path, cameras: Sequence[Camera]) -> FreeSpace:
+    """The inverse of ``write_free_space``.
+
+    Args:
+        folder: As there.
+        cameras: Of all photos trained on, in their order.
+
+    Raises:
+        StageError: if it is not there, or broken.
+    """
+    try:
+        arrays = read_archive(folder / FREE)
+        photos, start = [], 0
+        for camera, near, (rows, columns) in zip(
+            cameras, arrays["near"].tolist(), arrays["shapes"].tolist(), strict=True
+        ):
+            end = start + rows * columns
+            depth, box = arrays["depths"][start:end], arrays["boxes"][:, start:end]
+            photos.append(PhotoBounds(camera, depth.reshape(rows, columns), box.reshape(4, rows, columns), near))
+            start = end
+        return FreeSpace(tuple(photos), arrays["support"])
+    except (OSError, ValueError, KeyError) as error:
+        raise StageError(f"{FREE} cannot be read.", hint="Run again with --rerun-from blocks.") from error
+
+
+def rows_of(windows: Parts) -> list[int]:
+    """The photos of some windows, ascending."""
+    return sorted({row for pairs in windows.values() for row in pairs[:, 0].tolist()})
+
+
+def _path(folder: Path, block: int) -> Path:
+    return folder / f"block_{block + 1}.npz"
 
 
 def _named(arrays: dict[str, npt.NDArray[Any]], prefix: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:

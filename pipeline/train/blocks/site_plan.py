@@ -61,9 +61,31 @@ class SitePlan:
         return json_text(fields)
 
 
-def whole_json() -> str:
-    """The text of `blocks.json` where the scene is trained in one."""
-    return json_text({"shards": 0})
+def whole_json(limit_bytes: int = 0) -> str:
+    """The text of `blocks.json` where the scene is trained in one.
+
+    Args:
+        limit_bytes: Of memory, that nobody asked for and the training has to keep to; 0 for none.
+    """
+    return json_text({"shards": 0} | ({"limit_bytes": limit_bytes} if limit_bytes else {}))
+
+
+def limit_of_whole(path: Path) -> int:
+    """Of memory, that the training of a scene in one has to keep to though nobody asked for it; 0 for none.
+
+    Raises:
+        StageError: if it cannot be read, or is of a scene in blocks.
+    """
+    try:
+        fields: Any = json.loads(path.read_text(encoding="utf-8"))
+        if int(fields["shards"]):
+            raise StageError(
+                f"None of the {fields['shards']} blocks is here to be merged.",
+                hint="Run again: blocks that are missing are trained.",
+            )
+        return int(fields.get("limit_bytes", 0))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
 
 
 def load_site_plan(path: Path) -> SitePlan:

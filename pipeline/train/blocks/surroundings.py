@@ -59,18 +59,43 @@ def surroundings(
         view: What the block trains on; what all photos see, with depths; how each of those photos is cut.
         most: Frozen Gaussians, at least 1.
     """
+    means = coarse.means.detach().double().numpy()
+    around = seen_around(partition, block, coarse, view)
+    trained = np.flatnonzero(partition.trained_by(block, means))
+    return Surroundings(trained, around.within(coarse, most), len(around.rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Around:
+    """What a block's windows see of a coarse model besides the Gaussians that the block trains.
+
+    Attributes:
+        rows: Of the model, ascending.
+        units: Of each a voxel's least side, world units: the size of a pixel there, more away from the cell.
+    """
+
+    rows: Int64[np.ndarray, " k"]
+    units: Float64[np.ndarray, " k"]
+
+    def within(self, coarse: Gaussians, most: int) -> Gaussians:
+        """At most so many: those of a voxel of some times their unit become one; if need be, the least opaque go."""
+        return _within(coarse.select(torch.from_numpy(self.rows)), self.units, most)
+
+
+def seen_around(
+    partition: Partition, block: int, coarse: Gaussians, view: tuple[BlockViews, Sequence[Sight], Sequence[Windows]]
+) -> Around:
+    """What a block's windows see around it; arguments as of ``surroundings``."""
     views, seen, windows = view
     means = coarse.means.detach().double().numpy()
-    trained = partition.trained_by(block, means)
     pixel = np.full(len(coarse), math.inf)
     for photo in views.photos:
         rows, sizes = _seen_in(coarse, means, seen[photo.photo], windows[photo.photo][photo.windows])
         pixel[rows] = np.minimum(pixel[rows], sizes)
-    rows = np.flatnonzero(~trained & np.isfinite(pixel))
+    rows = np.flatnonzero(~partition.trained_by(block, means) & np.isfinite(pixel))
     cell = partition.cells[block].grown(partition.margin)
     away = cell.distance(partition.plan.places(means[rows])) / math.sqrt(cell.area)
-    frozen = _within(coarse.select(torch.from_numpy(rows)), pixel[rows] * (1.0 + away), most)
-    return Surroundings(np.flatnonzero(trained), frozen, len(rows))
+    return Around(rows, pixel[rows] * (1.0 + away))
 
 
 def _within(gaussians: Gaussians, unit: Float64[np.ndarray, " n"], most: int) -> Gaussians:

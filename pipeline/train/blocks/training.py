@@ -25,9 +25,9 @@ from splatpipe.pipeline.train.blocks.coarse import SKIES
 from splatpipe.pipeline.train.blocks.fence import Fence
 from splatpipe.pipeline.train.blocks.outlook import Cut, Parts
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.prospect import Surveyor
+from splatpipe.pipeline.train.blocks.prospect import Prospect, Surveyor, read_free_space, rows_of
 from splatpipe.pipeline.train.blocks.schedules import block_schedule
-from splatpipe.pipeline.train.clearing import Clearing, free_space_of
+from splatpipe.pipeline.train.clearing import Clearing
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.hooks import Technique
@@ -49,6 +49,7 @@ class SiteParts:
         dataset: The photos and the sparse points.
         split: Which photos are trained on.
         coarse: The folder that the coarse pass left.
+        prospects: The folder of what each block looks at.
         partition: The cells.
         area: That counts, in the model's frame; None where all does.
     """
@@ -56,6 +57,7 @@ class SiteParts:
     dataset: Path
     split: Path
     coarse: Path
+    prospects: Path
     partition: Partition
     area: PlanArea | None = None
 
@@ -100,13 +102,14 @@ def train_block(
     device = choose_device(machine.device, config.unfit_for_cuda(), report.note)
     with same_bits(machine.threads), device.one_order(), device.memory_limit(config.max_memory_bytes):
         block = Block.of(config, parts, task, device)
-        windows = block.surveyor.parts(out, report)
+        prospect = block.surveyor.prospect()
+        windows = prospect.windows
         plan = load_or_write_plan(out / "plan.json", lambda: block.plan(windows))
         if plan.schedule.iterations == 0:
             report.note("there is nothing to train")
             return _leave(block, plan, out, (block.start(), History())) | device.facts()
         report.note(f"{len(plan.train_views)} photos, {plan.described()}")
-        state = go_through(block.course(plan, windows, out), out, report)
+        state = go_through(block.course(plan, prospect, out), out, report)
         left = _leave(block, plan, out, (state.finished(), state.whole_history()))
     return summary_of(state, plan) | left | device.facts()
 
@@ -152,9 +155,7 @@ class Block:
         }
         whole = make_plan(config.model_copy(update=decided), views, split, 0, task.window_pixels)
         cut = Cut.of(whole.options, whole.footage, whole.megapixels)
-        surveyor = Surveyor(
-            parts.dataset, parts.coarse, parts.partition, task.number, trained_on, cut, task.frozen, device
-        )
+        surveyor = Surveyor(parts.prospects, parts.coarse, parts.partition, task.number, trained_on, cut, task.frozen)
         return Block(parts, task, device, whole, surveyor, exposures)
 
     def start(self) -> Gaussians:
@@ -186,17 +187,18 @@ class Block:
         size = round(1e-6 * seen.pixels(Look(schedule.finest.level)), 4)
         return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
 
-    def course(self, plan: Plan, windows: Parts, out: Path) -> Course:
+    def course(self, plan: Plan, prospect: Prospect, out: Path) -> Course:
         """What it goes through.
 
         Args:
             plan: Its plan.
-            windows: That it trains on.
-            out: Has its surroundings, and what of the photos counts.
+            prospect: What it looks at.
+            out: Has its surroundings.
         """
+        windows = prospect.windows
         views, place = self.views(windows), {row: place for place, row in enumerate(rows_of(windows))}
         cut, every = self.surveyor.cut, self.surveyor.views
-        cells = {place[row]: grid for row, grid in self.surveyor.counted(out).items()}
+        cells = {place[row]: grid for row, grid in prospect.counted.items()}
         pieces = {
             level: [(place[row], cut.frames(every[row].camera, level)[window]) for row, window in pairs.tolist()]
             for level, pairs in windows.items()
@@ -233,17 +235,13 @@ class Block:
             made = made.with_given(exposure)
         more: list[Technique] = [self.fence(plan)]
         if plan.options.prune_free_space:
-            more.append(Clearing(free_space_of(self.surveyor.views, self.parts.dataset), plan.schedule))
+            cameras = [view.camera for view in self.surveyor.views]
+            more.append(Clearing(read_free_space(self.parts.prospects, cameras), plan.schedule))
         return Techniques((*made, *more))
 
     def fence(self, plan: Plan) -> Fence:
         """What keeps its Gaussians to cell and margin."""
         return Fence(self.parts.partition, self.task.number, self.task.share, plan.schedule.density)
-
-
-def rows_of(windows: Parts) -> list[int]:
-    """The photos of some windows, ascending."""
-    return sorted({row for pairs in windows.values() for row in pairs[:, 0].tolist()})
 
 
 def _leave(block: Block, plan: Plan, out: Path, trained: tuple[Gaussians, History]) -> dict[str, JSON]:
