@@ -11,6 +11,7 @@ import pytest
 
 from splatpipe.pipeline.train.lengths import (
     FEWEST_VISITS,
+    FIRST_MOST,
     PART_VISITS,
     WHOLE_VISITS,
     Footage,
@@ -67,13 +68,18 @@ def test_few_photos_take_the_least_and_more_take_more_in_proportion() -> None:
     assert 0.7 < pixels / (7000 * 0.5e6) < 1.4
 
 
-def test_a_given_number_is_exactly_that_and_has_the_same_proportions() -> None:
+def test_a_given_number_is_exactly_that_and_what_is_more_than_auto_goes_to_the_finest_size() -> None:
     footage = footage_of(50, 4.0)
     auto = lengths(footage, 7000)
     for iterations in (1, 2, 99, 5001, 7000, 31_017):
         assert sum(count for _, count in divided(footage, 7000, iterations)) == iterations
-    twice = divided(footage, 7000, 2 * sum(count for _, count in auto))
-    assert twice == [(level, 2 * count) for level, count in auto]
+    total = sum(count for _, count in auto)
+    assert divided(footage, 7000, total) == auto
+    assert divided(footage, 7000, 5 * total) == [*auto[:-1], (0, auto[-1][1] + 4 * total)]
+    fewer = divided(footage, 7000, 3 * total // 4)
+    assert all(abs(count - 0.75 * wanted) <= 1 for (_, count), (_, wanted) in zip(fewer, auto, strict=True))
+    # However long a training is at least, its first size is no longer than it needs.
+    assert lengths(footage, 300_000)[0] == (2, FIRST_MOST) and lengths(footage_of(500, 4.0), 7000)[0] == (2, 10_000)
     assert divided(footage_of(50, 0.3), 7000, 600) == [(0, 600)]
 
 
@@ -101,9 +107,9 @@ def test_stretches_are_the_lengths_with_the_options_halvings_before_them() -> No
 
 
 def test_a_schedule_grows_gaussians_into_the_finest_size_and_resets_none_there() -> None:
-    footage = footage_of(50, 4.0)
-    schedule = resolve_schedule(TrainConfig(least_iterations=30_000), footage)
-    each = lengths_of(TrainConfig(least_iterations=30_000), footage)
+    footage = footage_of(500, 4.0)
+    config = TrainConfig(least_iterations=30_000, density="published")
+    schedule, each = resolve_schedule(config, footage), lengths_of(config, footage)
     assert schedule.iterations == sum(count for _, count in each) == schedule.stretches[-1].until
     assert schedule.finest_from < schedule.density.last < schedule.iterations
     resets = [iteration for iteration in range(1, schedule.iterations + 1) if schedule.density.is_reset(iteration)]

@@ -49,7 +49,8 @@ def test_long_runs_have_the_published_schedule() -> None:
     schedule = resolve_schedule(TrainConfig())
     density = schedule.density
     assert (schedule.sh_every, density.first, density.last, density.every) == (1000, 500, 15_000, 100)
-    assert density.reset_every == 3000
+    assert density.reset_every == 0
+    assert resolve_schedule(TrainConfig(density="published")).density.reset_every == 3000
 
 
 @pytest.mark.parametrize("iterations", [1, 7, 100, 999, 3000, 7000, 9999])
@@ -61,21 +62,21 @@ def test_short_runs_have_every_phase_and_no_reset(iterations: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("density", "gradient"),
-    [("published", 2e-4), ("absolute", 1.2e-3)],
+    ("density", "gradient", "resets"),
+    [("published", 2e-4, 3000), ("absolute", 1.2e-3, 0)],
 )
-def test_each_score_of_density_control_has_its_threshold(density: str, gradient: float) -> None:
+def test_each_score_of_density_control_has_its_threshold(density: str, gradient: float, resets: int) -> None:
     found = resolve_schedule(TrainConfig.model_validate({"density": density})).density
-    assert (found.gradient, found.last, found.reset_every) == (gradient, 15_000, 3000)
+    assert (found.gradient, found.last, found.reset_every) == (gradient, 15_000, resets)
 
 
 def test_published_density_takes_the_rates_resets_and_pruning_of_that_method_however_short_the_run() -> None:
     for iterations in (1500, 30_000):
         schedule = resolve_schedule(TrainConfig(iterations=iterations, density="published"))
-        assert schedule.rates == Rates(opacity=0.05, boost=1.0, sparse=False)
+        assert schedule.rates == Rates(opacity=0.05, boost=1.0, sparse=False, by_distance=False)
         assert (schedule.density.reset_every, schedule.density.prune_screen_px) == (3000, 20.0)
         ours = resolve_schedule(TrainConfig(iterations=iterations))
-        assert ours.rates.sparse and ours.rates.opacity == 0.15 and ours.density.prune_screen_px == 0.0
+        assert ours.rates.sparse and ours.rates.by_distance and ours.rates.opacity == 0.15 and ours.density.prune_screen_px == 0.0
 
 
 def test_a_time_budget_halves_the_threshold() -> None:

@@ -70,7 +70,7 @@ def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
     # Step.
     with torch.no_grad():
         own = state.of_trained(rendered)
-        state.step(own.visible, now, plan)
+        state.step(own.visible, now, plan, photo.camera)
         if probe is not None and probe.grad is not None:
             state.density.observe(own, probe.grad, plan.schedule.density, photo)
         techniques.after_step(shot)

@@ -19,9 +19,8 @@ from splatpipe.pipeline.train.options import TrainConfig
 # Judgement but for the one that says otherwise; no curve over CPU time was measured yet.
 WHOLE_VISITS = 20  # of a photo at the size at which it is seen whole, at least
 PART_VISITS = 16  # of every part of every photo at each finer size, at least; 8 lost, see docs/lengths.md
-FINEST_SHARE = (
-    0.5  # of the least iterations are at the finest size: where photos are few, its parts are seen more often
-)
+FIRST_SHARE = 0.5  # of the least iterations are at the first size,
+FIRST_MOST = 3500  # but no more than these where 20 visits are fewer: more went into what single photos show
 FEWEST_VISITS = (
     10.0  # of a part, below which a run that was given its length stays with the size before: it learns more
 )
@@ -130,14 +129,15 @@ def lengths(footage: Footage, least: int, finest: int = 0) -> list[Length]:
     first = max(finest, footage.first_level)
     if first == finest:
         return [(first, max(least, WHOLE_VISITS * footage.parts(first)))]
+    whole = max(WHOLE_VISITS * footage.parts(first), min(math.ceil(FIRST_SHARE * least), FIRST_MOST))
     finer = [(level, PART_VISITS * footage.parts(level)) for level in range(first - 1, finest, -1)]
-    last = max(PART_VISITS * footage.parts(finest), math.ceil(FINEST_SHARE * least))
-    whole = max(WHOLE_VISITS * footage.parts(first), least - last - sum(count for _level, count in finer))
-    return [(first, max(whole, math.ceil((1.0 - FINEST_SHARE) * least))), *finer, (finest, last)]
+    return [(first, whole), *finer, (finest, max(PART_VISITS * footage.parts(finest), least - whole))]
 
 
 def divided(footage: Footage, least: int, iterations: int) -> list[Length]:
-    """So many iterations, divided like those of ``lengths``; a size that comes too short is left out.
+    """So many iterations: fewer than those of ``lengths`` divided like them, more of them at the finest size.
+
+    A size that comes too short is left out.
 
     Args:
         footage: The photos.
@@ -146,13 +146,14 @@ def divided(footage: Footage, least: int, iterations: int) -> list[Length]:
     """
     for finest in range(footage.first_level + 1):
         wanted = lengths(footage, least, finest)
-        share = iterations / sum(count for _level, count in wanted)
+        share = min(1.0, iterations / sum(count for _level, count in wanted))
         if len(wanted) == 1 or share * wanted[-1][1] >= FEWEST_VISITS * footage.parts(finest):
             break
     ends, done = [], 0
     for _level, count in wanted:
         done += count
         ends.append(round(share * done))
+    ends[-1] = iterations
     return [(level, end - start) for (level, _), start, end in zip(wanted, [0, *ends], ends, strict=False)]
 
 

@@ -30,6 +30,8 @@ class Rates:
         boost: All but opacity's are multiplied by this, the last one of positions by its square; ours.
         sparse: Only the Gaussians that the photo saw are stepped; else all of them, as published, whose momentum goes
             on unseen. Ours.
+        by_distance: Positions step in proportion to their distance from the photo's camera (see `paces.py`), not all as
+            far, as published. Ours.
     """
 
     means: float = 1.6e-4
@@ -41,6 +43,7 @@ class Rates:
     quats: float = 1e-3
     boost: float = 1.0
     sparse: bool = True
+    by_distance: bool = True
 
     def means_at(self, share: float) -> float:
         """That of positions at a share of the schedule, times the scene's extent."""
@@ -49,7 +52,7 @@ class Rates:
         return math.exp(math.log(first) * (1.0 - share) + math.log(last) * share)
 
 
-PUBLISHED = Rates(opacity=PUBLISHED_OPACITY_RATE, sparse=False)
+PUBLISHED = Rates(opacity=PUBLISHED_OPACITY_RATE, sparse=False, by_distance=False)
 
 
 def rates_of(iterations: int) -> Rates:

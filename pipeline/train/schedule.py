@@ -15,7 +15,6 @@ from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
 
 FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
 FEW_DROPOUT = 0.2
-SHORT_RUN = 10_000  # iterations below which an opacity reset costs more than it brings; the published method has it
 RESET_EVERY = 3000  # iterations, published: what is reset needs them to come back
 GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified
 PUBLISHED_GRADIENT = 2e-4  # the same of the signed sum
@@ -253,7 +252,6 @@ class Pace:
 def _density(config: TrainConfig, each: list[Length], pace: Pace) -> DensitySchedule:
     published = config.density == "published"
     gradient = PUBLISHED_GRADIENT if published else GRADIENT
-    resets = published or pace.iterations >= SHORT_RUN
     return DensitySchedule(
         on=config.densify,
         seed=config.seed,
@@ -262,7 +260,7 @@ def _density(config: TrainConfig, each: list[Length], pace: Pace) -> DensitySche
         last=max(1, growth_until(each)),
         every=pace.lasting(100, 10),
         gradient=gradient * (BUDGET_SHARE if config.time_budget_s else 1.0),
-        reset_every=max(RESET_EVERY, RESET_VISITS * pace.photos) if resets else 0,
+        reset_every=max(RESET_EVERY, RESET_VISITS * pace.photos) if published else 0,
         reset_until=each[0][1] if len(each) > 1 else 0,
         prune_screen_px=PRUNE_SCREEN_PX if published else 0.0,
         prune_free_space=config.prune_free_space,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -10,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.device import CPU, take_rows
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, free_frames
@@ -28,6 +30,7 @@ from splatpipe.pipeline.train.densify import (
 from splatpipe.pipeline.train.density import Density, DensityStep
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.memory import within_room
+from splatpipe.pipeline.train.paces import by_distance
 from splatpipe.pipeline.train.plan import Plan
 from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.techniques import Techniques
@@ -120,13 +123,14 @@ class TrainState:
         zero = torch.zeros(1, 2, device=self.gaussians.means.device)
         return zero.expand(len(self.drawn), 2).requires_grad_()  # nobody reads its values
 
-    def step(self, gradient_rows: Bool[Tensor, " n"], now: Moment, plan: Plan) -> None:
+    def step(self, gradient_rows: Bool[Tensor, " n"], now: Moment, plan: Plan, camera: Camera) -> None:
         """Step the parameters against their gradients, which are dropped; those that ``buffers`` hold, too.
 
         Args:
             gradient_rows: The Gaussians that the photo saw.
             now: What the schedule says of the iteration.
             plan: The training's.
+            camera: Of the photo.
         """
         given, extent = plan.schedule.rates, plan.extent
         colour = given.boost * given.sh
@@ -139,8 +143,10 @@ class TrainState:
         }
         limits = {"log_scales": (math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))}
         self._hand_gradients()
-        tensors = self.gaussians.tensors()
-        self.adam.step(tensors, rates, gradient_rows if given.sparse else None, buffers=self.buffers, limits=limits)
+        tensors, rows = self.gaussians.tensors(), gradient_rows if given.sparse else None
+        pace = by_distance(tensors["means"].detach(), rows, camera, extent) if given.by_distance else nullcontext()
+        with pace:
+            self.adam.step(tensors, rates, rows, buffers=self.buffers, limits=limits)
         self._drop_gradients()
 
     def _hand_gradients(self) -> None:
