@@ -1,0 +1,49 @@
+"""How far a step moves a Gaussian: the same angle for its photo's camera, wherever it lies."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.train.paces import by_distance
+
+UNIT = 10.0
+
+
+def camera_at(centre: tuple[float, float, float]) -> Camera:
+    pose = np.eye(4)
+    pose[:3, 3] = -np.array(centre)
+    return Camera("a.jpg", 100, 50, 80.0, 80.0, 50.0, 25.0, pose)
+
+
+def stepped(means: torch.Tensor, step: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
+    """How far each moves where the step is as given."""
+    moved = means.clone()
+    with by_distance(moved, rows, camera_at((1.0, 2.0, 3.0)), UNIT):
+        moved += step
+    return moved - means
+
+
+def at(*distances: float) -> torch.Tensor:
+    return torch.tensor([[1.0, 2.0, 3.0 + distance] for distance in distances])
+
+
+def test_across_the_ray_a_step_grows_with_the_distance() -> None:
+    across = torch.tensor([[0.01, -0.02, 0.0]])
+    moved = stepped(at(5.0, 10.0, 40.0), across.repeat(3, 1))
+    assert torch.allclose(moved, across * torch.tensor([[0.5], [1.0], [4.0]]), atol=1e-5)
+
+
+def test_along_the_ray_it_grows_with_its_square_beyond_the_unit() -> None:
+    along = torch.tensor([[0.0, 0.0, 0.01]])
+    moved = stepped(at(5.0, 10.0, 40.0), along.repeat(3, 1))
+    assert torch.allclose(moved, along * torch.tensor([[0.5], [1.0], [16.0]]), atol=2e-4)
+
+
+def test_rows_that_are_not_stepped_stay_to_the_bit_and_so_does_one_in_the_camera() -> None:
+    means = at(20.0, 30.0, 0.0)
+    rows = torch.tensor([True, False, True])
+    moved = stepped(means, torch.tensor([[0.01, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), rows)
+    assert moved[0, 0] > 0.0199 and bool((moved[1:] == 0.0).all())
+    assert bool(torch.isfinite(stepped(means, torch.full((3, 3), 0.01))).all())
