@@ -35,10 +35,10 @@ def test_a_limit_that_no_training_keeps_to_is_refused_before_anything_is_done(tm
 
 @pytest.mark.parametrize(
     ("said", "size"),
-    [([], 0.5), (["train.time_budget_s=60"], 0.0), (["train.time_budget_s=60", "train.max_megapixels=0.4"], 0.4)],
+    [([], 0.3), (["train.time_budget_s=60"], 0.0), (["train.time_budget_s=60", "train.max_megapixels=0.4"], 0.4)],
 )
 def test_a_time_budget_may_take_all_of_the_photos_unless_somebody_says_less(said: list[str], size: float) -> None:
-    assert overrides(None, said, None).resolve(load_preset("standard")).train.max_megapixels == size
+    assert overrides(None, said, None).resolve(load_preset("preview")).train.max_megapixels == size
 
 
 def test_the_least_limit_that_is_told_is_taken(tmp_path: Path) -> None:
