@@ -147,7 +147,7 @@ BLOCKS = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=12,
+    version=13,
     config=TrainConfig,
     reads=(
         "undistort.dataset",
