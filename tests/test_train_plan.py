@@ -76,7 +76,12 @@ def test_published_density_takes_the_rates_resets_and_pruning_of_that_method_how
         assert schedule.rates == Rates(opacity=0.05, boost=1.0, sparse=False, by_distance=False)
         assert (schedule.density.reset_every, schedule.density.prune_screen_px) == (3000, 20.0)
         ours = resolve_schedule(TrainConfig(iterations=iterations))
-        assert ours.rates.sparse and ours.rates.by_distance and ours.rates.opacity == 0.15 and ours.density.prune_screen_px == 0.0
+        assert (
+            ours.rates.sparse
+            and ours.rates.by_distance
+            and ours.rates.opacity == 0.15
+            and ours.density.prune_screen_px == 0.0
+        )
 
 
 def test_a_time_budget_halves_the_threshold() -> None:
