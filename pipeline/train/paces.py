@@ -1,10 +1,11 @@
-"""How far a step moves a Gaussian: so many pixels of the photo that asks for it, wherever it lies.
+"""How far a step moves a Gaussian: what is far moves as many pixels of its photo as what is near.
 
 Learning rates of positions are published in the scene's extent: a step is as many millimetres on a façade as on the
 hills behind it, where these are a tenth of a pixel. What is far then never comes to the depth at which its photos
-agree, and is learned as so many pictures, one for each of them: good in what is trained on, wrong between them. Here
-a step across the ray grows with the distance, the same angle everywhere; along the ray it grows with its square, as
-what one pixel of parallax leaves open does.
+agree, and is learned as so many pictures, one for each of them: good in what is trained on, wrong between them. Here,
+beyond the extent, a step across the ray grows with the distance, the same angle everywhere; along the ray it grows with
+its square, as what one pixel of parallax leaves open does. Nearer it stays as published: shorter steps over ground that
+is flown over straight down left it a little softer.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 def by_distance(
     means: Float[Tensor, "n 3"], rows: Bool[Tensor, " n"] | None, camera: Camera, unit: float
 ) -> Iterator[None]:
-    """Positions that are stepped in the body go further the further they are from the camera.
+    """Positions that are stepped in the body go further where they are further than the unit from the camera.
 
     Args:
         means: Changed in place, world units.
@@ -32,12 +33,16 @@ def by_distance(
         unit: Distance at which a step is as long as its rate says, world units.
     """
     chosen = slice(None) if rows is None or means.device.type != "cpu" else torch.nonzero(rows).flatten()
+    centre = torch.from_numpy(camera.centre()).to(means.device, torch.float32)
+    ray = means[chosen] - centre
+    distance = torch.linalg.vector_norm(ray, dim=1, keepdim=True)
+    if isinstance(chosen, Tensor):  # on the CPU what is near costs no more than this look
+        far = torch.nonzero(distance[:, 0] > unit).flatten()
+        chosen, ray, distance = chosen[far], ray[far], distance[far]
     before = means[chosen].clone()
     yield
-    ray = before - torch.from_numpy(camera.centre()).to(means.device, torch.float32)
-    distance = torch.linalg.vector_norm(ray, dim=1, keepdim=True)
     ray.div_(distance.clamp(min=1e-30))
-    pace = distance.div_(unit)
+    pace = distance.div_(unit).clamp_(min=1.0)
     moved = (means[chosen] - before).mul_(pace)
-    along = (moved * ray).sum(dim=1, keepdim=True).mul_((pace - 1.0).clamp_(min=0.0))
+    along = (moved * ray).sum(dim=1, keepdim=True).mul_(pace - 1.0)
     means[chosen] = before.add_(moved).addcmul_(ray, along)

@@ -30,8 +30,8 @@ class Rates:
         boost: All but opacity's are multiplied by this, the last one of positions by its square; ours.
         sparse: Only the Gaussians that the photo saw are stepped; else all of them, as published, whose momentum goes
             on unseen. Ours.
-        by_distance: Positions step in proportion to their distance from the photo's camera (see `paces.py`), not all as
-            far, as published. Ours.
+        by_distance: Positions far from the photo's camera step further (see `paces.py`), not all as far, as published.
+            Ours.
     """
 
     means: float = 1.6e-4
