@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.cuda import kernels_of
 
 
 @contextmanager
@@ -32,11 +33,13 @@ def by_distance(
         camera: Of the photo that asks for the step.
         unit: Distance at which a step is as long as its rate says, world units.
     """
-    chosen = slice(None) if rows is None or means.device.type != "cpu" else torch.nonzero(rows).flatten()
-    centre = torch.from_numpy(camera.centre()).to(means.device, torch.float32)
-    ray = means[chosen] - centre
+    on_device = kernels_of(means.device) is not None  # there, to count rows is to wait, and all of them cost little
+    chosen = slice(None) if rows is None or on_device else torch.nonzero(rows).flatten()
+    ray = means[chosen].clone()
+    for axis, value in enumerate(camera.centre().tolist()):
+        ray[:, axis] -= value
     distance = torch.linalg.vector_norm(ray, dim=1, keepdim=True)
-    if isinstance(chosen, Tensor):  # on the CPU what is near costs no more than this look
+    if isinstance(chosen, Tensor):
         far = torch.nonzero(distance[:, 0] > unit).flatten()
         chosen, ray, distance = chosen[far], ray[far], distance[far]
     before = means[chosen].clone()
