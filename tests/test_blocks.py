@@ -32,7 +32,7 @@ from splatpipe.pipeline.train.blocks.needs import (
 )
 from splatpipe.pipeline.train.blocks.partition import NOBODY, Border, Cell, Partition
 from splatpipe.pipeline.train.blocks.sight import Sight, sights
-from splatpipe.pipeline.train.blocks.surroundings import surroundings
+from splatpipe.pipeline.train.blocks.surroundings import seen_around
 from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.blocks.visibility import block_views, windows
 from splatpipe.pipeline.train.limits import FIXED_BYTES
@@ -287,13 +287,15 @@ def test_surroundings_leave_the_blocks_photos_as_they_are(
     cuts = [building_site.quarters(sight.camera) for sight in seen]
     for block in (0, 3):
         view, worst = (views[block], seen, cuts), []
-        whole = surroundings(partition, block, coarse, view, len(coarse))
-        assert whole.seen == len(whole.frozen) < len(coarse) - len(whole.trained)
-        fewer = surroundings(partition, block, coarse, view, len(whole.frozen) // 2)
-        assert len(fewer.frozen) <= len(whole.frozen) // 2 and fewer.seen == whole.seen
-        evenly = torch.arange(len(fewer.frozen)) * whole.seen // len(fewer.frozen)
-        own = coarse.select(torch.from_numpy(whole.trained))
-        for around in (whole.frozen, fewer.frozen, whole.frozen.select(evenly)):
+        found = seen_around(partition, block, coarse, view)
+        trained = partition.trained_by(block, coarse.means.double().numpy())
+        whole = found.within(coarse, len(coarse))
+        assert len(found.rows) == len(whole) < len(coarse) - trained.sum()
+        fewer = found.within(coarse, len(whole) // 2)
+        assert len(fewer) <= len(whole) // 2
+        evenly = torch.arange(len(fewer)) * len(whole) // len(fewer)
+        own = coarse.select(torch.from_numpy(trained))
+        for around in (whole, fewer, whole.select(evenly)):
             drawn = Gaussians.concat([own, around])
             psnr = [_likeness(coarse, drawn, seen[p.photo], cuts[p.photo][p.windows]) for p in view[0].photos]
             worst.append(min(psnr))

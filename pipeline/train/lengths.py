@@ -16,11 +16,11 @@ from functools import cache
 from splatpipe.pipeline.train.looks import Look, windows_of
 from splatpipe.pipeline.train.options import TrainConfig
 
-# Judgement but for the one that says otherwise; no curve over CPU time was measured yet.
+# Judgement, but for what docs/lengths.md says of them.
 WHOLE_VISITS = 20  # of a photo at the size at which it is seen whole, at least
 PART_VISITS = 16  # of every part of every photo at each finer size, at least; 8 lost, see docs/lengths.md
 FIRST_SHARE = 0.5  # of the least iterations are at the first size,
-FIRST_MOST = 3500  # but no more than these where 20 visits are fewer: more went into what single photos show
+FIRST_MOST = 3500  # but no more than these where 20 visits are fewer: the finest size is worth more
 FEWEST_VISITS = (
     10.0  # of a part, below which a run that was given its length stays with the size before: it learns more
 )

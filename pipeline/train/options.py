@@ -57,7 +57,7 @@ class TrainConfig(StageConfig):
     seed: NonNegativeInt = 0
     """Seed of the order of photos and of density control."""
     max_gaussians: PositiveInt = 1_000_000
-    """Hard cap on Gaussians, at most 1.8 kB of memory each; where it binds, the largest scores are densified first."""
+    """Hard cap on Gaussians, at most 1.3 kB of memory each; where it binds, the largest scores are densified first."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics that are trained."""
     loss: Literal["native", "kornia"] = "native"

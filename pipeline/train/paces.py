@@ -1,11 +1,11 @@
 """How far a step moves a Gaussian: what is far moves as many pixels of its photo as what is near.
 
-Learning rates of positions are published in the scene's extent: a step is as many millimetres on a façade as on the
-hills behind it, where these are a tenth of a pixel. What is far then never comes to the depth at which its photos
-agree, and is learned as so many pictures, one for each of them: good in what is trained on, wrong between them. Here,
-beyond the extent, a step across the ray grows with the distance, the same angle everywhere; along the ray it grows with
-its square, as what one pixel of parallax leaves open does. Nearer it stays as published: shorter steps over ground that
-is flown over straight down left it a little softer.
+Learning rates of positions are published as a share of the scene's extent: a step is as many millimetres on a façade
+as on the hills behind it, where these are a small part of a pixel. What is far then never comes to the depth at which
+its photos agree, and is learned as so many pictures, one for each of them: good in what is trained on, wrong between
+them. Here, beyond the extent, a step across the ray grows with the distance, the same angle everywhere; along the ray
+it grows with its square, as the depth does that a pixel of parallax leaves open. Nearer it stays as published: shorter
+steps over ground that is flown over straight down left it a little softer.
 """
 
 from __future__ import annotations

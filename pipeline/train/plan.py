@@ -198,6 +198,12 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     return EXTENT_MARGIN * radius
 
 
+def sizes_of(cameras: Sequence[Camera]) -> tuple[tuple[int, int, int], ...]:
+    """Width and height of photos, and how many have it; sorted."""
+    counted = Counter((camera.width, camera.height) for camera in cameras)
+    return tuple((*size, counted[size]) for size in sorted(counted))
+
+
 def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window_pixels: int) -> Footage:
     """Photos as they are trained on.
 
@@ -235,7 +241,6 @@ def make_plan(
             f"All {len(cameras)} cameras stand in one place, so the scene has no size.",
             hint="Take the photos from different places, and hold out fewer of them.",
         )
-    counted = Counter((camera.width, camera.height) for camera in cameras)
     plan = Plan(
         options=config,
         schedule=resolve_schedule(config),
@@ -246,7 +251,7 @@ def make_plan(
         train_megapixels=0.0,
         initial_gaussians=gaussians,
         last_iteration=0,
-        sizes=tuple((*size, counted[size]) for size in sorted(counted)),
+        sizes=sizes_of(cameras),
         window_pixels=window_pixels,
     )
     return plan.of(config)

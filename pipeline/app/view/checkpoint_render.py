@@ -122,7 +122,8 @@ def _trainings(opened: Contents) -> list[tuple[Path, Path, int]]:
     if (coarse := _coarse(opened)) is not None:
         blocks = [(_moved(folder / CHECKPOINT), name, folder) for name, folder in opened.working.items()]
         blocks = [each for each in blocks if each[1].startswith("train.")]
-        found += [(folder, coarse / RENDERING, int(name[6:])) for _, name, folder in sorted(blocks, reverse=True)]
+        for _, name, folder in sorted(blocks, reverse=True):
+            found.append((folder, coarse / RENDERING, int(name.removeprefix("train."))))
     if "blocks" in opened.working:
         folder = opened.working["blocks"] / "coarse"
         found.append((folder, folder / RENDERING, 0))

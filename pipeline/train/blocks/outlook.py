@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +28,7 @@ from splatpipe.pipeline.train.lengths import Footage
 from splatpipe.pipeline.train.looks import Frame, windows_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photo_cache import stored_bytes
-from splatpipe.pipeline.train.plan import footage_of
+from splatpipe.pipeline.train.plan import footage_of, sizes_of
 
 
 @dataclass(frozen=True)
@@ -164,11 +163,11 @@ def block_outlooks(
 
 def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> tuple[Footage, float | None]:
     """Photos as they are trained on, and the megapixels that they are reduced to; None where they are as they are."""
-    counted = Counter((camera.width, camera.height) for camera in cameras)
+    sizes = sizes_of(cameras)
     most = config.max_megapixels or None
-    if most is not None and max(width * height for width, height in counted) <= 1e6 * most:
+    if most is not None and max(width * height for width, height, _count in sizes) <= 1e6 * most:
         most = None
-    return footage_of([(*size, counted[size]) for size in sorted(counted)], most, window_pixels), most
+    return footage_of(sizes, most, window_pixels), most
 
 
 def _outlook(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[View], parts: Parts) -> Outlook:
@@ -194,8 +193,7 @@ def _steps(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[View
     rows = {row for pairs in parts.values() for row in pairs[:, 0].tolist()}
     if not rows:
         return 0
-    sizes = Counter((views[row].camera.width, views[row].camera.height) for row in rows)
-    seen = footage_of([(*size, sizes[size]) for size in sorted(sizes)], cut.max_megapixels, cut.window_pixels)
+    seen = footage_of(sizes_of([views[row].camera for row in rows]), cut.max_megapixels, cut.window_pixels)
     density = block_schedule(config, footage, seen, pieces, 1.0).density
     return sum(density.is_step(iteration) for iteration in range(density.first, density.last + 1))
 

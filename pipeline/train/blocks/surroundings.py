@@ -29,43 +29,6 @@ COARSEST = 64.0  # pixels of a voxel at the cell's edge: beyond it the least opa
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """A coarse model as one block takes it.
-
-    Attributes:
-        trained: Rows of the Gaussians that the block trains, ascending.
-        frozen: What is drawn besides: Gaussians of the model, or such as stand for several.
-        seen: How many of the model the frozen ones stand for.
-    """
-
-    trained: Int64[np.ndarray, " _"]
-    frozen: Gaussians
-    seen: int
-
-
-def surroundings(
-    partition: Partition,
-    block: int,
-    coarse: Gaussians,
-    view: tuple[BlockViews, Sequence[Sight], Sequence[Windows]],
-    most: int,
-) -> Surroundings:
-    """Divide a coarse model for a block.
-
-    Args:
-        partition: The cells.
-        block: Which.
-        coarse: The model of the whole, on the CPU.
-        view: What the block trains on; what all photos see, with depths; how each of those photos is cut.
-        most: Frozen Gaussians, at least 1.
-    """
-    means = coarse.means.detach().double().numpy()
-    around = seen_around(partition, block, coarse, view)
-    trained = np.flatnonzero(partition.trained_by(block, means))
-    return Surroundings(trained, around.within(coarse, most), len(around.rows))
-
-
-@dataclass(frozen=True, eq=False)
 class Around:
     """What a block's windows see of a coarse model besides the Gaussians that the block trains.
 
@@ -85,7 +48,14 @@ class Around:
 def seen_around(
     partition: Partition, block: int, coarse: Gaussians, view: tuple[BlockViews, Sequence[Sight], Sequence[Windows]]
 ) -> Around:
-    """What a block's windows see around it; arguments as of ``surroundings``."""
+    """What a block's windows see around it.
+
+    Args:
+        partition: The cells.
+        block: Which.
+        coarse: The model of the whole, on the CPU.
+        view: What the block trains on; what all photos see, with depths; how each of those photos is cut.
+    """
     views, seen, windows = view
     means = coarse.means.detach().double().numpy()
     pixel = np.full(len(coarse), math.inf)

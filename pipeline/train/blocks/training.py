@@ -7,7 +7,6 @@ cell and margin alone; ``merging.py`` puts the cells together.
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +33,7 @@ from splatpipe.pipeline.train.hooks import Technique
 from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.loop import Course, go_through, summary_of
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, footage_of, load_or_write_plan, make_plan
+from splatpipe.pipeline.train.plan import Plan, footage_of, load_or_write_plan, make_plan, sizes_of
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.sky_file import read_skies
 from splatpipe.pipeline.train.techniques import Techniques, make_techniques
@@ -169,8 +168,7 @@ class Block:
     def plan(self, windows: Parts) -> Plan:
         """What it does; no iterations where it sees nothing, or has nothing to train."""
         options, cameras = self.whole.options, [view.camera for view in self.views(windows)]
-        counted = Counter((camera.width, camera.height) for camera in cameras)
-        sizes = tuple((*size, counted[size]) for size in sorted(counted))
+        sizes = sizes_of(cameras)
         count = len(self.start())
         planned = replace(
             self.whole,
