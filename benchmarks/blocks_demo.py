@@ -33,6 +33,7 @@ COLUMNS = {
     "iterations": "iterations:,",
     "CPU s of training": "cpu:.0f",
     "memory MB": "memory:MB",
+    "coarse pass's": "before:MB",
 }
 KILLED_AT = 0.3  # of a block's iterations
 
@@ -69,14 +70,15 @@ def file_of(out: Path, stage: str, name: str) -> Path:
 def figures(name: str, out: Path) -> Row:
     """A row of the table."""
     metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
-    train = manifest(out, "train")
+    train, before = manifest(out, "train"), manifest(out, "blocks")
     row: Row = {key: metrics[key] for key in ("psnr", "psnr_cc", "ssim", "gaussians", "iterations")}
-    cpu = train["cpu_seconds"] + manifest(out, "blocks")["cpu_seconds"]
+    cpu = train["cpu_seconds"] + before["cpu_seconds"]
     return row | {
         "run": name,
         "blocks": train["summary"].get("blocks", 1),
         "cpu": cpu,
         "memory": train["peak_memory_bytes"],
+        "before": before["peak_memory_bytes"],
     }
 
 

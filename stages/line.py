@@ -137,7 +137,7 @@ INITIALIZE = Stage(
 )
 BLOCKS = Stage(
     "blocks",
-    version=7,
+    version=8,
     config=BlocksConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={"plan": "blocks.json", "coarse": "coarse", "prospects": "prospects"},

@@ -103,9 +103,19 @@ def alone(scene: Path, out: Path, shard: str, threads: int) -> subprocess.Popen[
 def test_a_cap_that_does_not_fit_stays_and_the_scene_is_cut(limit: int) -> None:
     found = divided(SITE, limit)
     assert found.blocks > 1 and found.cap == SITE.cap and found.memory_bytes <= limit
-    assert found.coarse_cap <= found.need.trained < found.cap
+    assert found.need.trained < found.cap
     fewer = need_of_blocks(found.blocks - 1, SITE.cap, found.window_pixels, SITE.sh_degree)
     assert fewer.memory_bytes > limit - (found.memory_bytes - found.need.memory_bytes)  # as few as there can be
+
+
+@pytest.mark.parametrize("limit", [1_000_000_000, 1_500_000_000, 2_000_000_000])
+def test_the_coarse_pass_has_the_whole_scene_or_what_the_limit_holds(limit: int) -> None:
+    found = divided(SITE, limit)
+    room = limit - (found.memory_bytes - found.need.memory_bytes)  # the libraries are in no need
+    assert found.need.trained < found.coarse_cap < found.cap  # more than a block trains: nothing lies frozen around it
+    taken = [need_of_blocks(1, found.coarse_cap + n, found.window_pixels, SITE.sh_degree).memory_bytes for n in (0, 2)]
+    assert taken[0] <= room < taken[1]
+    assert divided(SITE, 0, least=4).coarse_cap == divided(SITE, 8_000_000_000, least=4).coarse_cap == SITE.cap
 
 
 def test_what_fits_or_will_not_come_near_the_cap_is_one_whole() -> None:

@@ -1,4 +1,4 @@
-"""The coarse pass: the whole scene at its first size, in the memory of one block.
+"""The coarse pass: the whole scene at its first size, with its cap or what the limit of memory holds.
 
 It is what is drawn around blocks and outside of all of them, what they start from, and what they see their photos
 through: its sky and exposures are theirs, so that no two blocks differ in them.

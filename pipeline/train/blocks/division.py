@@ -60,7 +60,8 @@ class Division:
         limit_bytes: Of memory; 0 for none.
         window_pixels: That an iteration looks at, at most.
         need: What one of the blocks takes, without the libraries.
-        coarse_cap: On Gaussians of the pass over the whole that comes before blocks.
+        coarse_cap: On Gaussians of the pass over the whole that comes before blocks: of those of the whole as many as
+            the limit holds, for what it lacks no block makes up for.
         is_near: Whether a whole one may come near the limit: of too few photos for blocks, its training keeps to it.
     """
 
@@ -133,7 +134,7 @@ def _of(scene: SceneSize, blocks: int, cap: int, limit_bytes: int, window: int) 
         fitting = _most_gaussians(1, limit_bytes - LIBRARIES_BYTES, window, scene.sh_degree)
     cap = min(cap, fitting) if blocks == 1 else cap
     need = need_of_blocks(blocks, cap, window, scene.sh_degree)
-    return Division(blocks, cap, limit_bytes, window, need, min(need.trained, fitting))
+    return Division(blocks, cap, limit_bytes, window, need, min(cap, fitting))
 
 
 def _most_gaussians(blocks: int, room: int, window: int, sh_degree: int) -> int:

@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.limits import (
 )
 
 MARGIN_GROWTH = 1.44  # (1 + 2 × 0.1)²: a square cell with its margin, over the cell
-FROZEN_SHARE = 1.0  # of those that a block trains: a coarse model that fits one block's memory is drawn unthinned
+FROZEN_SHARE = 1.0  # of those that a block trains: what it sees of a coarse model that is larger is thinned
 FROZEN_COPIES = 2  # of a frozen Gaussian's parameters: density control copies them with the others
 FRAME_BYTES = 201  # of any Gaussian in a frame (`limits.py`)
 SPLAT_BYTES = 249  # of a Gaussian in a file
