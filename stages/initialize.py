@@ -1,4 +1,4 @@
-"""initialize: a Gaussian for each point of the sparse model and of a plane sweep, as big as its neighbours are far."""
+"""initialize: a Gaussian for each point of the sparse model and of photos' depths, as big as its neighbours are far."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ NEIGHBOURS = 3
 SMALLEST_PER_EXTENT = 1e-6  # size of a point on top of others, over the scene's size
 TINY = 1e-12  # a scene of one point at its camera has a size, too
 QUERY_CHUNK = 65_536
-MOST_DENSE = 50_000  # points of the sweep, an even cover; what is finer, density control adds where it pays
+MOST_DENSE = 50_000  # dense points, an even cover; what is finer, density control adds where it pays
 
 
 def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `init.ply`: isotropic Gaussians at the sparse points and, after them, at the sweep's, in the model's frame.
+    """Write `init.ply`: isotropic Gaussians at the sparse points, after them at dense ones, in the model's frame.
 
     With a boundary, all of those inside and a backdrop's worth of the others.
 
@@ -58,7 +58,7 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     area = read_model_area(inputs.parts.get("georef.boundary"))
     sparse, summary = int(chosen.size), {}
     if config.dense:
-        more = _sweep(views, inputs, area, out, report)
+        more = _dense(views, inputs, area, out, report)
         xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
     if area is not None:
         rows = coarse_start(inside := area.contains(xyz))
@@ -72,7 +72,7 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
 
 
-def _sweep(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter) -> DensePoints:
+def _dense(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter) -> DensePoints:
     """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
     cover = Cover(MOST_DENSE, None if area is None else area.contains)
     kept = set(load_split(inputs["split.views"]).train)

@@ -129,7 +129,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=3,
+    version=4,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views", "georef.boundary"),
     parts={"splat": "init.ply"},

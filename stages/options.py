@@ -34,7 +34,7 @@ class LineConfig(StageConfig):
     gone: ClassVar[Mapping[str, str]] = {
         **{old: f"It is called {new}." for old, new in renamed.items()},
         **{f"train.{name}": hint for name, hint in GONE_OF_TRAIN.items()},
-        "initialize.dense_points": "The sweep adds 50,000 points at most.",
+        "initialize.dense_points": "50,000 points are added at most.",
     }
 
     ingest: IngestConfig = IngestConfig()

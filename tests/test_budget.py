@@ -234,13 +234,13 @@ def test_every_photo_is_seen_often_enough_before_photos_grow() -> None:
 
 
 @pytest.mark.parametrize("seconds", [5.0, 15.0, 60.0])
-def test_points_of_the_sweep_take_nothing_from_photos_and_iterations(seconds: float) -> None:
+def test_dense_points_take_nothing_from_photos_and_iterations(seconds: float) -> None:
     """They are what a plan drops first, so it need not have room for them: only the forecast counts those that stay."""
-    bare, swept = choose(task_of(seconds)), choose(replace(task_of(seconds), swept=50_000))
-    assert swept.options.max_megapixels == bare.options.max_megapixels
-    assert swept.options.iterations >= 0.9 * bare.options.iterations
-    assert swept.options.max_gaussians >= 0.8 * bare.options.max_gaussians
-    assert swept.forecast_s <= SCHEDULE_SHARE * seconds
+    bare, dense = choose(task_of(seconds)), choose(replace(task_of(seconds), dense=50_000))
+    assert dense.options.max_megapixels == bare.options.max_megapixels
+    assert dense.options.iterations >= 0.9 * bare.options.iterations
+    assert dense.options.max_gaussians >= 0.8 * bare.options.max_gaussians
+    assert dense.forecast_s <= SCHEDULE_SHARE * seconds
 
 
 @pytest.fixture(scope="module")
@@ -388,7 +388,7 @@ def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused
     assert count < FEWEST_GAUSSIANS
 
 
-def test_memory_that_holds_the_sparse_points_takes_the_sweep_s_without_a_warning(
+def test_memory_that_holds_the_sparse_points_takes_dense_ones_without_a_warning(
     plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "resident_bytes", lambda: 0)

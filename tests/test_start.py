@@ -34,7 +34,7 @@ def rows_of(gaussians: Gaussians) -> list[int]:
     return (gaussians.means[:, 0].to(torch.int64) // 3).tolist()
 
 
-def test_points_of_the_sweep_fill_half_of_the_cap_evenly_and_the_sparse_ones_stay() -> None:
+def test_dense_points_fill_half_of_the_cap_evenly_and_the_sparse_ones_stay() -> None:
     start = numbered()
     assert start.within(2 * len(start.gaussians)) is start.gaussians
     half = rows_of(start.within(2 * SPARSE + 100))

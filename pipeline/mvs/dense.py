@@ -1,4 +1,4 @@
-"""More points where the sparse cloud is thin: depths by plane sweep, kept where other photos found the same."""
+"""More points where the sparse cloud is thin: depths by PatchMatch, kept where other photos found the same."""
 
 from __future__ import annotations
 
@@ -15,25 +15,28 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.likeness import Picture
 from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, load_tracks, neighbours
-from splatpipe.pipeline.mvs.sweep import Depths, sweep
+from splatpipe.pipeline.mvs.patch_match import Depths, find_depths
+from splatpipe.pipeline.mvs.picture import Picture
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.photos.small_views import small_view
+from splatpipe.pipeline.raster.threads import same_bits
 
-MEGAPIXELS = 0.1  # of a photo in the sweep; its planes see it at half the size
-SWEPT = 4  # neighbours a photo is compared with
+MEGAPIXELS = 0.05  # of a photo: depths good to half a hundredth, in half a CPU second
+COMPARED = 8  # neighbours a photo is compared with
 ASKED = 8  # neighbours whose depths have to agree
 AGREEING = 2  # so many at least
-TOLERANCE = 0.01  # of the depth, within which two photos agree
+TOLERANCE = 0.01  # of the depth, within which two photos agree;
+TOLERANCE_PX = 0.5  # far away as much of it as moves the point so far in the other's photo,
+LOOSEST = 0.2  # of the depth at most
 CELLS = 64  # of a photo's width; one with a sparse point in it gets no other
 GROWTH = 2.0 ** (1.0 / 3.0)  # of the voxels, until the points are few enough
 
 
 @dataclass(frozen=True)
 class DensePoints:
-    """Points found by the sweep.
+    """Points that depths of several photos agree on.
 
     Attributes:
         xyz: Positions, world units.
@@ -73,11 +76,11 @@ class _Capture:
     """What every photo's work needs to know.
 
     Attributes:
-        views: Photos to sweep, in name order.
-        cameras: Theirs, in the sweep's grid.
+        views: Photos to use, in name order.
+        cameras: Theirs, in the small photos' grid.
         tracks: Which saw which sparse point.
         near: Their neighbours.
-        folder: Where depths and colours are kept meanwhile: memory holds those of a few photos only.
+        folder: Where small photos and depths are kept meanwhile: memory holds those of a few only.
     """
 
     views: Sequence[View]
@@ -97,7 +100,7 @@ def dense_points(
         views: Photos to use, in name order; none that are held out.
         cover: How they are spread.
         folder: Where there is room for a megabyte a photo meanwhile.
-        threads: Photos at a time.
+        threads: Photos at a time where depths are compared, and the kernel's.
         report: Told of progress.
 
     Raises:
@@ -106,20 +109,18 @@ def dense_points(
     cameras = [reduced_camera(view.camera, MEGAPIXELS) for view in views]
     tracks = load_tracks(dataset, [camera.name for camera in cameras])
     near = neighbours(tracks, cameras, ASKED)
-    threads_before = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # photos are the unit of parallel work
-    try:
-        with tempfile.TemporaryDirectory(prefix="sweep-", dir=folder) as kept:
-            capture = _Capture(views, cameras, tracks, near, Path(kept))
-            numbers = range(len(views))
-            for done, _ in enumerate(ordered_map(partial(_keep_depths, capture), numbers, threads), start=1):
-                report.progress(done, len(views), "sweeping planes", "photos")
-            found = []
-            for done, points in enumerate(ordered_map(partial(_agreed, capture), numbers, threads), start=1):
-                found += [points] if points is not None else []
-                report.progress(done, len(views), "comparing depths", "photos")
-    finally:
-        cv2.setNumThreads(threads_before)
+    with tempfile.TemporaryDirectory(prefix="depths-", dir=folder) as kept, same_bits(threads):
+        capture = _Capture(views, cameras, tracks, near, Path(kept))
+        numbers = range(len(views))
+        for _ in ordered_map(partial(_keep_photo, capture), numbers, threads):
+            pass
+        for number in numbers:
+            _keep_depths(capture, number)
+            report.progress(number + 1, len(views), "finding depths", "photos")
+        found = []
+        for done, points in enumerate(ordered_map(partial(_agreed, capture), numbers, threads), start=1):
+            found += [points] if points is not None else []
+            report.progress(done, len(views), "comparing depths", "photos")
     every = _joined(found)
     if cover.inside is None:
         return thinned(every, tracks.xyz, cover.most)
@@ -134,38 +135,44 @@ def _joined(parts: Sequence[DensePoints]) -> DensePoints:
     return DensePoints(*(np.concatenate(column) for column in columns))
 
 
+def _keep_photo(capture: _Capture, number: int) -> None:
+    """Make one photo small and keep it: its neighbours ask for it, too."""
+    _, colour, mask = small_view(capture.views[number], MEGAPIXELS)
+    counts = np.ones(colour.shape[:2], np.bool_) if mask is None else mask
+    np.savez(capture.folder / f"photo-{number}.npz", colour=colour, counts=counts)
+
+
 def _keep_depths(capture: _Capture, number: int) -> None:
-    """Sweep one photo and keep what it found."""
+    """Look at one photo and keep what it found."""
     bounds = inverse_depths(capture.tracks, number, capture.cameras[number])
-    others = capture.near[number][:SWEPT]
+    others = capture.near[number][:COMPARED]
     if bounds is None or len(others) < AGREEING:
         return
-    photo, colour = _picture(capture.views[number])
-    found = sweep(photo, [_picture(capture.views[other])[0] for other in others], bounds)
-    np.savez(capture.folder / f"{number}.npz", inverse=found.inverse, score=found.score, colour=colour)
+    found = find_depths(_picture(capture, number), [_picture(capture, other) for other in others], bounds, number)
+    np.savez(capture.folder / f"depths-{number}.npz", inverse=found.inverse, cost=found.cost)
 
 
-def _picture(view: View) -> tuple[Picture, UInt8[np.ndarray, "h w 3"]]:
-    camera, colour, mask = small_view(view, MEGAPIXELS)
-    grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255.0)
-    counts = np.ones(grey.shape, np.bool_) if mask is None else mask
-    return Picture(camera, grey, counts), colour
+def _picture(capture: _Capture, number: int) -> Picture:
+    with np.load(capture.folder / f"photo-{number}.npz") as kept:
+        grey = np.asarray(cv2.cvtColor(kept["colour"], cv2.COLOR_RGB2GRAY), np.uint8)
+        return Picture(capture.cameras[number], grey, kept["counts"])
 
 
-def _kept(capture: _Capture, number: int) -> tuple[Depths, UInt8[np.ndarray, "h w 3"]] | None:
-    path = capture.folder / f"{number}.npz"
+def _kept(capture: _Capture, number: int) -> Depths | None:
+    path = capture.folder / f"depths-{number}.npz"
     if not path.is_file():
         return None
     with np.load(path) as kept:
-        return Depths(kept["inverse"], kept["score"]), kept["colour"]
+        return Depths(kept["inverse"], kept["cost"])
 
 
 def _agreed(capture: _Capture, number: int) -> DensePoints | None:
     """One point for each cell of a photo that has no sparse one: the surest of those that other photos confirm."""
-    kept = _kept(capture, number)
-    if kept is None:
+    depths = _kept(capture, number)
+    if depths is None:
         return None
-    depths, colour = kept
+    with np.load(capture.folder / f"photo-{number}.npz") as kept:
+        colour = kept["colour"]
     camera = capture.cameras[number]
     free = depths.inverse > 0.0
     rows, columns = np.nonzero(free)
@@ -175,7 +182,7 @@ def _agreed(capture: _Capture, number: int) -> DensePoints | None:
     for other in capture.near[number]:
         theirs = _kept(capture, other)
         if theirs is not None:
-            moved, agrees = _confirmed(points, capture.cameras[other], theirs[0].inverse)
+            moved, agrees = _confirmed(points, camera, capture.cameras[other], theirs.inverse)
             total[agrees] += moved[agrees]
             votes += agrees
     sure = np.flatnonzero(votes > AGREEING)
@@ -183,7 +190,7 @@ def _agreed(capture: _Capture, number: int) -> DensePoints | None:
     taken = camera.project(capture.tracks.xyz[capture.tracks.seen[number]])
     thin = ~np.isin(cell, _cells(camera, taken[:, 0], taken[:, 1]))
     sure, cell = sure[thin], cell[thin]
-    scores = votes[sure] + depths.score[rows[sure], columns[sure]]
+    scores = votes[sure] - depths.cost[rows[sure], columns[sure]]
     order = np.lexsort((sure, -scores, cell))
     first = order[np.unique(cell[order], return_index=True)[1]]
     chosen = sure[first]
@@ -193,15 +200,18 @@ def _agreed(capture: _Capture, number: int) -> DensePoints | None:
 
 
 def _confirmed(
-    points: Float64[np.ndarray, "n 3"], camera: Camera, inverse: Float32[np.ndarray, "h w"]
+    points: Float64[np.ndarray, "n 3"], photo: Camera, camera: Camera, inverse: Float32[np.ndarray, "h w"]
 ) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Points where a camera's own depths put them along its rays, and whether that is where they are."""
+    """Points of a photo where a camera's own depths put them along its rays, and whether that is where they are."""
     rows, pixels, depth = camera.in_view(points)
     x, y = pixels.T.astype(np.int64)
     ratio = np.zeros(len(points))  # of the point's depth over the one that the camera found
     ratio[rows] = depth * inverse[y, x]
-    agrees = np.abs(ratio - 1.0) < TOLERANCE
     centre = camera.centre()
+    parallax = camera.fx * float(np.linalg.norm(centre - photo.centre()))  # of something one unit deep, in pixels
+    tolerance = np.zeros(len(points))
+    tolerance[rows] = np.clip(TOLERANCE_PX * depth / max(parallax, 1e-9), TOLERANCE, LOOSEST)
+    agrees = np.abs(ratio - 1.0) < tolerance
     moved = centre + (points - centre) / np.where(agrees, ratio, 1.0)[:, None]
     return moved, agrees
 
@@ -215,6 +225,9 @@ def _cells(camera: Camera, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, 
 def thinned(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int) -> DensePoints:
     """The surest point of each voxel without a sparse one; voxels grow until few enough are left.
 
+    A voxel is about as large as its point's spacing, a power of two times the median's: as wide in the photos far away
+    as near by.
+
     Args:
         points: From all photos.
         sparse: Points that are there already, world units.
@@ -222,20 +235,26 @@ def thinned(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int) 
     """
     if len(points) == 0:
         return points
-    size = float(np.median(points.spacing))
+    middle = float(np.median(points.spacing))
+    sizes = middle * 2.0 ** np.round(np.log2(points.spacing / middle))
     ranked = np.argsort(-points.scores, kind="stable")
     while True:
-        rows = _one_each(points.xyz[ranked], sparse, size)
+        rows = _one_each(points.xyz[ranked], sizes[ranked], sparse)
         if rows.size <= most:
             return points.select(np.sort(ranked[rows]))
-        size *= GROWTH
+        sizes = sizes * GROWTH
 
 
 def _one_each(
-    points: Float64[np.ndarray, "n 3"], sparse: Float64[np.ndarray, "m 3"], size: float
+    points: Float64[np.ndarray, "n 3"], sizes: Float64[np.ndarray, " n"], sparse: Float64[np.ndarray, "m 3"]
 ) -> Int64[np.ndarray, " k"]:
-    """Rows of the first point in each voxel that has none of ``sparse`` in it."""
+    """Rows of the first point in each voxel that has none of ``sparse`` in it, nor any of a smaller voxel."""
     origin = points.min(axis=0)  # so that they share one voxel in the end
-    voxels = np.floor((np.concatenate([sparse, points]) - origin) / size)
-    _, first = np.unique(voxels, axis=0, return_index=True)
-    return np.asarray(np.sort(first[first >= len(sparse)]) - len(sparse), np.int64)
+    taken, kept = sparse, []
+    for size in np.unique(sizes):
+        rows = np.flatnonzero(sizes == size)
+        voxels = np.floor((np.concatenate([taken, points[rows]]) - origin) / size)
+        _, first = np.unique(voxels, axis=0, return_index=True)
+        kept.append(rows[np.sort(first[first >= len(taken)]) - len(taken)])
+        taken = np.concatenate([taken, points[kept[-1]]])
+    return np.asarray(np.sort(np.concatenate(kept)), np.int64)

@@ -19,7 +19,8 @@ LEAST_SHARED = 8  # points; two photos with fewer overlap by chance or by an edg
 LEAST_POINTS = 20  # a photo with fewer has no range of depths to trust
 PERCENTILES = (1.0, 99.0)  # of the depths: the few wrong points lie outside
 DEEPEST = 1000.0  # the far end over the near one at most, whatever the points say
-WIDER = 1.25  # the range of depths is taken that much wider at both ends: thin places have no points yet
+WIDER = 1.25  # times nearer than the nearest points: thin places have no points yet
+FARTHER = 10.0  # times farther than the farthest: of hills and trees behind, few points tell; a few planes more
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def _angle_weights(
 
 
 def inverse_depths(tracks: Tracks, view: int, camera: Camera) -> tuple[float, float] | None:
-    """The range of inverse depths to sweep, a little wider than that of the view's own points.
+    """The range of inverse depths to sweep: that of the view's own points, a little nearer and much farther.
 
     Returns:
         Smallest and largest, in 1 / world units, both above 0; None where the view has too few points.
@@ -104,4 +105,4 @@ def inverse_depths(tracks: Tracks, view: int, camera: Camera) -> tuple[float, fl
     if depths.size < LEAST_POINTS:
         return None
     near, far = (float(depth) for depth in np.percentile(depths, PERCENTILES))
-    return 1.0 / (far * WIDER), WIDER / max(near, far / DEEPEST)
+    return 1.0 / (far * FARTHER), WIDER / max(near, far / DEEPEST)

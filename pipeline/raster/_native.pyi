@@ -164,3 +164,28 @@ def lay_over(sky: tuple[Any, ...], colour: Tensor, out: Tensor) -> None:
 
 def lay_over_backward(sky: tuple[Any, ...], upstream: Tensor, by_alpha: Tensor, by_nodes: Tensor | None) -> None:
     """Gradients by the opacity and the nodes, from the one by the result."""
+
+def patch_match(
+    photo: tuple[np.ndarray, np.ndarray],
+    others: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
+    inverse_range: tuple[float, float],
+    iterations: int,
+    seed: int,
+    planes: np.ndarray,
+    costs: np.ndarray,
+) -> None:
+    """Depths of a photo by what others show there: a plane for each pixel, on the pool's threads.
+
+    Args:
+        photo: Grey values and a mask (not 0 where they count), uint8 (h, w) each.
+        others: The same of up to 16 photos, and how pixels get there: p at depth z is turn @ p + shift / z, float32.
+        inverse_range: Smallest and largest inverse depth, above 0.
+        iterations: At most 64; 0 fills in the costs of the planes given.
+        seed: Of the random planes.
+        planes: (3, h, w) float32: inverse depth at the pixel's centre, and its slopes across and down a pixel. Changed
+            in place; an inverse depth out of range asks for a random plane.
+        costs: (h, w) float32: from 0, alike, to 1, unlike; 2 where no photo tells.
+
+    Raises:
+        ValueError: if sizes do not fit, or the range is empty.
+    """

@@ -129,7 +129,7 @@ class Task:
     Attributes:
         config: The options; its ``max_gaussians`` is the most that may be planned.
         sparse: Gaussians of sparse points at the start, which every plan keeps where it can.
-        swept: Gaussians of the sweep, which only fill what room a cap leaves.
+        dense: Gaussians of dense points, which only fill what room a cap leaves.
         sizes: Width and height of the photos in the dataset, and how many have them.
         window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
         speed: Of this machine on this scene.
@@ -139,7 +139,7 @@ class Task:
 
     config: TrainConfig
     sparse: int
-    swept: int
+    dense: int
     sizes: tuple[tuple[int, int, int], ...]
     window_pixels: int
     speed: Speed
@@ -163,7 +163,7 @@ class Task:
 
     def takes(self, options: TrainConfig, megapixels: float) -> float:
         """Forecast of a training, its photos' decoding (once a size) included, seconds."""
-        initial, footage = started(self.sparse, self.swept, options.max_gaussians), self.footage(megapixels)
+        initial, footage = started(self.sparse, self.dense, options.max_gaussians), self.footage(megapixels)
         return self.prepare_s + AGEING * forecast(self.speed, resolve_schedule(options, footage), initial, footage)
 
 

@@ -30,7 +30,7 @@ def within_memory(plan: Plan, sparse: int, report: Reporter, on_cuda: bool = Fal
 
     Args:
         plan: Without it; ``max_memory_bytes`` of its options is the limit.
-        sparse: Gaussians of sparse points at the start; the sweep's go before they do, and nobody misses those.
+        sparse: Gaussians of sparse points at the start; dense ones go before they do, and nobody misses those.
         report: Is told where those of sparse points have to be thinned.
         on_cuda: The training's tensors are a CUDA device's.
 

@@ -75,7 +75,7 @@ def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Pla
     if plan.options.time_budget_s:
         plan = within_time(plan, scene, step, report)
     start = scene.start
-    return replace(plan, initial_gaussians=started(start.sparse, start.swept, plan.options.max_gaussians))
+    return replace(plan, initial_gaussians=started(start.sparse, start.dense, plan.options.max_gaussians))
 
 
 def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
@@ -139,7 +139,7 @@ def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
     return Task(
         config=options,
         sparse=scene.start.sparse,
-        swept=scene.start.swept,
+        dense=scene.start.dense,
         sizes=plan.sizes,
         window_pixels=plan.window_pixels,
         speed=measured.speed,

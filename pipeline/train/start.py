@@ -11,7 +11,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header
 from splatpipe.pipeline.splat.sparse_count import sparse_count
 
-START_SHARE = 0.5  # of the cap, that the start may fill with points of the sweep: the rest is for where detail is
+START_SHARE = 0.5  # of the cap, that the start may fill with dense points: the rest is for where detail is
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Start:
     """The initial Gaussians.
 
     Attributes:
-        gaussians: Those of the sparse points first, then the sweep's.
+        gaussians: Those of the sparse points first, then the dense ones.
         sparse: How many are of sparse points.
     """
 
@@ -27,22 +27,22 @@ class Start:
     sparse: int
 
     @property
-    def swept(self) -> int:
-        """How many are of the sweep."""
+    def dense(self) -> int:
+        """How many are dense points."""
         return len(self.gaussians) - self.sparse
 
     def within(self, cap: int) -> Gaussians:
-        """Those that training starts with: taken evenly from the sweep's, and from the sparse points' beyond the cap.
+        """Those that training starts with: taken evenly from the dense ones, and from the sparse ones beyond the cap.
 
         Args:
             cap: Most Gaussians of the training.
         """
-        count = started(self.sparse, self.swept, cap)
+        count = started(self.sparse, self.dense, cap)
         if count == len(self.gaussians):
             return self.gaussians
         sparse = min(self.sparse, count)
-        swept = count - sparse
-        rows = [_evenly(self.sparse, sparse), self.sparse + _evenly(self.swept, swept)]
+        dense = count - sparse
+        rows = [_evenly(self.sparse, sparse), self.sparse + _evenly(self.dense, dense)]
         return self.gaussians.select(torch.cat(rows))
 
 
@@ -50,16 +50,16 @@ def _evenly(rows: int, count: int) -> torch.Tensor:
     return torch.arange(count) * rows // max(count, 1)
 
 
-def started(sparse: int, swept: int, cap: int) -> int:
-    """How many Gaussians training starts with: the sweep's leave room to grow, and go before any sparse point does.
+def started(sparse: int, dense: int, cap: int) -> int:
+    """How many Gaussians training starts with: the dense ones leave room to grow, and go before any sparse point does.
 
     Args:
         sparse: Gaussians of sparse points.
-        swept: Gaussians of the sweep.
+        dense: Those of dense points.
         cap: Most Gaussians of the training.
     """
     room = max(0, int(START_SHARE * cap) - sparse)
-    return min(cap, sparse + min(swept, room))
+    return min(cap, sparse + min(dense, room))
 
 
 def read_start(path: Path) -> Start:

@@ -62,4 +62,5 @@ void test_gradients();
 void test_loss();
 void test_colour();
 void test_sky();
+void test_patch_match();
 void test_adam();

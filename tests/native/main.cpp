@@ -52,6 +52,7 @@ int main() {
     test_loss();
     test_colour();
     test_sky();
+    test_patch_match();
     test_adam();
     std::printf("%d passed, %d failed\n", passed, failed);
     return failed ? 1 : 0;

@@ -53,6 +53,16 @@ SPLAT_INLINE Floats gather(const float* p, int stride) {                        
     const __m512i lane = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
     return _mm512_i32gather_ps(_mm512_mullo_epi32(lane, _mm512_set1_epi32(stride)), p, 4);
 }
+// The four bytes of p[y * width + x], lowest first; x and y are whole numbers.
+SPLAT_INLINE void gather_bytes(const uint32_t* p, Floats x, Floats y, int width, Floats* out) {
+    const __m512i rows = _mm512_mullo_epi32(_mm512_cvttps_epi32(y), _mm512_set1_epi32(width));
+    const __m512i found = _mm512_i32gather_epi32(_mm512_add_epi32(rows, _mm512_cvttps_epi32(x)), p, 4);
+    const __m512i byte = _mm512_set1_epi32(255);
+    out[0] = _mm512_cvtepi32_ps(_mm512_and_si512(found, byte));
+    out[1] = _mm512_cvtepi32_ps(_mm512_and_si512(_mm512_srli_epi32(found, 8), byte));
+    out[2] = _mm512_cvtepi32_ps(_mm512_and_si512(_mm512_srli_epi32(found, 16), byte));
+    out[3] = _mm512_cvtepi32_ps(_mm512_srli_epi32(found, 24));
+}
 // Lanes for which value < p[lane].
 SPLAT_INLINE Mask below(int32_t value, const int32_t* p) {
     return _mm512_cmplt_epi32_mask(_mm512_set1_epi32(value), _mm512_loadu_si512(p));
@@ -165,6 +175,15 @@ SPLAT_INLINE Floats gather(const float* p, int stride) {
     const __m256i lane = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
     return _mm256_i32gather_ps(p, _mm256_mullo_epi32(lane, _mm256_set1_epi32(stride)), 4);
 }
+SPLAT_INLINE void gather_bytes(const uint32_t* p, Floats x, Floats y, int width, Floats* out) {
+    const __m256i rows = _mm256_mullo_epi32(_mm256_cvttps_epi32(y), _mm256_set1_epi32(width));
+    const __m256i at = _mm256_add_epi32(rows, _mm256_cvttps_epi32(x)), byte = _mm256_set1_epi32(255);
+    const __m256i found = _mm256_i32gather_epi32(reinterpret_cast<const int*>(p), at, 4);
+    out[0] = _mm256_cvtepi32_ps(_mm256_and_si256(found, byte));
+    out[1] = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32(found, 8), byte));
+    out[2] = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32(found, 16), byte));
+    out[3] = _mm256_cvtepi32_ps(_mm256_srli_epi32(found, 24));
+}
 // An 8 x 8 matrix: v[i][j] to v[j][i].
 SPLAT_INLINE void transpose(Floats* v) {
     Floats pair[8], quad[8];
@@ -230,6 +249,12 @@ SPLAT_INLINE Floats only(Mask m, Floats v) { return reinterpret_cast<Floats>(m &
 SPLAT_INLINE Floats min(Floats a, Floats b) { return select(a < b, a, b); }
 SPLAT_INLINE Floats max(Floats a, Floats b) { return select(a > b, a, b); }
 SPLAT_INLINE Floats gather(const float* p, int stride) { return Floats{p[0], p[stride], p[2 * stride], p[3 * stride]}; }
+SPLAT_INLINE void gather_bytes(const uint32_t* p, Floats x, Floats y, int width, Floats* out) {
+    for (int i = 0; i < kLanes; ++i) {
+        const uint32_t found = p[static_cast<int32_t>(y[i]) * static_cast<int64_t>(width) + static_cast<int32_t>(x[i])];
+        for (int k = 0; k < 4; ++k) out[k][i] = static_cast<float>((found >> (8 * k)) & 255U);
+    }
+}
 // A 4 x 4 matrix: v[i][j] to v[j][i].
 SPLAT_INLINE void transpose(Floats* v) {
     const Floats a = v[0], b = v[1], c = v[2], d = v[3];

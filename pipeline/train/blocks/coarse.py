@@ -93,5 +93,5 @@ def coarse_plan(plan: Plan, scene: Scene, limits: Limits) -> Plan:
         schedule=schedule,
         last_iteration=schedule.iterations,
         train_megapixels=round(1e-6 * plan.footage.pixels(Look(schedule.finest.level)), 4),
-        initial_gaussians=started(scene.start.sparse, scene.start.swept, limits.gaussians),
+        initial_gaussians=started(scene.start.sparse, scene.start.dense, limits.gaussians),
     )

@@ -1,0 +1,78 @@
+"""Depths of a photo by PatchMatch: a plane for every pixel, spread where it fits, from coarse to fine.
+
+At a quarter of the size planes begin at random, and those that fit spread (Barnes et al., "PatchMatch", SIGGRAPH 2009,
+for depths Bleyer et al., BMVC 2011, and Galliani et al., "Gipuma", ICCV 2015). Each finer size begins with the planes
+of the one before, which leaves it little to do. What one photo finds is a guess: only what others find, too, counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from splatpipe.pipeline.mvs.picture import Picture, relative
+from splatpipe.pipeline.raster import _native
+
+ITERATIONS = (6, 3, 1)  # from the coarsest size, each half as large as the next; beyond the last size one each
+LEAST_SIDE = 24  # pixels of a photo below which it is not halved again
+ALIKE = 0.5  # cost of the two photos most alike, up to which there is a depth
+FAR_END = 2.0  # times the smallest inverse depth; what is farther is at no distance: clouds
+
+
+@dataclass(frozen=True, eq=False)
+class Depths:
+    """What a photo's pixels are told.
+
+    Attributes:
+        inverse: Inverse depth along the camera's z, 1 / world units; 0 where none was found.
+        cost: One minus the correlation with the two photos most alike.
+    """
+
+    inverse: Float32[np.ndarray, "h w"]
+    cost: Float32[np.ndarray, "h w"]
+
+
+def find_depths(photo: Picture, others: Sequence[Picture], inverse_range: tuple[float, float], seed: int) -> Depths:
+    """Find the depths of a photo's pixels, on the kernels' threads.
+
+    Args:
+        photo: The photo.
+        others: Its neighbours; with fewer than two nothing is found.
+        inverse_range: Smallest and largest inverse depth.
+        seed: Of the random planes.
+    """
+    sizes = [(photo, list(others))]
+    while len(sizes) < len(ITERATIONS) and min(sizes[-1][0].grey.shape) >= 2 * LEAST_SIDE:
+        sizes.append((sizes[-1][0].halved(), [other.halved() for other in sizes[-1][1]]))
+    planes = np.zeros((3, *sizes[-1][0].grey.shape), np.float32)
+    costs = np.zeros(planes.shape[1:], np.float32)
+    for number, (small, near) in enumerate(reversed(sizes)):
+        planes = _spread(planes, small)
+        costs = np.zeros(planes.shape[1:], np.float32)
+        seen = [_seen_from(small, other) for other in near]
+        _native.patch_match(_bytes(small), seen, inverse_range, ITERATIONS[number], seed + number, planes, costs)
+    found = photo.textured() & (costs <= ALIKE) & (planes[0] > FAR_END * inverse_range[0])
+    return Depths(np.where(found, planes[0], np.float32(0.0)), costs)
+
+
+def _spread(planes: Float32[np.ndarray, "3 h w"], photo: Picture) -> Float32[np.ndarray, "3 h2 w2"]:
+    """Planes in the grid of a larger photo."""
+    height, width = photo.grey.shape
+    if planes.shape[1:] == (height, width):
+        return planes
+    larger = [cv2.resize(each, (width, height), interpolation=cv2.INTER_NEAREST) for each in planes]
+    slopes = (1.0, planes.shape[2] / width, planes.shape[1] / height)
+    return np.stack([each * np.float32(slope) for each, slope in zip(larger, slopes, strict=True)])
+
+
+def _bytes(photo: Picture) -> tuple[np.ndarray, np.ndarray]:
+    return np.ascontiguousarray(photo.grey), np.ascontiguousarray(photo.counts).view(np.uint8)
+
+
+def _seen_from(photo: Picture, other: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    turn, shift = (np.ascontiguousarray(each, np.float32) for each in relative(photo.camera, other.camera))
+    return (*_bytes(other), turn, shift)

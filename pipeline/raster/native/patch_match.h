@@ -1,0 +1,50 @@
+// Depths of a photo by PatchMatch: kernels for a row of pixels, compiled once per ISA, and the driver.
+//
+// Each pixel has a plane, linear in inverse depth over the photo's pixels: i(x, y) = i0 + across (x - x0) + down (y -
+// y0). A plane (across, down, c) carries the pixel p = (x, y, 1) to (turn + shift (across, down, c)) p in another
+// photo.
+#pragma once
+
+#include <cstdint>
+
+#include "isa.h"
+
+namespace splat {
+
+constexpr int kPatchMostViews = 16;
+constexpr float kPatchWorst = 2.0f;  // cost of what no photo can tell
+
+// A photo to compare with.
+struct PatchView {
+    int width, height;             // at least 4
+    const std::uint32_t* corners;  // (height, width): four grey values a pixel: its own, right, below, below right
+    const std::uint8_t* counts;    // (height, width)
+    float turn[9], shift[3];       // from pixels of the photo to its own, as above
+};
+
+struct PatchJob {
+    int width, height;
+    const std::uint8_t* grey;    // (height, width)
+    const std::uint8_t* counts;  // (height, width)
+    const PatchView* views;
+    int view_count;
+    float least, most;  // inverse depths
+    std::uint32_t seed;
+    float* planes;  // (3, height, width): inverse depth at the pixel's centre, across and down a pixel
+    float* costs;   // (height, width): 0 alike to 1 unlike; kPatchWorst where nothing can be told
+};
+
+struct PatchKernels {
+    // Costs of a row's planes; random ones where the inverse depth is not within the range.
+    void (*begin)(const PatchJob& job, int row);
+    // Every other pixel of a row, from `row + colour` on, takes its neighbours' planes, or its own a little changed,
+    // where they are better. Neighbours are of the other colour, so rows do not depend on each other.
+    void (*improve)(const PatchJob& job, int row, int colour, int iteration);
+};
+
+// Works off rows on the pool's threads; the same bits for any number of them.
+void patch_match(const PatchJob& job, int iterations);
+
+}  // namespace splat
+
+SPLAT_DECLARE_KERNELS(PatchKernels, patch_kernels)
