@@ -94,7 +94,7 @@ def _angle_weights(
 
 
 def inverse_depths(tracks: Tracks, view: int, camera: Camera) -> tuple[float, float] | None:
-    """The range of inverse depths to sweep: that of the view's own points, a little nearer and much farther.
+    """The range of inverse depths to look at: that of the view's own points, a little nearer and much farther.
 
     Returns:
         Smallest and largest, in 1 / world units, both above 0; None where the view has too few points.
