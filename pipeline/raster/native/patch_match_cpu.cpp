@@ -11,13 +11,13 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kSamples = 32;  // of a round window: 6 x 6, two pixels apart, without the corners
-constexpr int kLooked = 4;    // photos that a pixel's planes are tried in: those most alike before
-constexpr int kBest = 2;      // photos that count
-constexpr float kUnlike = 1.2f;
+constexpr int kSamples = 32;                 // of a round window: 6 x 6, two pixels apart, without the corners
+constexpr int kLooked = 4;                   // photos that a pixel's planes are tried in: those most alike before
+constexpr int kBest = 2;                     // photos that count
+constexpr float kUnlike = 1.2f;              // cost above which a photo tells no more: it shows something else
 constexpr float kNoise2 = 1.5f * 1.5f;       // of grey values: contrast below it is not taken for likeness
 constexpr float kPerGrey = 0.047f;           // of a weight's logarithm to base two
-constexpr float kPerPixel = 0.14f;           // the same, by distance
+constexpr float kPerPixel2 = 0.028f;         // the same, by squared distance
 constexpr float kNearest = 1e-6f;            // homogeneous: what is nearer is behind
 constexpr float kDepthShare = 0.25f;         // of the inverse depth, that it is changed by at first
 constexpr float kSlopeShare = 2.0f;          // of the inverse depth over the photo's width, the same of a slope
@@ -77,7 +77,7 @@ void open_window(const PatchJob& job, int column, int row, Window* window) {
         values[k] = counts ? job.grey[at] : middle;
         const float unlike = values[k] > middle ? values[k] - middle : middle - values[k];
         const float away = kRight[k] * kRight[k] + kDown[k] * kDown[k];
-        logs[k] = counts ? -kPerGrey * unlike - kPerPixel * 0.2f * away : -120.0f;
+        logs[k] = counts ? -kPerGrey * unlike - kPerPixel2 * away : -120.0f;
     }
     Floats sum = fill(0.0f), mean = fill(0.0f), spread = fill(0.0f), unused = fill(0.0f);
     for (int k = 0; k < kSamples; k += kLanes) {
