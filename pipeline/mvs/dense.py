@@ -23,7 +23,7 @@ from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.raster.threads import same_bits
 
-MEGAPIXELS = 0.05  # of a photo: depths good to half a hundredth, in half a CPU second
+MEGAPIXELS = 0.05  # of a photo: most depths good to half a hundredth
 COMPARED = 8  # neighbours a photo is compared with
 ASKED = 8  # neighbours whose depths have to agree
 AGREEING = 2  # so many at least

@@ -18,5 +18,5 @@ class InitializeConfig(StageConfig):
     max_angle: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
     """Cap on a Gaussian's size for outliers, as a share of its distance to the nearest camera."""
     dense: bool = True
-    """Add points where the sparse ones are thin, by PatchMatch between neighbouring photos: half a CPU second a
+    """Add points where the sparse ones are thin, by PatchMatch between neighbouring photos: 0.6 CPU seconds a
     photo. At most 50,000; with the sparse ones they fill half of the training's cap at most, so that it can grow."""
