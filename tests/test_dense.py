@@ -11,7 +11,8 @@ import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.dense import Cover, DensePoints, _confirmed, dense_points, thinned
+from splatpipe.pipeline.mvs.dense import WIDER, Cover, DensePoints, dense_points, thinned
+from splatpipe.pipeline.mvs.depth_search import confirmed
 from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, neighbours
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.mvs.patch_match import find_depths
@@ -243,9 +244,9 @@ def test_neighbours_prefer_ten_degrees_and_skip_views_that_share_nothing() -> No
     near = neighbours(tracks, cameras, 8)
     assert near[0] == [2, 1, 3]
     assert near[4] == []
-    smallest, largest = inverse_depths(tracks, 0, cameras[0]) or (0.0, 0.0)
+    smallest, largest = inverse_depths(tracks, 0, cameras[0], WIDER) or (0.0, 0.0)
     assert 0.005 < smallest < 0.02 and 0.1 < largest < 0.2
-    assert inverse_depths(tracks, 4, cameras[4]) is None
+    assert inverse_depths(tracks, 4, cameras[4], WIDER) is None
 
 
 def test_the_surest_point_of_a_voxel_without_a_sparse_one_stays() -> None:
@@ -271,7 +272,7 @@ def test_photos_agree_within_half_a_pixel_far_away(depth: float, agrees: bool) -
     camera.cam_from_world[0, 3] = -1.0
     points = np.array([[0.5, 0.0, depth]])
     inverse = np.full((48, 64), 1.03 / depth, np.float32)
-    moved, found = _confirmed(points, photo, camera, inverse)
+    moved, found = confirmed(points, photo, camera, inverse)
     assert found.tolist() == [agrees]
     if agrees:
         np.testing.assert_allclose(moved, camera.centre() + (points - camera.centre()) / 1.03, rtol=1e-6)

@@ -19,7 +19,6 @@ LEAST_SHARED = 8  # points; two photos with fewer overlap by chance or by an edg
 LEAST_POINTS = 20  # a photo with fewer has no range of depths to trust
 PERCENTILES = (1.0, 99.0)  # of the depths: the few wrong points lie outside
 DEEPEST = 1000.0  # the far end over the near one at most, whatever the points say
-WIDER = 1.25  # times nearer than the nearest points: thin places have no points yet
 FARTHER = 10.0  # times farther than the farthest: of hills and trees behind, few points tell; a few planes more
 
 
@@ -93,8 +92,14 @@ def _angle_weights(
     return np.asarray(np.exp(-0.5 * np.square((angle - BEST_ANGLE_DEG) / spread)))
 
 
-def inverse_depths(tracks: Tracks, view: int, camera: Camera) -> tuple[float, float] | None:
+def inverse_depths(tracks: Tracks, view: int, camera: Camera, wider: float) -> tuple[float, float] | None:
     """The range of inverse depths to look at: that of the view's own points, a little nearer and much farther.
+
+    Args:
+        tracks: Of all views.
+        view: Its number.
+        camera: Its own.
+        wider: Times nearer than the nearest points.
 
     Returns:
         Smallest and largest, in 1 / world units, both above 0; None where the view has too few points.
@@ -105,4 +110,4 @@ def inverse_depths(tracks: Tracks, view: int, camera: Camera) -> tuple[float, fl
     if depths.size < LEAST_POINTS:
         return None
     near, far = (float(depth) for depth in np.percentile(depths, PERCENTILES))
-    return 1.0 / (far * FARTHER), WIDER / max(near, far / DEEPEST)
+    return 1.0 / (far * FARTHER), wider / max(near, far / DEEPEST)

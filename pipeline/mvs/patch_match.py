@@ -36,7 +36,9 @@ class Depths:
     cost: Float32[np.ndarray, "h w"]
 
 
-def find_depths(photo: Picture, others: Sequence[Picture], inverse_range: tuple[float, float], seed: int) -> Depths:
+def find_depths(
+    photo: Picture, others: Sequence[Picture], inverse_range: tuple[float, float], seed: int, plain: bool = False
+) -> Depths:
     """Find the depths of a photo's pixels, on the kernels' threads.
 
     Args:
@@ -44,6 +46,7 @@ def find_depths(photo: Picture, others: Sequence[Picture], inverse_range: tuple[
         others: Its neighbours; with fewer than two nothing is found.
         inverse_range: Smallest and largest inverse depth.
         seed: Of the random planes.
+        plain: Whether pixels have depths, too, that have nothing to compare at hand.
     """
     sizes = [(photo, list(others))]
     while len(sizes) < len(ITERATIONS) and min(sizes[-1][0].grey.shape) >= 2 * LEAST_SIDE:
@@ -55,7 +58,8 @@ def find_depths(photo: Picture, others: Sequence[Picture], inverse_range: tuple[
         costs = np.zeros(planes.shape[1:], np.float32)
         seen = [_seen_from(small, other) for other in near]
         _native.patch_match(_bytes(small), seen, inverse_range, ITERATIONS[number], seed + number, planes, costs)
-    found = photo.textured() & (costs <= ALIKE) & (planes[0] > FAR_END * inverse_range[0])
+    usable = photo.whole() if plain else photo.textured()
+    found = usable & (costs <= ALIKE) & (planes[0] > FAR_END * inverse_range[0])
     return Depths(np.where(found, planes[0], np.float32(0.0)), costs)
 
 

@@ -41,9 +41,13 @@ class Picture:
         """Where there is something to compare, at hand, and nothing masked in the window."""
         grey = self.grey.astype(np.float32)
         wide, narrow = (_variance(grey, side) for side in (WINDOW, AT_HAND))
+        return np.asarray((wide > TEXTURE**2) & (narrow > NOISE**2) & self.whole())
+
+    def whole(self) -> Bool[np.ndarray, "h w"]:
+        """Where nothing is masked in the window, nor beyond the photo's border."""
         kernel = np.ones((WINDOW, WINDOW), np.uint8)
         whole = cv2.erode(self.counts.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-        return np.asarray((wide > TEXTURE**2) & (narrow > NOISE**2) & (whole > 0))
+        return np.asarray(whole > 0)
 
 
 def relative(camera: Camera, other: Camera) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:

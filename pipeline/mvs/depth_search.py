@@ -1,0 +1,199 @@
+"""Depths of all photos of a capture, found one by one, and where other photos found the same.
+
+Photos and depths lie in a folder meanwhile, so that memory holds those of a photo and its neighbours only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, load_tracks, neighbours
+from splatpipe.pipeline.mvs.patch_match import Depths, find_depths
+from splatpipe.pipeline.mvs.picture import Picture
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.photos.small_views import small_view
+from splatpipe.pipeline.raster.threads import same_bits
+
+COMPARED = 8  # neighbours a photo is compared with, and whose depths are asked
+AGREEING = 2  # so many have to agree at least
+TOLERANCE = 0.01  # of the depth, within which two photos agree;
+TOLERANCE_PX = 0.5  # far away as much of it as moves the point so far in the other's photo,
+LOOSEST = 0.2  # of the depth at most
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What other photos say of a photo's depths; a row for each pixel with one.
+
+    Attributes:
+        rows: Of the pixels.
+        columns: Of the pixels.
+        inverse: Inverse depths along the camera's z, 1 / world units.
+        xyz: Mean of the places that the photo and those which agree have found, world units.
+        votes: How many other photos agree.
+        cost: One minus the correlation with the two photos most alike.
+    """
+
+    rows: Int64[np.ndarray, " n"]
+    columns: Int64[np.ndarray, " n"]
+    inverse: Float64[np.ndarray, " n"]
+    xyz: Float64[np.ndarray, "n 3"]
+    votes: Int64[np.ndarray, " n"]
+    cost: Float32[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class DepthSearch:
+    """Photos of one size, who is compared with whom, and where what is found lies.
+
+    Attributes:
+        views: Photos to use, in name order.
+        cameras: Theirs, in the grid that depths are found in.
+        tracks: Which saw which sparse point.
+        near: Neighbours of each, the best first.
+        folder: Where photos and depths are kept.
+        megapixels: Of that grid at most.
+        wider: Times nearer than its sparse points that a photo is searched.
+        plain: Whether pixels without texture at hand have depths, too: others have to confirm them.
+    """
+
+    views: Sequence[View]
+    cameras: Sequence[Camera]
+    tracks: Tracks
+    near: Sequence[Sequence[int]]
+    folder: Path
+    megapixels: float
+    wider: float
+    plain: bool
+
+    @classmethod
+    def begin(
+        cls, dataset: Path, views: Sequence[View], folder: Path, megapixels: float, wider: float, plain: bool
+    ) -> DepthSearch:
+        """A search that has found nothing yet.
+
+        Args:
+            dataset: The folder that `undistort` left.
+            views: Photos to use, in name order.
+            folder: Where there is room meanwhile: 9 bytes a pixel.
+            megapixels: Of a photo at most.
+            wider: As above.
+            plain: As above.
+
+        Raises:
+            StageError: if the model cannot be read.
+        """
+        cameras = [reduced_camera(view.camera, megapixels) for view in views]
+        tracks = load_tracks(dataset, [camera.name for camera in cameras])
+        return cls(views, cameras, tracks, neighbours(tracks, cameras, COMPARED), folder, megapixels, wider, plain)
+
+    def run(self, threads: int, report: Reporter) -> None:
+        """Find the depths of every photo; the same for any number of threads.
+
+        Args:
+            threads: Photos at a time where they are decoded, and the kernel's.
+            report: Told of progress.
+
+        Raises:
+            StageError: if a photo cannot be read.
+        """
+        numbers = range(len(self.views))
+        with same_bits(threads):
+            for _ in ordered_map(partial(DepthSearch._keep_photo, self), numbers, threads):
+                pass
+            for number in numbers:
+                self._keep_depths(number)
+                report.progress(number + 1, len(self.views), "finding depths", "photos")
+
+    def colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
+        """A photo's colours, RGB."""
+        with np.load(self._photo_path(number)) as kept:
+            return np.asarray(kept["colour"], np.uint8)
+
+    def depths(self, number: int) -> Depths | None:
+        """What was found in a photo; None for one that has too few neighbours or points."""
+        path = self._depths_path(number)
+        if not path.is_file():
+            return None
+        with np.load(path) as kept:
+            return Depths(kept["inverse"], kept["cost"])
+
+    def agreement(self, number: int) -> Agreement | None:
+        """What a photo's neighbours say of its depths; None where it has none."""
+        depths = self.depths(number)
+        if depths is None:
+            return None
+        camera = self.cameras[number]
+        rows, columns = np.nonzero(depths.inverse > 0.0)
+        inverse = depths.inverse[rows, columns].astype(np.float64)
+        points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), 1.0 / inverse)
+        total, votes = points.copy(), np.zeros(len(points), np.int64)
+        for other in self.near[number]:
+            theirs = self.depths(other)
+            if theirs is not None:
+                moved, agrees = confirmed(points, camera, self.cameras[other], theirs.inverse)
+                total[agrees] += moved[agrees]
+                votes += agrees
+        return Agreement(rows, columns, inverse, total / (1 + votes)[:, None], votes, depths.cost[rows, columns])
+
+    def _photo_path(self, number: int) -> Path:
+        return self.folder / f"photo-{number}.npz"
+
+    def _depths_path(self, number: int) -> Path:
+        return self.folder / f"depths-{number}.npz"
+
+    def _keep_photo(self, number: int) -> None:
+        """Make one photo small and keep it: its neighbours ask for it, too."""
+        _, colour, mask = small_view(self.views[number], self.megapixels)
+        counts = np.ones(colour.shape[:2], np.bool_) if mask is None else mask
+        np.savez(self._photo_path(number), colour=colour, counts=counts)
+
+    def _keep_depths(self, number: int) -> None:
+        """Look at one photo and keep what it found."""
+        bounds = inverse_depths(self.tracks, number, self.cameras[number], self.wider)
+        others = self.near[number]
+        if bounds is None or len(others) < AGREEING:
+            return
+        pictures = [self._picture(other) for other in others]
+        found = find_depths(self._picture(number), pictures, bounds, number, self.plain)
+        np.savez(self._depths_path(number), inverse=found.inverse, cost=found.cost)
+
+    def _picture(self, number: int) -> Picture:
+        with np.load(self._photo_path(number)) as kept:
+            grey = np.asarray(cv2.cvtColor(kept["colour"], cv2.COLOR_RGB2GRAY), np.uint8)
+            return Picture(self.cameras[number], grey, kept["counts"])
+
+
+def confirmed(
+    points: Float64[np.ndarray, "n 3"], photo: Camera, camera: Camera, inverse: Float32[np.ndarray, "h w"]
+) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Points of a photo where a camera's own depths put them along its rays, and whether that is where they are.
+
+    Args:
+        points: World units.
+        photo: The camera that found them.
+        camera: The one that is asked.
+        inverse: Its inverse depths, 0 where it has none.
+    """
+    rows, pixels, depth = camera.in_view(points)
+    x, y = pixels.T.astype(np.int64)
+    ratio = np.zeros(len(points))  # of the point's depth over the one that the camera found
+    ratio[rows] = depth * inverse[y, x]
+    centre = camera.centre()
+    parallax = camera.fx * float(np.linalg.norm(centre - photo.centre()))  # of something one unit deep, in pixels
+    tolerance = np.zeros(len(points))
+    tolerance[rows] = np.clip(TOLERANCE_PX * depth / max(parallax, 1e-9), TOLERANCE, LOOSEST)
+    agrees = np.abs(ratio - 1.0) < tolerance
+    moved = centre + (points - centre) / np.where(agrees, ratio, 1.0)[:, None]
+    return moved, agrees
