@@ -44,7 +44,7 @@ def everywhere() -> np.ndarray:
 
 def matched(job: Job, iterations: int = 8, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     planes, costs = np.zeros((3, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
-    _native.patch_match(*job, RANGE, iterations, seed, planes, costs)
+    _native.patch_match(*job, RANGE, iterations, 0, seed, planes, costs)
     return planes, costs
 
 
@@ -97,12 +97,22 @@ def test_given_planes_are_judged_as_they_are() -> None:
     planes, costs = np.zeros((3, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
     planes[0], planes[1], planes[2] = true_inverse(), WALL[0], WALL[1]
     before = planes.copy()
-    _native.patch_match(*wall(), RANGE, 0, 0, planes, costs)
+    _native.patch_match(*wall(), RANGE, 0, 0, 0, planes, costs)
     np.testing.assert_array_equal(planes, before)
     assert np.median(costs) < 0.05
     planes[1] = np.nan
-    _native.patch_match(*wall(), RANGE, 2, 0, planes, costs)
+    _native.patch_match(*wall(), RANGE, 2, 0, 0, planes, costs)
     assert np.isfinite(planes).all()
+
+
+def test_smaller_changes_mend_planes_that_are_nearly_right() -> None:
+    errors = []
+    for begun in (0, 5):
+        planes, costs = np.zeros((3, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
+        planes[0], planes[1], planes[2] = 1.005 * true_inverse(), WALL[0], WALL[1]
+        _native.patch_match(*wall(), RANGE, 1, begun, 0, planes, costs)
+        errors.append(np.median(np.abs(planes[0] / true_inverse() - 1.0)))
+    assert errors[1] < 0.8 * errors[0] < 0.004, errors
 
 
 def test_one_other_photo_is_not_enough_to_be_alike() -> None:
@@ -113,8 +123,11 @@ def test_what_does_not_fit_is_refused() -> None:
     (grey, counts), others = wall()
     planes, costs = np.zeros((3, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
 
+    given = {"photo": (grey, counts), "others": others, "inverse_range": RANGE}
+    given |= {"iterations": 1, "begun": 0, "seed": 0}
+    _native.patch_match(**given, planes=planes, costs=costs)
+
     def refused(**changed: object) -> None:
-        given = {"photo": (grey, counts), "others": others, "inverse_range": RANGE, "iterations": 1, "seed": 0}
         with pytest.raises((ValueError, TypeError)):
             _native.patch_match(**{**given, "planes": planes, "costs": costs, **changed})
 
@@ -127,5 +140,7 @@ def test_what_does_not_fit_is_refused() -> None:
     refused(costs=costs.astype(np.float64))
     refused(planes=planes[:, :, ::-1])
     refused(iterations=65)
+    refused(begun=65)
+    refused(begun=-1)
     for bounds in ((0.0, 1.0), (0.5, 0.1), (0.1, np.inf), (np.nan, 1.0)):
         refused(inverse_range=bounds)

@@ -18,6 +18,7 @@ from splatpipe.pipeline.mvs.picture import Picture, relative
 from splatpipe.pipeline.raster import _native
 
 ITERATIONS = (6, 3, 1)  # from the coarsest size, each half as large as the next; beyond the last size one each
+BEGUN = (0, 1, 4)  # how often planes were changed less before: a larger photo's are nearly right
 LEAST_SIDE = 24  # pixels of a photo below which it is not halved again
 ALIKE = 0.5  # cost of the two photos most alike, up to which there is a depth
 FAR_END = 2.0  # times the smallest inverse depth; what is farther is at no distance: clouds
@@ -57,7 +58,9 @@ def find_depths(
         planes = _spread(planes, small)
         costs = np.zeros(planes.shape[1:], np.float32)
         seen = [_seen_from(small, other) for other in near]
-        _native.patch_match(_bytes(small), seen, inverse_range, ITERATIONS[number], seed + number, planes, costs)
+        _native.patch_match(
+            _bytes(small), seen, inverse_range, ITERATIONS[number], BEGUN[number], seed + number, planes, costs
+        )
     usable = photo.whole() if plain else photo.textured()
     found = usable & (costs <= ALIKE) & (planes[0] > FAR_END * inverse_range[0])
     return Depths(np.where(found, planes[0], np.float32(0.0)), costs)

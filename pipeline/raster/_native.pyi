@@ -170,6 +170,7 @@ def patch_match(
     others: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
     inverse_range: tuple[float, float],
     iterations: int,
+    begun: int,
     seed: int,
     planes: np.ndarray,
     costs: np.ndarray,
@@ -181,6 +182,7 @@ def patch_match(
         others: The same of up to 16 photos, and how pixels get there: p at depth z is turn @ p + shift / z, float32.
         inverse_range: Smallest and largest inverse depth, above 0.
         iterations: At most 64; 0 fills in the costs of the planes given.
+        begun: How many times random changes were halved before, at most 64: more where planes are nearly right.
         seed: Of the random planes.
         planes: (3, h, w) float32: inverse depth at the pixel's centre, and its slopes across and down a pixel. Changed
             in place; an inverse depth out of range asks for a random plane.

@@ -61,13 +61,14 @@ std::vector<std::uint32_t> corners_of(const Bytes& grey) {
 }
 
 void patch_match(const Picture& photo, const std::vector<Other>& others, std::tuple<float, float> range, int iterations,
-                 std::uint32_t seed, const Planes& planes, const Costs& costs) {
+                 int begun, std::uint32_t seed, const Planes& planes, const Costs& costs) {
     const auto& [grey, counts] = photo;
     const auto [least, most] = range;
     check(grey, counts);
     require(!others.empty() && others.size() <= splat::kPatchMostViews, "no other photo, or too many");
     require(std::isfinite(most) && least > 0.0f && most >= least, "the range of inverse depths is empty");
     require(iterations >= 0 && iterations <= 64, "too many iterations");
+    require(begun >= 0 && begun <= 64, "begun too far on");
     require(planes.shape(1) == grey.shape(0) && planes.shape(2) == grey.shape(1) && same_size(costs, grey),
             "planes, costs and the photo differ in size");
     std::vector<std::vector<std::uint32_t>> corners;
@@ -86,7 +87,7 @@ void patch_match(const Picture& photo, const std::vector<Other>& others, std::tu
     job.width = static_cast<int>(grey.shape(1)), job.height = static_cast<int>(grey.shape(0));
     job.grey = grey.data(), job.counts = counts.data();
     job.views = views.data(), job.view_count = static_cast<int>(views.size());
-    job.least = least, job.most = most, job.seed = seed;
+    job.least = least, job.most = most, job.seed = seed, job.begun = begun;
     job.planes = planes.data(), job.costs = costs.data();
     const nb::gil_scoped_release released;
     splat::patch_match(job, iterations);
@@ -95,6 +96,6 @@ void patch_match(const Picture& photo, const std::vector<Other>& others, std::tu
 }  // namespace
 
 void bind_patch_match(nb::module_& m) {
-    m.def("patch_match", &patch_match, "photo"_a, "others"_a, "inverse_range"_a, "iterations"_a, "seed"_a,
+    m.def("patch_match", &patch_match, "photo"_a, "others"_a, "inverse_range"_a, "iterations"_a, "begun"_a, "seed"_a,
           "planes"_a.noconvert(), "costs"_a.noconvert());
 }

@@ -30,8 +30,10 @@ struct PatchJob {
     int view_count;
     float least, most;  // inverse depths
     std::uint32_t seed;
-    float* planes;  // (3, height, width): inverse depth at the pixel's centre, across and down a pixel
-    float* costs;   // (height, width): 0 alike to 1 unlike; kPatchWorst where nothing can be told
+    int begun;              // how many times planes were changed less than at first
+    float* planes;          // (3, height, width): inverse depth at the pixel's centre, across and down a pixel
+    float* costs;           // (height, width): 0 alike to 1 unlike; kPatchWorst where nothing can be told
+    std::uint32_t* chosen;  // (height, width): the photos that a pixel is compared with at first; filled by `begin`
 };
 
 struct PatchKernels {
@@ -43,7 +45,8 @@ struct PatchKernels {
 };
 
 // Works off rows on the pool's threads; the same bits for any number of them.
-void patch_match(const PatchJob& job, int iterations);
+// `job.chosen` is its own.
+void patch_match(PatchJob job, int iterations);
 
 }  // namespace splat
 

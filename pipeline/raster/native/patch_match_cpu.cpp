@@ -14,6 +14,7 @@ namespace {
 constexpr int kSamples = 32;                 // of a round window: 6 x 6, two pixels apart, without the corners
 constexpr int kLooked = 4;                   // photos that a pixel's planes are tried in: those most alike before
 constexpr int kBest = 2;                     // photos that count
+constexpr int kNoView = 255;                 // in the place of a photo's number
 constexpr float kUnlike = 1.2f;              // cost above which a photo tells no more: it shows something else
 constexpr float kNoise2 = 1.5f * 1.5f;       // of grey values: contrast below it is not taken for likeness
 constexpr float kPerGrey = 0.047f;           // of a weight's logarithm to base two
@@ -139,20 +140,17 @@ float view_cost(const PatchView& view, const Window& window, const Plane& plane)
     return 1.0f - sums[2] / __builtin_sqrtf(product);
 }
 
-// The photos that a pixel is compared with, those that show its plane most alike.
-struct Chosen {
-    int views[kLooked];
-    int count;
-};
+// The photos that a pixel is compared with, those that show its plane most alike, as bytes of a number: 255 is none.
+SPLAT_INLINE int chosen_view(uint32_t chosen, int k) { return static_cast<int>(chosen >> (8 * k) & 255U); }
 
-// Of the photos most alike; with `chosen`, those alone.
-float plane_cost(const PatchJob& job, const Window& window, const Plane& plane, const Chosen* chosen) {
+float plane_cost(const PatchJob& job, const Window& window, const Plane& plane, uint32_t chosen) {
     if (!(plane.inverse >= job.least && plane.inverse <= job.most)) return kPatchWorst;
     float best[kBest + 1];
     for (float& each : best) each = kUnlike;
-    const int count = chosen ? chosen->count : job.view_count;
-    for (int k = 0; k < count; ++k) {
-        const float cost = view_cost(job.views[chosen ? chosen->views[k] : k], window, plane);
+    for (int k = 0; k < kLooked; ++k) {
+        const int view = chosen_view(chosen, k);
+        if (view == kNoView) break;
+        const float cost = view_cost(job.views[view], window, plane);
         int place = kBest;
         for (; place > 0 && best[place - 1] > cost; --place) best[place] = best[place - 1];
         best[place] = cost;
@@ -162,18 +160,24 @@ float plane_cost(const PatchJob& job, const Window& window, const Plane& plane, 
     return sum * (1.0f / kBest);
 }
 
-Chosen choose(const PatchJob& job, const Window& window, const Plane& plane) {
-    Chosen chosen{};
+// The photos to compare with; what the plane costs in them is `plane_cost`'s, without looking twice.
+uint32_t choose(const PatchJob& job, const Window& window, const Plane& plane, float* cost) {
     float costs[kLooked + 1];
+    int views[kLooked + 1], count = 0;
     for (int k = 0; k < job.view_count; ++k) {
-        const float cost = view_cost(job.views[k], window, plane);
-        int place = least_of(chosen.count, kLooked - 1);
-        if (chosen.count == kLooked && costs[place] <= cost) continue;
-        for (; place > 0 && costs[place - 1] > cost; --place)
-            costs[place] = costs[place - 1], chosen.views[place] = chosen.views[place - 1];
-        costs[place] = cost, chosen.views[place] = k;
-        chosen.count = least_of(chosen.count + 1, kLooked);
+        const float found = view_cost(job.views[k], window, plane);
+        int place = least_of(count, kLooked - 1);
+        if (count == kLooked && costs[place] <= found) continue;
+        for (; place > 0 && costs[place - 1] > found; --place)
+            costs[place] = costs[place - 1], views[place] = views[place - 1];
+        costs[place] = found, views[place] = k;
+        count = least_of(count + 1, kLooked);
     }
+    float sum = 0.0f;
+    for (int k = 0; k < kBest; ++k) sum += k < count && costs[k] < kUnlike ? costs[k] : kUnlike;
+    *cost = sum * (1.0f / kBest);
+    uint32_t chosen = 0;
+    for (int k = 0; k < kLooked; ++k) chosen |= static_cast<uint32_t>(k < count ? views[k] : kNoView) << (8 * k);
     return chosen;
 }
 
@@ -181,12 +185,12 @@ Chosen choose(const PatchJob& job, const Window& window, const Plane& plane) {
 struct Pixel {
     const PatchJob& job;
     const Window& window;
-    Chosen chosen;
+    uint32_t chosen;  // the photos that planes are tried in
     Plane plane;
     float cost;
 
     SPLAT_METHOD void attempt(const Plane& other) {
-        const float found = plane_cost(job, window, other, &chosen);
+        const float found = plane_cost(job, window, other, chosen);
         if (found < cost) cost = found, plane = other;
     }
     // The plane that another pixel has, here; -1: none.
@@ -225,7 +229,7 @@ void take_from_neighbours(const PatchJob& job, int column, int row, Pixel* pixel
 
 void change_a_little(const PatchJob& job, int iteration, Draws* draws, Pixel* pixel) {
     float range = kDepthShare, slope = kSlopeShare / static_cast<float>(job.width);
-    for (int k = 0; k < iteration; ++k) range *= kFainter, slope *= kFainter;
+    for (int k = 0; k < job.begun + iteration; ++k) range *= kFainter, slope *= kFainter;
     for (int k = 0; k < kTries; ++k) {
         const Plane one = pixel->plane;
         pixel->attempt({one.inverse * (1.0f + range * draws->either_side()), one.across, one.down});
@@ -263,7 +267,7 @@ void begin(const PatchJob& job, int row) {
         Window window;
         open_window(job, column, row, &window);
         const Plane plane{job.planes[at], job.planes[size + at], job.planes[2 * size + at]};
-        job.costs[at] = plane_cost(job, window, plane, nullptr);
+        job.chosen[at] = choose(job, window, plane, &job.costs[at]);
     }
 }
 
@@ -275,7 +279,9 @@ void improve(const PatchJob& job, int row, int colour, int iteration) {
         Window window;
         open_window(job, column, row, &window);
         const Plane plane{job.planes[at], job.planes[size + at], job.planes[2 * size + at]};
-        Pixel pixel{job, window, choose(job, window, plane), plane, job.costs[at]};
+        float cost = job.costs[at];
+        const uint32_t chosen = iteration ? choose(job, window, plane, &cost) : job.chosen[at];
+        Pixel pixel{job, window, chosen, plane, job.costs[at]};
         take_from_neighbours(job, column, row, &pixel);
         Draws draws{mixed(job.seed + 1U + static_cast<uint32_t>(iteration)) ^ mixed(static_cast<uint32_t>(at))};
         change_a_little(job, iteration, &draws, &pixel);
