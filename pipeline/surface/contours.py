@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import rasterio
 from contourpy import LineType, contour_generator
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -140,12 +140,12 @@ def _pieces(raster: Any, window: Window, interval: float) -> Iterator[tuple[int,
     least, most = math.ceil(float(heights.min()) / interval), math.floor(float(heights.max()) / interval)
     for level in range(least, most + 1):
         for line in generator.lines(level * interval):
-            simple = _simplified(np.asarray(line, np.float64), np.array([window.col_off, window.row_off]))
+            simple = _simplified(np.asarray(line, np.float64), np.array([window.col_off, window.row_off], np.float64))
             if len(simple) > 1:
                 yield level, simple
 
 
-def _simplified(line: Line, corner: Float[np.ndarray, " 2"]) -> Line:
+def _simplified(line: Line, corner: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "k 2"]:
     """By Douglas and Peucker; float32 from the window's corner is exact to 1e-4 of a cell, and ends stay the same."""
     closed = bool((line[0] == line[-1]).all())
     near = (line[:-1] if closed else line) - corner

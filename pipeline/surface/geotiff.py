@@ -6,7 +6,7 @@ What is in the files, and why:
 - nodata is -9999, which every program knows; NaN is none to some.
 - Heights lie on steps of 2⁻¹⁰ m: off by half a millimetre at most, and half the size of noise in all bits (1.1 bytes a
   cell against 2.2, of a made surface with 2 mm of noise).
-- DEFLATE with TIFF's predictors: ZSTD is a twentieth smaller, and not known by all readers. Colours are lossless with an
+- DEFLATE with TIFF's predictors: ZSTD is a twentieth smaller, and unknown to some readers. Colours are lossless with an
   alpha band, as files that are measured in should be: 2.2 bytes a cell of a photo of the demo. As JPEG of quality 92
   they are half of that, 51 dB from what they were, with a mask: as nodata, its noise would eat into what is black.
 - The vertical CRS is there where EPSG has one. GeoTIFF cannot say that a projected CRS has ellipsoidal heights (GDAL
@@ -122,7 +122,7 @@ def raster_file(path: Path, grid: Grid, form: RasterForm) -> Iterator[RasterFile
             options = {**_COG, **dict(form.packing), **({"STATISTICS": "YES"} if form.has_heights else {})}
             copy_raster(tiled, aside, driver="COG", strict=False, **options)
             _require_whole(aside, grid)
-        except RasterioError as error:
+        except (RasterioError, SystemError) as error:  # the latter where GDAL's copy fails without a word
             raise MachineError(f"{path} cannot be written: {error}", "Is there space on the disk?") from error
 
 

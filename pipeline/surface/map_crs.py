@@ -127,15 +127,18 @@ def _vertical(heights: str, unit_m: float) -> pyproj.CRS | None:
     if not heights.startswith("EPSG:"):
         return None
     stated = pyproj.CRS(heights)
+    if _is_in(stated, unit_m):
+        return stated
     family = stated.name.partition(" (")[0]
-    others = [
-        f"EPSG:{info.code}"
-        for info in query_crs_info("EPSG", PJType.VERTICAL_CRS)
-        if info.name.partition(" (")[0] == family and same_datum(f"EPSG:{info.code}", heights)
-    ]
-    for code in [heights, *sorted(others)]:
-        crs = pyproj.CRS(code)
-        axis = crs.axis_info[0]
-        if axis.direction == "up" and math.isclose(axis.unit_conversion_factor, unit_m, rel_tol=SAME_UNIT):
-            return crs
+    for info in query_crs_info("EPSG", PJType.VERTICAL_CRS):
+        if info.name.partition(" (")[0] == family and same_datum(f"EPSG:{info.code}", heights):
+            other = pyproj.CRS.from_epsg(int(info.code))
+            if _is_in(other, unit_m):
+                return other
     return None
+
+
+def _is_in(vertical: pyproj.CRS, unit_m: float) -> bool:
+    """Whether a CRS counts upwards in a unit."""
+    axis = vertical.axis_info[0]
+    return axis.direction == "up" and math.isclose(axis.unit_conversion_factor, unit_m, rel_tol=SAME_UNIT)

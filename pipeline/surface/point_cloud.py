@@ -29,6 +29,7 @@ NORMALS = ("NormalX", "NormalY", "NormalZ")
 CONFIDENCE = "Confidence"
 SIXTEEN_BITS = 257  # 255 becomes 65,535
 ROWS = 1 << 18  # points converted at a time
+LIMITS_KNOWN = 0b110  # of an extra byte's options: laspy 2.7 takes them from the first point of each chunk alone
 UNDATED = date(2000, 1, 1)  # the format wants a date, and the same points are to give the same bytes
 PROGRAM = "splatpipe"
 
@@ -90,6 +91,8 @@ def _header(grid: Grid, taken_on: date) -> laspy.LasHeader:
         steps = {"scales": np.array([1.0 / NORMAL_STEPS]), "offsets": np.zeros(1)}
         header.add_extra_dim(laspy.ExtraBytesParams(name, "int8", "unit normal", **steps))
     header.add_extra_dim(laspy.ExtraBytesParams(CONFIDENCE, "uint8", "photos that confirm it"))
+    for field in header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs:
+        field.options &= ~LIMITS_KNOWN
     header.vlrs.append(WktCoordinateSystemVlr(grid.crs.compound.to_wkt("WKT1_GDAL")))
     header.global_encoding.wkt = True
     about = f"Heights: {grid.crs.described_heights()}".encode() + b"\0"
@@ -112,7 +115,7 @@ def _record(chunk: CloudChunk, grid: Grid, header: laspy.LasHeader) -> laspy.Sca
         record[name] = steps[:, axis]
     for band, name in enumerate(("red", "green", "blue")):
         record[name] = chunk.colours[:, band].astype(np.uint16) * SIXTEEN_BITS
-    normals = chunk.normals @ _turn(grid, chunk.positions.mean(axis=0)).T
+    normals = chunk.normals @ _turn(grid).T
     for axis, name in enumerate(NORMALS):
         record.array[name] = np.rint(np.clip(normals[:, axis], -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
     record.array[CONFIDENCE] = chunk.confidence
@@ -128,9 +131,13 @@ def _steps(coordinates: Float64[np.ndarray, "n 3"], header: laspy.LasHeader) -> 
     return np.asarray(steps.astype(np.int64))
 
 
-def _turn(grid: Grid, place: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The rotation of directions from the local frame to the CRS's axes: by the convergence, above all."""
-    there = grid.crs_from_local(place + np.concatenate([np.eye(3), -np.eye(3)]))
+def _turn(grid: Grid) -> Float64[np.ndarray, "3 3"]:
+    """The rotation of directions from the local frame to the CRS's axes: by the convergence, above all.
+
+    It is the one at the grid's middle: 3 km away it is another by 0.03°.
+    """
+    middle = grid.local_from_cells(np.array([[grid.width / 2.0, grid.height / 2.0, 0.0]]))
+    there = grid.crs_from_local(middle + np.concatenate([np.eye(3), -np.eye(3)]))
     derivative = (there[:3] - there[3:]).T * np.array([[grid.crs.unit_m]] * 2 + [[grid.crs.height_unit_m]])
     u, _, vt = np.linalg.svd(derivative)
     return np.asarray(u @ vt)
