@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import rasterio
+from rasterio._err import CPLE_BaseError
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError, RasterioIOError
@@ -39,6 +40,7 @@ NODATA_HEIGHT = -9999.0
 HEIGHT_STEPS_A_UNIT = 1024.0  # a power of two, so that steps have few bits and compress
 CACHE_MEGABYTES = 128  # of GDAL's blocks; its own default is a share of the machine's memory
 JPEG_QUALITY = 92
+GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)  # the last where a copy of GDAL's fails without a word
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def raster_file(path: Path, grid: Grid, form: RasterForm) -> Iterator[RasterFile
             options = {**_COG, **dict(form.packing), **({"STATISTICS": "YES"} if form.has_heights else {})}
             copy_raster(tiled, aside, driver="COG", strict=False, **options)
             _require_whole(aside, grid)
-        except (RasterioError, SystemError) as error:  # the latter where GDAL's copy fails without a word
+        except GDAL_ERRORS as error:
             raise MachineError(f"{path} cannot be written: {error}", "Is there space on the disk?") from error
 
 
