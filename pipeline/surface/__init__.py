@@ -1,0 +1,1 @@
+"""What surveyors open: rasters, contours and clouds in the run's CRS."""

@@ -1,0 +1,122 @@
+"""Contours as GeoJSON for maps and as DXF for CAD.
+
+GeoJSON is in WGS 84 longitude and latitude (RFC 7946 knows no other CRS, and web maps read no other); heights are a
+property, as a third coordinate would be taken for an ellipsoidal one. Between WGS 84 and an older datum programs choose
+transformations of their own, metres apart: so there is GeoJSON in the run's CRS, too, with the `crs` member of the
+format of 2008, which GDAL and QGIS still read. DXF is in the run's CRS, heights in the drawing's unit. It is of AutoCAD
+2000: the oldest with a drawing's unit and polylines of an elevation, and so read by the most programs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ezdxf._options import options
+from ezdxf.filemanagement import new as new_drawing
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.surface.contours import Contours
+from splatpipe.pipeline.surface.grid import Grid
+from splatpipe.pipeline.surface.map_crs import MapCrs, unit_name
+from splatpipe.pipeline.surface.whole_file import whole_file
+
+DXF_VERSION = "R2000"
+DXF_UNITS = {"metre": 6, "foot": 2, "US survey foot": 21}  # of $INSUNITS
+LAYER, INDEX_LAYER = "CONTOURS", "CONTOURS_INDEX"
+LINE_WEIGHTS = {LAYER: 13, INDEX_LAYER: 35}  # hundredths of a millimetre
+COLOURS = {LAYER: 8, INDEX_LAYER: 7}  # AutoCAD's grey; black or white, as the background asks
+DEGREE_DIGITS = 9  # a tenth of a millimetre
+UNIT_DIGITS = 4  # the same, of metres and feet
+
+
+def write_geojson(path: Path, contours: Contours, grid: Grid, in_crs: bool = False) -> None:
+    """Write contours as GeoJSON; a closed one's last position is its first.
+
+    Args:
+        path: Where.
+        contours: In the grid's CRS.
+        grid: The grid that they were made in.
+        in_crs: In the CRS rather than in longitude and latitude.
+
+    Raises:
+        SplatpipeError: if the frame lies nowhere on the earth, or the CRS has no code to name it by.
+    """
+    header: dict[str, Any] = {"type": "FeatureCollection", "heights": grid.crs.described_heights()}
+    if in_crs:
+        header["crs"] = {"type": "name", "properties": {"name": _urn(grid.crs)}}
+    elif grid.crs.world is None:
+        raise SplatpipeError(
+            "The reconstruction lies nowhere on the earth, so its contours have no longitude and latitude.",
+            "Take the DXF, or place it: give photos with positions, or a gcp_list.txt.",
+        )
+    with whole_file(path) as aside, aside.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(header)[:-1] + ',\n"features": [')
+        for number, contour in enumerate(contours.lines):
+            line = np.concatenate([contour.line, contour.line[:1]]) if contour.closed else contour.line
+            digits = UNIT_DIGITS if in_crs else DEGREE_DIGITS
+            shown = line if in_crs else _degrees(line, contour.height, grid)
+            feature = {
+                "type": "Feature",
+                "properties": {"height": contour.height, "index": contour.is_index},
+                "geometry": {"type": "LineString", "coordinates": np.round(shown, digits).tolist()},
+            }
+            file.write(("," if number else "") + "\n" + json.dumps(feature))
+        file.write("\n]}\n")
+
+
+def write_dxf(path: Path, contours: Contours, crs: MapCrs) -> None:
+    """Write contours as DXF: polylines with an elevation on two layers.
+
+    Args:
+        path: Where.
+        contours: In the CRS.
+        crs: It.
+    """
+    with _the_same_bytes():
+        drawing = new_drawing(DXF_VERSION, units=DXF_UNITS.get(unit_name(crs.unit_m), 0))
+        drawing.header["$MEASUREMENT"] = 1
+        about = f"every {contours.interval:g}, {crs.described_heights()}; {crs.horizontal.name}"
+        for name in (LAYER, INDEX_LAYER):
+            layer = drawing.layers.add(name, color=COLOURS[name], lineweight=LINE_WEIGHTS[name])
+            layer.description = f"Contours {about}"
+        model = drawing.modelspace()
+        scale = crs.height_unit_m / crs.unit_m
+        for contour in contours.lines:
+            drawn = {"layer": INDEX_LAYER if contour.is_index else LAYER, "elevation": contour.height * scale}
+            model.add_lwpolyline(np.round(contour.line, UNIT_DIGITS), close=contour.closed, dxfattribs=drawn)
+        if contours.lines:
+            lows, highs = zip(*((c.line.min(axis=0), c.line.max(axis=0)) for c in contours.lines), strict=True)
+            model.reset_extents((*np.min(lows, axis=0), 0.0), (*np.max(highs, axis=0), 0.0))
+        with whole_file(path) as aside:
+            drawing.saveas(aside)
+
+
+def _degrees(line: Float64[np.ndarray, "n 2"], height: float, grid: Grid) -> Float64[np.ndarray, "n 2"]:
+    """Longitude and latitude (WGS 84)."""
+    assert grid.crs.world is not None
+    local = grid.local_from_crs(np.column_stack([line, np.full(len(line), height)]))
+    return np.asarray(grid.crs.world.origin.geodetic_from_enu(local)[:, 1::-1])
+
+
+def _urn(crs: MapCrs) -> str:
+    authority = crs.horizontal.to_authority(min_confidence=100)
+    if authority is None:
+        raise SplatpipeError("GeoJSON names a CRS by its code, which this one has not.", "Take the DXF.")
+    return f"urn:ogc:def:crs:{authority[0]}::{authority[1]}"
+
+
+@contextmanager
+def _the_same_bytes() -> Iterator[None]:
+    """Let ezdxf write no date and no random number: its own means to that end."""
+    before = options.write_fixed_meta_data_for_testing
+    options.write_fixed_meta_data_for_testing = True
+    try:
+        yield
+    finally:
+        options.write_fixed_meta_data_for_testing = before

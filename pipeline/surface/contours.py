@@ -1,0 +1,249 @@
+"""Contours of a surface model: lines of one height, traced window by window and joined where windows meet.
+
+Windows share a row or column of centres of cells, so a line leaves one where it enters the next. Lines end where there
+is no data. They are simplified within a window, between its borders, where points stay: so nothing tears.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from contourpy import LineType, contour_generator
+from jaxtyping import Float64
+from rasterio.windows import Window
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.surface.geotiff import gdal
+
+INDEX_EVERY = 5  # every fifth contour is drawn bold, as on maps
+CELLS_AN_INTERVAL = 6.0  # 95 % of heights are within 3 cells: half an interval, as map standards ask of contours
+LEVELS_AT_MOST = 100  # of what is chosen here, over the relief
+MOST_LEVELS = 10_000  # of what somebody asks for
+MOST_VERTICES = 3_000_000  # 300 MB until they are written
+WINDOW = 1024  # cells
+TOLERANCE_CELLS = 0.3  # of simplified lines: less than half a cell, which is what a height's place means
+LEAST_LOOP_CELLS = 12.0  # around: a loop of less is a single cell's noise
+SAME_PLACE_CELLS = 1e-6  # two windows round one crossing differently
+
+Line = Float64[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """One line.
+
+    Attributes:
+        height: Its height in the CRS's unit.
+        is_index: Whether it is every fifth's.
+        closed: Whether it goes on from its last point to its first, which are two then.
+        line: Eastings and northings.
+    """
+
+    height: float
+    is_index: bool
+    closed: bool
+    line: Line
+
+
+@dataclass(frozen=True, eq=False)
+class Contours:
+    """All of them.
+
+    Attributes:
+        interval: From height to height, in the CRS's unit.
+        lines: By height.
+    """
+
+    interval: float
+    lines: tuple[Contour, ...]
+
+
+def neat_interval(cell: float, relief: float) -> float:
+    """1, 2 or 5 times a power of ten: what heights are good for, and not too many lines.
+
+    Args:
+        cell: Side of a cell, in the heights' unit.
+        relief: From the lowest to the highest.
+    """
+    least = max(CELLS_AN_INTERVAL * cell, relief / LEVELS_AT_MOST)
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(float(f"{step * power:.1g}") for step in (1, 2, 5, 10) if step * power >= least * (1.0 - 1e-9))
+
+
+def trace_contours(dsm: Path, interval: float | None = None) -> Contours:
+    """The contours of `dsm.tif`.
+
+    Args:
+        dsm: Heights in the first band.
+        interval: In their unit; None for a neat one.
+
+    Raises:
+        SplatpipeError: if the interval is none, or so small that lines are too many.
+    """
+    with gdal(dsm.parent), rasterio.open(dsm) as raster:
+        low, high = _height_range(raster)
+        if interval is None:
+            interval = neat_interval(abs(raster.transform.a) * _cell_in_heights(raster), max(high - low, 0.0))
+        if not (math.isfinite(interval) and interval > 0.0) or (high - low) / interval > MOST_LEVELS:
+            raise SplatpipeError(
+                f"Contours every {interval:g} over {high - low:g} are not to be drawn.", "Name another interval."
+            )
+        joints = _Joints()
+        for window in _windows(raster):
+            for level, line in _pieces(raster, window, interval):
+                joints.add(level, line)
+        found = joints.lines()
+        return Contours(interval, tuple(_contour(level, line, interval, raster.transform) for level, line in found))
+
+
+def _cell_in_heights(raster: Any) -> float:
+    """The CRS's unit in the heights' unit."""
+    units = raster.crs.linear_units_factor[1] if raster.crs is not None and raster.crs.is_projected else 1.0
+    heights = {"foot": 0.3048, "US survey foot": 1200.0 / 3937.0}.get(raster.units[0] or "", 1.0)
+    return float(units) / heights
+
+
+def _height_range(raster: Any) -> tuple[float, float]:
+    low, high = math.inf, -math.inf
+    for window in _windows(raster):
+        heights = raster.read(1, window=window, masked=True)
+        if heights.count():
+            low, high = min(low, float(heights.min())), max(high, float(heights.max()))
+    return (low, high) if low <= high else (0.0, 0.0)
+
+
+def _windows(raster: Any) -> Iterator[Window]:
+    """Windows that share their borders' cells: no two a square of four centres."""
+    for row in range(0, max(raster.height - 1, 1), WINDOW):
+        for column in range(0, max(raster.width - 1, 1), WINDOW):
+            width, height = min(WINDOW + 1, raster.width - column), min(WINDOW + 1, raster.height - row)
+            yield Window(column, row, width, height)
+
+
+def _pieces(raster: Any, window: Window, interval: float) -> Iterator[tuple[int, Line]]:
+    """Lines within a window, by level, in cells of the raster; closed ones end where they begin."""
+    heights = raster.read(1, window=window, masked=True)
+    heights = np.ma.masked_invalid(heights)
+    if min(heights.shape) < 2 or not heights.count():
+        return
+    xs = window.col_off + 0.5 + np.arange(heights.shape[1])
+    ys = window.row_off + 0.5 + np.arange(heights.shape[0])
+    generator = contour_generator(xs, ys, heights, name="serial", line_type=LineType.Separate)
+    least, most = math.ceil(float(heights.min()) / interval), math.floor(float(heights.max()) / interval)
+    for level in range(least, most + 1):
+        for line in generator.lines(level * interval):
+            simple = _simplified(np.asarray(line, np.float64), np.array([window.col_off, window.row_off], np.float64))
+            if len(simple) > 1:
+                yield level, simple
+
+
+def _simplified(line: Line, corner: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "k 2"]:
+    """By Douglas and Peucker; float32 from the window's corner is exact to 1e-4 of a cell, and ends stay the same."""
+    closed = bool((line[0] == line[-1]).all())
+    near = (line[:-1] if closed else line) - corner
+    kept = cv2.approxPolyDP(near.astype(np.float32)[:, None], TOLERANCE_CELLS, closed)[:, 0].astype(np.float64) + corner
+    if closed:
+        return np.concatenate([kept, kept[:1]]) if len(kept) > 2 else kept[:0]
+    kept[0], kept[-1] = line[0], line[-1]
+    return np.asarray(kept)
+
+
+@dataclass(eq=False)
+class _Chain:
+    level: int
+    parts: deque[Line] = field(default_factory=deque)
+
+
+_Place = tuple[int, int, int]  # level, and where in steps of SAME_PLACE_CELLS
+
+
+class _Joints:
+    """Pieces on their way to lines: each goes on from one that ends where it begins."""
+
+    def __init__(self) -> None:
+        self._begin: dict[_Place, list[_Chain]] = {}
+        self._end: dict[_Place, list[_Chain]] = {}
+        self._whole: list[tuple[int, Line]] = []
+        self._vertices = 0
+
+    def add(self, level: int, piece: Line) -> None:
+        """Add a piece.
+
+        Raises:
+            SplatpipeError: if there are too many.
+        """
+        self._vertices += len(piece)
+        if self._vertices > MOST_VERTICES:
+            raise SplatpipeError(
+                f"The contours have more than {MOST_VERTICES:,} points.", "Name a larger interval, or larger cells."
+            )
+        begin, end = _place(level, piece[0]), _place(level, piece[-1])
+        if begin == end:
+            self._whole.append((level, piece))
+            return
+        chain = _taken(self._end, begin)
+        if chain is None:
+            chain = _Chain(level)
+            self._begin.setdefault(begin, []).append(chain)
+        chain.parts.append(piece)
+        after = _taken(self._begin, end)
+        if after is None:
+            self._end.setdefault(end, []).append(chain)
+        elif after is chain:
+            self._whole.append((level, _joined(chain)))
+        else:
+            self._join(chain, after)
+
+    def _join(self, chain: _Chain, after: _Chain) -> None:
+        """Let a chain go on as another one, whose end it takes."""
+        waiting = self._end[_place(after.level, after.parts[-1][-1])]
+        waiting[waiting.index(after)] = chain
+        chain.parts.extend(after.parts)
+
+    def lines(self) -> list[tuple[int, Line]]:
+        """All lines with their levels, but for the smallest loops; the same order whatever the windows."""
+        opened = [(chain.level, _joined(chain)) for chains in self._begin.values() for chain in chains]
+        lines = [found for found in self._whole + opened if not _is_noise(found[1])]
+        return sorted(lines, key=lambda found: (found[0], *found[1].min(axis=0), *found[1].max(axis=0)))
+
+
+def _taken(chains: dict[_Place, list[_Chain]], place: _Place) -> _Chain | None:
+    waiting = chains.get(place)
+    if not waiting:
+        return None
+    chain = waiting.pop()
+    if not waiting:
+        del chains[place]
+    return chain
+
+
+def _place(level: int, point: Float64[np.ndarray, " 2"]) -> _Place:
+    return level, round(float(point[0]) / SAME_PLACE_CELLS), round(float(point[1]) / SAME_PLACE_CELLS)
+
+
+def _joined(chain: _Chain) -> Line:
+    return np.concatenate([chain.parts[0], *(part[1:] for part in list(chain.parts)[1:])])
+
+
+def _is_closed(line: Line) -> bool:
+    return bool(np.abs(line[0] - line[-1]).max() <= 2.0 * SAME_PLACE_CELLS)
+
+
+def _is_noise(line: Line) -> bool:
+    around = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    return _is_closed(line) and around < LEAST_LOOP_CELLS
+
+
+def _contour(level: int, line: Line, interval: float, transform: Any) -> Contour:
+    closed = _is_closed(line)
+    cells = line[:-1] if closed else line
+    there = np.stack([transform.c + cells[:, 0] * transform.a, transform.f + cells[:, 1] * transform.e], axis=1)
+    return Contour(float(f"{level * interval:.12g}"), level % INDEX_EVERY == 0, closed, there)

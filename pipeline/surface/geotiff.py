@@ -1,0 +1,202 @@
+"""Cloud Optimised GeoTIFFs, written tile by tile in bounded memory, by GDAL (rasterio).
+
+What is in the files, and why:
+- Heights are alone in `dsm.tif`. A GeoTIFF has one type and one nodata value for all bands, programs for terrain and
+  CAD take the only band, and QGIS draws two bands as a red and green picture. Confidence is a file on the same grid.
+- nodata is -9999, which every program knows; NaN is none to some.
+- Heights lie on steps of 2⁻¹⁰ m: off by half a millimetre at most, and half the size of noise in all bits (1.1 bytes a
+  cell against 2.2, of a made surface with 2 mm of noise).
+- DEFLATE with TIFF's predictors: ZSTD is a twentieth smaller, and unknown to some readers. Colours are lossless with an
+  alpha band, as files that are measured in should be: 2.2 bytes a cell of a photo of the demo. As JPEG of quality 92
+  they are half of that, 51 dB from what they were, with a mask: as nodata, its noise would eat into what is black.
+- The vertical CRS is there where EPSG has one. GeoTIFF cannot say that a projected CRS has ellipsoidal heights (GDAL
+  would put that into a file beside): the tag VERTICAL_DATUM says it for all.
+- No date and no version is in a file: the same values give the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from rasterio._err import CPLE_BaseError
+from rasterio.crs import CRS
+from rasterio.enums import ColorInterp
+from rasterio.errors import RasterioError, RasterioIOError
+from rasterio.shutil import copy as copy_raster
+from rasterio.windows import Window
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.surface.grid import TILE, Grid, Tile
+from splatpipe.pipeline.surface.map_crs import unit_name
+from splatpipe.pipeline.surface.whole_file import whole_file
+
+NODATA_HEIGHT = -9999.0
+HEIGHT_STEPS_A_UNIT = 1024.0  # a power of two, so that steps have few bits and compress
+CACHE_MEGABYTES = 128  # of GDAL's blocks; its own default is a share of the machine's memory
+JPEG_QUALITY = 92
+GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)  # the last where a copy of GDAL's fails without a word
+
+
+@dataclass(frozen=True)
+class RasterForm:
+    """What a raster has, and how it is packed.
+
+    Attributes:
+        dtype: Of all bands.
+        bands: Their names.
+        nodata: Of all bands; None where an alpha band tells.
+        packing: Options of GDAL's COG driver.
+        has_heights: Whether values are heights in the CRS's unit.
+    """
+
+    dtype: str
+    bands: tuple[str, ...]
+    nodata: float | None
+    packing: tuple[tuple[str, str], ...]
+    has_heights: bool = False
+
+
+_DEFLATE = (("COMPRESS", "DEFLATE"), ("PREDICTOR", "YES"), ("LEVEL", "6"))
+_JPEG = (("COMPRESS", "JPEG"), ("QUALITY", str(JPEG_QUALITY)))
+_RGBA = ("red", "green", "blue", "alpha")
+HEIGHTS = RasterForm("float32", ("height",), NODATA_HEIGHT, _DEFLATE, has_heights=True)
+CONFIDENCE = RasterForm("uint8", ("photos that confirm the height",), 0.0, _DEFLATE)
+COLOURS = RasterForm("uint8", _RGBA, None, _DEFLATE)
+COLOURS_AS_JPEG = RasterForm("uint8", _RGBA, None, _JPEG)
+
+
+class RasterFile:
+    """A raster under way.
+
+    Args:
+        raster: GDAL's.
+        form: Its form.
+    """
+
+    def __init__(self, raster: Any, form: RasterForm) -> None:
+        self._raster = raster
+        self._form = form
+
+    def write(self, tile: Tile, values: np.ndarray) -> None:
+        """Write a tile; what is never written has no data.
+
+        Args:
+            tile: Of the grid.
+            values: (bands, height, width), or (height, width) of a raster of one band; of the form's type. Heights that
+                are not finite are nodata.
+
+        Raises:
+            ValueError: if they are not of the form's type and the tile's size.
+            MachineError: if the disk is full.
+        """
+        values = values[None] if values.ndim == 2 else values
+        if values.shape != (len(self._form.bands), tile.height, tile.width) or values.dtype != self._form.dtype:
+            raise ValueError(f"{values.dtype} {values.shape} is not {self._form.dtype} of {self._form.bands} in {tile}")
+        if self._form.has_heights:
+            values = _packed_heights(values)
+        self._raster.write(values, window=Window(tile.column, tile.row, tile.width, tile.height))
+
+
+@contextmanager
+def raster_file(path: Path, grid: Grid, form: RasterForm) -> Iterator[RasterFile]:
+    """Write a Cloud Optimised GeoTIFF; it is there when the block ends, whole, and not if that fails.
+
+    Args:
+        path: Where.
+        grid: Its grid.
+        form: ``HEIGHTS``, ``CONFIDENCE``, ``COLOURS`` or ``COLOURS_AS_JPEG``.
+
+    Raises:
+        MachineError: if the disk is full or not writable.
+    """
+    with whole_file(path) as aside, gdal(aside.parent):
+        tiled = aside.with_name("tiled.tif")
+        try:
+            with rasterio.open(tiled, "w", **_profile(grid, form)) as raster:
+                _describe(raster, grid, form)
+                yield RasterFile(raster, form)
+            options = {**_COG, **dict(form.packing), **({"STATISTICS": "YES"} if form.has_heights else {})}
+            copy_raster(tiled, aside, driver="COG", strict=False, **options)
+            _require_whole(aside, grid)
+        except GDAL_ERRORS as error:
+            raise MachineError(f"{path} cannot be written: {error}", "Is there space on the disk?") from error
+
+
+def gdal(scratch: Path) -> rasterio.Env:
+    """GDAL as files are written with it: no network, no files beside, little memory, one thread.
+
+    It has a PROJ of its own, with its own settings: pyproj's stay as they are.
+
+    Args:
+        scratch: Folder for GDAL's files under way.
+    """
+    return rasterio.Env(
+        CPL_TMPDIR=str(scratch),
+        GDAL_CACHEMAX=CACHE_MEGABYTES,
+        GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR",
+        GDAL_NUM_THREADS="1",
+        GDAL_PAM_ENABLED="NO",
+        GDAL_TIFF_INTERNAL_MASK="YES",
+        PROJ_NETWORK="OFF",
+    )
+
+
+_COG = {"BLOCKSIZE": str(TILE), "OVERVIEW_RESAMPLING": "AVERAGE", "BIGTIFF": "IF_SAFER", "NUM_THREADS": "1"}
+
+
+def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
+    """What the tiled raster is made with, from which the final one is copied."""
+    crs = grid.crs.compound if form.has_heights else grid.crs.horizontal
+    return {
+        "driver": "GTiff",
+        "width": grid.width,
+        "height": grid.height,
+        "count": len(form.bands),
+        "dtype": form.dtype,
+        "nodata": form.nodata,
+        "crs": CRS.from_wkt(crs.to_wkt("WKT1_GDAL" if grid.crs.world is None else "WKT2_2019")),
+        "transform": grid.transform,
+        "tiled": True,
+        "blockxsize": TILE,
+        "blockysize": TILE,
+        "interleave": "pixel",
+        "sparse_ok": True,
+        "bigtiff": "yes",
+        "compress": "deflate",
+        "zlevel": 1,
+        **({"photometric": "RGB", "alpha": "unspecified"} if form.bands == _RGBA else {}),
+    }
+
+
+def _describe(raster: Any, grid: Grid, form: RasterForm) -> None:
+    raster.descriptions = form.bands
+    if form.has_heights:
+        raster.units = (unit_name(grid.crs.height_unit_m),)
+        raster.update_tags(VERTICAL_DATUM=grid.crs.described_heights())
+    if form.bands == _RGBA:
+        raster.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+
+
+def _packed_heights(values: np.ndarray) -> np.ndarray:
+    """On whole steps; nodata where they are not finite."""
+    steps = np.round(values.astype(np.float64) * HEIGHT_STEPS_A_UNIT) / HEIGHT_STEPS_A_UNIT
+    return np.where(np.isfinite(steps), steps, NODATA_HEIGHT).astype(np.float32)
+
+
+def _require_whole(path: Path, grid: Grid) -> None:
+    """GDAL tells of a full disk in its log alone when it closes a file: so the last block has to be there.
+
+    Raises:
+        RasterioError: if it is not.
+    """
+    with rasterio.open(path) as raster:
+        if raster.shape != (grid.height, grid.width):
+            raise RasterioIOError("its size is another one")
+        for row, column in ((0, 0), (grid.height - 1, grid.width - 1)):
+            raster.read(window=Window(column, row, 1, 1))

@@ -1,0 +1,143 @@
+"""A point cloud as LAZ: LAS 1.4 of point format 7, written chunk by chunk in bounded memory (laspy, lazrs).
+
+Colours have 16 bits, as the format asks. Normals are extra bytes by the names of PDAL and CloudCompare, each a signed
+byte of steps of 1/127, as Metashape writes them: 0.2° at most, finer than any depth map's, and 2 bytes a point in the
+file where float32 takes 9 (measured with 3 bytes for the rest). The CRS is WKT of 2001, which the format asks for; what
+it cannot say of the heights stands in a text beside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import laspy
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+from laspy.vlrs.known import WktCoordinateSystemVlr
+from laspy.vlrs.vlr import VLR
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.surface.grid import Grid
+from splatpipe.pipeline.surface.whole_file import whole_file
+
+SCALE = 0.001  # of coordinates: a millimetre, or a thousandth of a foot
+NORMAL_STEPS = 127.0
+NORMALS = ("NormalX", "NormalY", "NormalZ")
+CONFIDENCE = "Confidence"
+SIXTEEN_BITS = 257  # 255 becomes 65,535
+ROWS = 1 << 18  # points converted at a time
+LIMITS_KNOWN = 0b110  # of an extra byte's options: laspy 2.7 takes them from the first point of each chunk alone
+UNDATED = date(2000, 1, 1)  # the format wants a date, and the same points are to give the same bytes
+PROGRAM = "splatpipe"
+
+
+@dataclass(frozen=True, eq=False)
+class CloudChunk:
+    """Some points.
+
+    Attributes:
+        positions: East, north, up, metres.
+        colours: Red, green, blue.
+        normals: East, north, up, of unit length; zero where not known.
+        confidence: Photos that confirm each.
+    """
+
+    positions: Float64[np.ndarray, "n 3"]
+    colours: UInt8[np.ndarray, "n 3"]
+    normals: Float32[np.ndarray, "n 3"]
+    confidence: UInt8[np.ndarray, " n"]
+
+
+def write_cloud(path: Path, chunks: Iterable[CloudChunk], grid: Grid, taken_on: date = UNDATED) -> int:
+    """Write a cloud; it is there when all chunks are in it, and not if that fails.
+
+    Args:
+        path: Where: a name that ends in .laz.
+        chunks: Asked for one by one.
+        grid: Whose CRS it is written in; it covers the points.
+        taken_on: The date in the file: the photos', for one.
+
+    Returns:
+        Number of points.
+
+    Raises:
+        SplatpipeError: if a point is not finite, or too far away for the format.
+        OSError: if the disk is full or not writable.
+    """
+    header = _header(grid, taken_on)
+    count = 0
+    with (
+        whole_file(path) as aside,
+        aside.open("wb") as file,
+        laspy.LasWriter(file, header, laz_backend=laspy.LazBackend.Lazrs, closefd=False) as writer,
+    ):
+        for chunk in _pieces(chunks):
+            writer.write_points(_record(chunk, grid, header))
+            count += len(chunk.positions)
+    return count
+
+
+def _header(grid: Grid, taken_on: date) -> laspy.LasHeader:
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    west, south, _, _ = grid.bounds
+    header.scales = np.full(3, SCALE)
+    header.offsets = np.array([np.floor(west), np.floor(south), 0.0])
+    header.creation_date = taken_on
+    header.system_identifier = header.generating_software = PROGRAM
+    for name in NORMALS:
+        steps = {"scales": np.array([1.0 / NORMAL_STEPS]), "offsets": np.zeros(1)}
+        header.add_extra_dim(laspy.ExtraBytesParams(name, "int8", "unit normal", **steps))
+    header.add_extra_dim(laspy.ExtraBytesParams(CONFIDENCE, "uint8", "photos that confirm it"))
+    for field in header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs:
+        field.options &= ~LIMITS_KNOWN
+    header.vlrs.append(WktCoordinateSystemVlr(grid.crs.compound.to_wkt("WKT1_GDAL")))
+    header.global_encoding.wkt = True
+    about = f"Heights: {grid.crs.described_heights()}".encode() + b"\0"
+    header.vlrs.append(VLR("LASF_Spec", 3, "Text area description", about))
+    return header
+
+
+def _pieces(chunks: Iterable[CloudChunk]) -> Iterator[CloudChunk]:
+    """The same points, no more than ``ROWS`` at a time."""
+    for chunk in chunks:
+        for start in range(0, len(chunk.positions), ROWS):
+            rows = slice(start, start + ROWS)
+            yield CloudChunk(chunk.positions[rows], chunk.colours[rows], chunk.normals[rows], chunk.confidence[rows])
+
+
+def _record(chunk: CloudChunk, grid: Grid, header: laspy.LasHeader) -> laspy.ScaleAwarePointRecord:
+    record = laspy.ScaleAwarePointRecord.zeros(len(chunk.positions), header=header)
+    steps = _steps(grid.crs_from_local(chunk.positions), header)
+    for axis, name in enumerate(("X", "Y", "Z")):
+        record[name] = steps[:, axis]
+    for band, name in enumerate(("red", "green", "blue")):
+        record[name] = chunk.colours[:, band].astype(np.uint16) * SIXTEEN_BITS
+    normals = chunk.normals @ _turn(grid).T
+    for axis, name in enumerate(NORMALS):
+        record.array[name] = np.rint(np.clip(normals[:, axis], -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
+    record.array[CONFIDENCE] = chunk.confidence
+    record["return_number"] = np.ones(len(steps), np.uint8)
+    record["number_of_returns"] = np.ones(len(steps), np.uint8)
+    return record
+
+
+def _steps(coordinates: Float64[np.ndarray, "n 3"], header: laspy.LasHeader) -> Int64[np.ndarray, "n 3"]:
+    steps = np.rint((coordinates - header.offsets) / header.scales)
+    if not (np.abs(steps) <= np.iinfo(np.int32).max).all():  # also where it is not a number
+        raise SplatpipeError("A point of the cloud is not finite, or beyond what LAS holds.", "Set a --boundary.")
+    return np.asarray(steps.astype(np.int64))
+
+
+def _turn(grid: Grid) -> Float64[np.ndarray, "3 3"]:
+    """The rotation of directions from the local frame to the CRS's axes: by the convergence, above all.
+
+    It is the one at the grid's middle: 3 km away it is another by 0.03°.
+    """
+    middle = grid.local_from_cells(np.array([[grid.width / 2.0, grid.height / 2.0, 0.0]]))
+    there = grid.crs_from_local(middle + np.concatenate([np.eye(3), -np.eye(3)]))
+    derivative = (there[:3] - there[3:]).T * np.array([[grid.crs.unit_m]] * 2 + [[grid.crs.height_unit_m]])
+    u, _, vt = np.linalg.svd(derivative)
+    return np.asarray(u @ vt)

@@ -1,0 +1,42 @@
+"""Files that libraries write: there whole or as before, also after a kill, with nothing of theirs left beside them."""
+
+from __future__ import annotations
+
+import glob
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from splatpipe.pipeline.engine.durable import sync_folder
+
+UNFINISHED = ".making"
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A name to fill, in a folder of its own, whose place beside it the file takes when it is whole.
+
+    The folder is for what libraries put beside their files, too (GDAL's overviews under way). One process at a time
+    may write a file: what another one left unfinished of it is removed.
+
+    Args:
+        path: Where; an older file there is replaced.
+
+    Raises:
+        OSError: if the disk is full or not writable; what was at ``path`` is still there.
+    """
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*{UNFINISHED}"):
+        shutil.rmtree(left, ignore_errors=True)
+    folder = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+    folder.mkdir()
+    try:
+        aside = folder / path.name
+        yield aside
+        with aside.open("rb") as file:
+            os.fsync(file.fileno())
+        aside.replace(path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    sync_folder(path.parent)
