@@ -16,7 +16,7 @@ from affine import Affine
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface.lattice import SPACING_M, Lattice, sample_lattice
+from splatpipe.pipeline.surface.smooth_map import SPACING_M, SmoothMap, sample_map
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.world import World
@@ -76,8 +76,8 @@ class Grid:
     width: int
     height: int
     cell_m: float
-    crs_from_local: Lattice = field(repr=False)
-    local_from_crs: Lattice = field(repr=False)
+    crs_from_local: SmoothMap = field(repr=False)
+    local_from_crs: SmoothMap = field(repr=False)
 
     @property
     def transform(self) -> Affine:
@@ -146,8 +146,8 @@ def make_grid(frame: Frame, box: Float64[np.ndarray, "2 3"], gsd_m: float) -> Gr
     height = max(top - math.floor(south + ROUNDING), 1)
     _require_reasonable(width, height, gsd_m)
     there = np.stack([mapped.min(axis=0), mapped.max(axis=0)])
-    to_crs = _lattice(crs.crs_from_local, box, 1.0, 1.0)
-    to_local = _lattice(crs.local_from_crs, there, crs.unit_m, crs.height_unit_m)
+    to_crs = _smooth(crs.crs_from_local, box, 1.0, 1.0)
+    to_local = _smooth(crs.local_from_crs, there, crs.unit_m, crs.height_unit_m)
     return Grid(crs, cell, left, top, width, height, gsd_m, to_crs, to_local)
 
 
@@ -183,8 +183,8 @@ def _border(box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, "n 3"]:
     return np.asarray(box[0] + plane * (box[1] - box[0]))
 
 
-def _lattice(exact: Exact, box: Float64[np.ndarray, "2 3"], unit_m: float, height_unit_m: float) -> Lattice:
+def _smooth(exact: Exact, box: Float64[np.ndarray, "2 3"], unit_m: float, height_unit_m: float) -> SmoothMap:
     """A lattice over a box and a margin, in any units."""
     spacing = SPACING_M / unit_m
     margin = np.array([spacing, spacing, HEIGHT_MARGIN_M / height_unit_m])
-    return sample_lattice(exact, box[0] - margin, box[1] + margin, spacing)
+    return sample_map(exact, box[0] - margin, box[1] + margin, spacing)

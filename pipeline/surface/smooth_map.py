@@ -20,7 +20,7 @@ Points = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
+class SmoothMap:
     """A map of space as polynomials over squares: bilinear on the plane, straight in the height.
 
     Attributes:
@@ -54,9 +54,9 @@ class Lattice:
         return np.asarray(np.einsum("nt,ntc->nc", terms, squares[index]))
 
 
-def sample_lattice(
+def sample_map(
     exact: Callable[[Points], Points], low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], spacing: float
-) -> Lattice:
+) -> SmoothMap:
     """Sample a map over a box.
 
     Args:
@@ -73,7 +73,7 @@ def sample_lattice(
     rise = (values[:, :, 1] - base) / (high[2] - low[2])
     squares = np.concatenate([_bilinear(base), _bilinear(rise)], axis=2)
     step = np.append((high - low)[:2] / counts, 1.0)
-    return Lattice(np.asarray(low, np.float64), step, squares)
+    return SmoothMap(np.asarray(low, np.float64), step, squares)
 
 
 def _bilinear(nodes: Float64[np.ndarray, "m n 3"]) -> Float64[np.ndarray, "rows columns 4 3"]:
