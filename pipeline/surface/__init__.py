@@ -1,0 +1,1 @@
+"""What a surveyor takes away: surface model and orthophoto, tile by tile."""
