@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.height_field import HeightField
-from splatpipe.pipeline.surface.orthophoto import Album, visible
+from splatpipe.pipeline.surface.orthophoto import Album, view_of
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, halvings, linear, loader, sampled
 from splatpipe.pipeline.surface.sight import place_in
 
@@ -38,7 +38,7 @@ def exposure_gains(album: Album, threads: int) -> Float64[np.ndarray, "n 3"]:
     light = np.stack([row for row, _ in rows]) if rows else np.zeros((0, 0, 3))
     seen = np.stack([there for _, there in rows]) if rows else np.zeros((0, 0), np.bool_)
     gains = [_levelled(light[..., channel], seen) for channel in range(3)]
-    return np.clip(np.exp(np.stack(gains, axis=-1)), 1.0 / MOST_GAIN, MOST_GAIN)
+    return np.asarray(np.clip(np.exp(np.stack(gains, axis=-1)), 1.0 / MOST_GAIN, MOST_GAIN))
 
 
 def _places(surface: HeightField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -64,8 +64,8 @@ def _light(
     if source.depths is None or not size:
         return np.zeros((size, 3)), np.zeros(size, np.bool_)
     place = place_in(source.camera, *points)
-    seen, mixed = visible(source.depths, album.depths, number, points)
-    seen = seen & ~mixed & place.inside
+    view = view_of(source.depths, album.depths, number, points)
+    seen = view.seen & ~view.mixed & place.inside
     if not seen.any():
         return np.zeros((size, 3)), np.zeros(size, np.bool_)
     pixels = album.pixels.get(number, loader(source))

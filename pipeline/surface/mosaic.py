@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 
 NEVER = np.int32(1 << 28)  # cost of a photo that does not see a cell
-HIDDEN = 4000  # what such a cell adds to the cost around it: photos end before they end
-SMOOTH = 5  # cells on either side that a cell's costs are averaged over
-ODD_FREE = 12  # grey values that a photo may differ from the others without being odd...
-ODD = 25  # ...and what each more costs
+HIDDEN = 4000  # what such a cell adds to the cost around it: photos end before they end; and no cost is higher
+SMOOTH = 10  # cells on either side that a cell's costs are averaged over
+ODD_FREE = 20  # grey values that a photo may differ from the others without being odd...
+ODD = 15  # ...and what each more costs
 ODD_MOST = 60  # more differ by no more
 SEAM = 60  # cost of a seam between two cells,
 SEAM_STEP = 12  # and of each grey value that the photos differ there
@@ -26,12 +26,12 @@ def likeness_cost(
 
     The others' grey is a mean in which better photos count more, taken again without those that are far from it.
     """
-    weight = np.where(seen, np.int32(1 << 16) // (cost + 64), 0)
+    weight = np.where(seen, np.int32(1 << 16) // (cost + 64), np.int32(0))  # 1024 at most: sums of 255 × it fit
     mean = np.zeros(grey.shape[1:], np.int32)
     for _ in range(2):
-        total = np.maximum(weight.sum(axis=0, dtype=np.int64), 1)
-        mean = ((weight.astype(np.int64) * grey).sum(axis=0) // total).astype(np.int32)
-        off = np.abs(grey.astype(np.int32) - mean)
+        total = np.maximum(weight.sum(axis=0, dtype=np.int32), 1)
+        mean = (weight * grey).sum(axis=0, dtype=np.int32) // total
+        off = np.abs(grey - mean)
         weight = weight // np.maximum(1, off // ODD_FREE) ** 2
     return np.where(seen, ODD * np.clip(off - ODD_FREE, 0, ODD_MOST), 0).astype(np.int32)
 
@@ -46,7 +46,7 @@ def labels(
     ("Graphcut Textures", 2003).
 
     Args:
-        cost: Of each photo in each cell.
+        cost: Of each photo in each cell, also where it does not see it.
         seen: Whether it sees it.
         grey: Its values, levelled.
         parity: Of the first cell's row plus column in the whole picture.
@@ -54,8 +54,7 @@ def labels(
     smooth = np.empty_like(cost)
     side = 2 * SMOOTH + 1
     for number in range(len(cost)):
-        part = np.where(seen[number], np.minimum(cost[number], HIDDEN), HIDDEN)
-        total = _box(part, SMOOTH)
+        total = _box(np.minimum(cost[number], np.int32(HIDDEN)), SMOOTH)
         smooth[number] = np.where(seen[number], total // (side * side), NEVER)
     label = np.argmin(smooth, axis=0)
     label = np.where(np.take_along_axis(smooth, label[None], 0)[0] >= NEVER, -1, label)
@@ -65,15 +64,11 @@ def labels(
     return label
 
 
-def _box(values: Int32[np.ndarray, "h w"], radius: int) -> Int64[np.ndarray, "h w"]:
+def _box(values: Int32[np.ndarray, "h w"], radius: int) -> Int32[np.ndarray, "h w"]:
     """Sums around each cell, exact; what is outside repeats the rim."""
-    wide = np.pad(values, radius, mode="edge").astype(np.int64)
-    for axis in (0, 1):
-        sums = np.cumsum(wide, axis=axis)
-        sums = np.concatenate([np.zeros_like(np.take(sums, [0], axis)), sums], axis=axis)
-        length = sums.shape[axis]
-        wide = np.take(sums, range(2 * radius + 1, length), axis) - np.take(sums, range(length - 2 * radius - 1), axis)
-    return wide
+    side = 2 * radius + 1
+    total = cv2.boxFilter(values, cv2.CV_32S, (side, side), normalize=False, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(total, np.int32)
 
 
 BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -117,7 +112,7 @@ def _energy(
         here = np.abs(grey[mine, rows, columns].astype(np.int64) - grey[known, rows, columns])
         there = np.abs(grey[mine, *place].astype(np.int64) - grey[known, *place])
         total += np.where((other >= 0) & (other != mine), SEAM + SEAM_STEP * (here + there), 0)
-    return total
+    return np.asarray(total)
 
 
 def blended(

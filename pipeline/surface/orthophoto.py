@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -15,6 +15,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice, Tile
 from splatpipe.pipeline.surface.mosaic import (
+    HIDDEN,
     MARGIN,
     blended,
     labels,
@@ -24,7 +25,7 @@ from splatpipe.pipeline.surface.mosaic import (
     spread,
 )
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, halvings, loader, sampled, tone_curve
-from splatpipe.pipeline.surface.sight import LEAST_SINE, Place, nearest_and_through, place_in, sight, tolerance
+from splatpipe.pipeline.surface.sight import LEAST_SINE, Place, Sight, place_in, sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
 
 TILE = 384  # cells a side
@@ -34,6 +35,7 @@ COARSE = 0.5  # cost of a photo half as fine as the cells
 RIM = 0.06  # of a photo's width: nearer to its edge it costs more, for lenses are worst there,
 RIM_COST = 0.5  # up to so much
 MIXED = 0.6  # cost where a nearer surface lies in the next pixel of the depths: colours may be mixed
+UNKNOWN = 0.3  # cost around a cell where the photo has no depth: it colours others beside it none the less
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +82,14 @@ class Album:
 
 @dataclass(frozen=True, eq=False)
 class _Offer:
-    """What one photo offers to a tile: its number, where it sees the surface, at which cost, in which colours."""
+    """What one photo offers to a tile.
+
+    Attributes:
+        number: The photo's.
+        seen: Where it sees the surface.
+        cost: Of being coloured by it; told beside, too, for what lies around a cell counts.
+        colour: Levelled; black where it does not see the surface.
+    """
 
     number: int
     seen: Bool[np.ndarray, "h w"]
@@ -132,10 +141,10 @@ def _composed(
     return label, blended(label, colour, seen), photos
 
 
-def visible(
+def view_of(
     source: DepthSource, shelf: Shelf[DepthMap], number: int, points: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[Bool[np.ndarray, " *n"], Bool[np.ndarray, " *n"]]:
-    """Which places a photo sees by its own depths, and for which of them a nearer surface lies in the next pixel.
+) -> Sight:
+    """What a photo says about places by its own depths.
 
     Args:
         source: The photo's depths.
@@ -144,11 +153,7 @@ def visible(
         points: East, north, up.
     """
     found = shelf.get(number, partial(_loaded, source))
-    place = place_in(found.camera, *points)
-    seen = sight(found, place, 0.0).seen
-    row, column = (np.where(place.inside, at, 0.0).astype(np.int64) for at in (place.row, place.column))
-    _, least = nearest_and_through(found, row, column)
-    return seen, seen & (least < place.depth - tolerance(found.camera, place))
+    return sight(found, place_in(found.camera, *points), 0.0)
 
 
 def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
@@ -161,18 +166,19 @@ def _offer(album: Album, number: int, points: tuple[np.ndarray, np.ndarray, np.n
     if source.depths is None:
         return None
     place = place_in(source.camera, *points)
-    seen, mixed = visible(source.depths, album.depths, number, points)
-    seen &= place.inside
+    view = view_of(source.depths, album.depths, number, points)
+    seen = view.seen & place.inside
     if not seen.any():
         return None
-    place = Place(place.column, place.row, place.depth, place.sine, seen)
+    cost = _cost(source.camera, place, album.lattice.cell_m) + scaled_cost(MIXED * view.mixed + UNKNOWN * view.unknown)
+    cost = np.where(seen | (view.unknown & place.inside), cost, np.int32(HIDDEN))
     pixels = album.pixels.get(number, loader(source))
+    place = replace(place, inside=seen)
     level = halvings(source.camera, place, album.lattice.cell_m)
-    colour = sampled(pixels, place, level, tone_curve(album.gains[number]))
-    return _Offer(number, seen, _cost(source.camera, place, mixed, album.lattice.cell_m), colour)
+    return _Offer(number, seen, cost, sampled(pixels, place, level, tone_curve(album.gains[number])))
 
 
-def _cost(camera: Camera, place: Place, mixed: Bool[np.ndarray, "h w"], cell_m: float) -> Int32[np.ndarray, "h w"]:
+def _cost(camera: Camera, place: Place, cell_m: float) -> Int32[np.ndarray, "h w"]:
     """What it costs to colour cells by a photo: it leans, is coarse, or they lie near its edge."""
     sine = np.maximum(place.sine, LEAST_SINE)
     pixel = np.where(place.inside, place.depth, 0.0) / max(camera.fx, camera.fy) / sine
@@ -181,4 +187,4 @@ def _cost(camera: Camera, place: Place, mixed: Bool[np.ndarray, "h w"], cell_m: 
     )
     rim = np.clip(1.0 - edge / (RIM * camera.width), 0.0, 1.0)
     total = LEANING * (1.0 - sine) + COARSE * np.clip(pixel / cell_m - 1.0, 0.0, 4.0) + RIM_COST * rim
-    return scaled_cost(np.where(place.inside, total + MIXED * mixed, 0.0))
+    return scaled_cost(np.where(place.inside, total, 0.0))

@@ -114,7 +114,7 @@ def tone_curve(gain: Float64[np.ndarray, " 3"]) -> UInt8[np.ndarray, "256 3"]:
     """Values of a photo as if it had been exposed so many times longer, a channel each (IEC 61966-2-1 for sRGB)."""
     light = linear(np.arange(256) / 255.0)[:, None] * gain
     encoded = np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.clip(np.round(encoded * 255.0), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.round(encoded * 255.0), 0, 255), np.uint8)
 
 
 def linear(value: Float64[np.ndarray, " *n"]) -> Float64[np.ndarray, " *n"]:

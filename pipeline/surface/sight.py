@@ -65,12 +65,14 @@ class Sight:
     Attributes:
         seen: It sees them.
         through: It sees something behind them.
-        known: It has depths there.
+        mixed: It sees them, but a nearer surface lies in the next pixel.
+        unknown: It looks there, but has no depth: it may see them.
     """
 
     seen: Bool[np.ndarray, " *n"]
     through: Bool[np.ndarray, " *n"]
-    known: Bool[np.ndarray, " *n"]
+    mixed: Bool[np.ndarray, " *n"]
+    unknown: Bool[np.ndarray, " *n"]
 
 
 def sight(found: DepthMap, place: Place, least_m: float) -> Sight:
@@ -83,15 +85,15 @@ def sight(found: DepthMap, place: Place, least_m: float) -> Sight:
     """
     column = np.clip(np.where(place.inside, place.column, 0.0), 0, found.camera.width - 1).astype(np.int64)
     row = np.clip(np.where(place.inside, place.row, 0.0), 0, found.camera.height - 1).astype(np.int64)
-    near, far = nearest_and_through(found, row, column)
+    near, least = _nearest_and_least(found, row, column)
     limit = np.maximum(tolerance(found.camera, place), least_m)
-    known = place.inside & (near > 0.0)
-    seen = known & (np.abs(near - place.depth) <= limit)
-    through = place.inside & (far > 0.0) & (far - place.depth > limit)
-    return Sight(seen, through & ~seen, known)
+    seen = place.inside & (near > 0.0) & (np.abs(near - place.depth) <= limit)
+    through = place.inside & (least > 0.0) & (least - place.depth > limit) & ~seen
+    mixed = seen & (least > 0.0) & (least < place.depth - limit)
+    return Sight(seen, through, mixed, place.inside & (near <= 0.0))
 
 
-def nearest_and_through(
+def _nearest_and_least(
     found: DepthMap, row: Int64[np.ndarray, " *n"], column: Int64[np.ndarray, " *n"]
 ) -> tuple[Float32[np.ndarray, " *n"], Float32[np.ndarray, " *n"]]:
     """A pixel's depth, and the least of it and those around it; 0 where one of them has none.

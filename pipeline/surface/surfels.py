@@ -68,7 +68,8 @@ def surfels(found: DepthMap, window: PhotoWindow, lattice: Lattice, tile: Tile, 
     place = [centre[axis] + ray[axis] / w for axis in range(3)]
     there = (place[2] >= relief.low_m) & (place[2] < relief.high_m) & _near(lattice, tile, place[0], place[1])
     some = np.flatnonzero(there)
-    known, row, column, w, x, y = (part[some] for part in (known, row, column, w, x, y))
+    known, row, column = known[some], row[some], column[some]
+    w, x, y = w[some], x[some], y[some]
     ray, place = [part[some] for part in ray], [part[some] for part in place]
     per_x, per_y = (g.ravel()[known].astype(np.float64) for g in gradient)
     across, down = per_x * camera.fx, per_y * camera.fy
@@ -124,7 +125,8 @@ def _inverse_and_gradient(
 
         def beside(along: int, aside: int, axis: int = axis) -> Float32[np.ndarray, "wh ww"]:
             down, right = (aside, along) if axis == 0 else (along, aside)
-            return inverse[REACH + down : REACH + down + height, REACH + right : REACH + right + width]
+            rows, columns = (slice(REACH + by, REACH + by + size) for by, size in ((down, height), (right, width)))
+            return np.asarray(inverse[rows, columns])
 
         gradients.append(_gradient(centre, near, beside))
     return np.nan_to_num(centre, nan=0.0), np.stack(gradients)
@@ -154,7 +156,7 @@ def _gradient(
     limit = near.ravel()[lone]
     single = np.where(np.abs(ahead) < limit, ahead, np.where(np.abs(behind) < limit, -behind, np.float32(np.nan)))
     result.ravel()[lone] = single
-    return result
+    return np.asarray(result)
 
 
 def _cut(depth: Float32[np.ndarray, "h w"], window: PhotoWindow, reach: int) -> Float32[np.ndarray, "a b"]:
