@@ -1,1 +1,1 @@
-"""What surveyors open: rasters, contours and clouds in the run's CRS."""
+"""What surveyors are handed besides the splat: surface model, orthophoto, contours, clouds, and their files."""

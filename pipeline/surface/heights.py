@@ -1,0 +1,154 @@
+"""The surface model: the height of the topmost surface in every cell, from the depths of all photos that see it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.surface.holes import REACH, filled
+from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.sight import place_in, sight
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, PhotoWindow, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, fitted, joined, layers, photo_votes, undecided
+
+TILE = 256  # cells a side
+LEAST_PHOTOS = 3  # that see a place
+MARGIN = REACH + 1  # cells around a tile that its holes look at
+FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
+MOST = np.iinfo(np.uint8).max
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """The surface model in a tile.
+
+    Attributes:
+        tile: Which.
+        height: Of the topmost surface at the cells' centres, local metres; nan where fewer than three photos see.
+        sigma: Expected deviation of each, metres; nan where there is none.
+        photos: How many photos agree on each; 1 where it was filled from around, 0 where there is none.
+    """
+
+    tile: Tile
+    height: Float32[np.ndarray, "h w"]
+    sigma: Float32[np.ndarray, "h w"]
+    photos: UInt8[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """All that the surface model is made from.
+
+    Attributes:
+        sources: Depths of the photos, always in the same order.
+        lattice: Whose cells get heights.
+        relief: Between which heights.
+        shelf: Holds a few depths.
+    """
+
+    sources: Sequence[DepthSource]
+    lattice: Lattice
+    relief: Relief
+    shelf: Shelf[DepthMap]
+
+    def depths(self, number: int) -> DepthMap:
+        """A photo's depths, loaded if they are not at hand."""
+        return self.shelf.get(number, partial(_loaded, self.sources[number]))
+
+
+def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
+    found = source.load()
+    shape = (found.camera.height, found.camera.width)
+    if found.depth.shape != shape or found.confidence.shape != shape:
+        raise ValueError(f"{found.camera.name}: depths of {found.depth.shape} for a camera of {shape}")
+    return found, found.depth.nbytes + found.confidence.nbytes
+
+
+def surface_heights(capture: Capture, tiles: Sequence[Tile], threads: int) -> Iterator[Heights]:
+    """Heights of tiles, in their order: the same bits for any number of threads, and however cells are tiled.
+
+    Args:
+        capture: Photos and cells.
+        tiles: Which to make.
+        threads: Tiles at a time.
+
+    Raises:
+        ValueError: if depths do not fit their camera.
+    """
+    return ordered_map(partial(tile_heights, capture), tiles, threads)
+
+
+def tile_heights(capture: Capture, tile: Tile) -> Heights:
+    """Heights of one tile."""
+    wide = tile.grown(MARGIN)
+    seen = seen_by([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
+    votes = joined([_votes(capture, wide, number, window) for number, window in seen], capture.relief)
+    cells = wide.height * wide.width
+    found = layers(votes, cells, capture.relief)
+    if not found:
+        return _empty(tile)
+    start = _chosen(capture, wide, found, [number for number, _ in seen])
+    fit = fitted(votes, start)
+    enough = fit.photos >= LEAST_PHOTOS
+    shape = (wide.height, wide.width)
+    height, new = filled(np.where(enough, fit.height, np.nan).reshape(shape), capture.lattice.cell_m)
+    sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma.reshape(shape))
+    photos = np.where(new, 1, np.where(enough, np.minimum(fit.photos, MOST), 0).reshape(shape))
+    inner = (slice(MARGIN, MARGIN + tile.height), slice(MARGIN, MARGIN + tile.width))
+    known = np.isfinite(height)
+    return Heights(
+        tile,
+        height[inner].astype(np.float32),
+        np.where(known, sigma, np.nan)[inner].astype(np.float32),
+        photos[inner].astype(np.uint8),
+    )
+
+
+def _empty(tile: Tile) -> Heights:
+    nothing = np.full((tile.height, tile.width), np.nan, np.float32)
+    return Heights(tile, nothing, nothing.copy(), np.zeros((tile.height, tile.width), np.uint8))
+
+
+def _votes(capture: Capture, tile: Tile, number: int, window: PhotoWindow) -> Votes:
+    return photo_votes(capture.depths(number), window, capture.lattice, tile, capture.relief)
+
+
+def _chosen(capture: Capture, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]) -> Float64[np.ndarray, " c"]:
+    """Of the surfaces in each cell the highest that no more photos look through than see it; nan where none is.
+
+    Where there are several, one that covers half of the cell at least comes before others.
+    """
+    asked = np.flatnonzero(undecided(found, LEAST_PHOTOS))
+    heights = np.stack([layer.height[asked] for layer in found])
+    balance = _balance(capture, tile, asked, heights, numbers)
+    good = np.isfinite(heights) & (balance >= 0)
+    covering = good & (np.stack([layer.cover[asked] for layer in found]) >= HALF)
+    good = np.where(covering.any(axis=0), covering, good)
+    highest = np.where(good.any(axis=0), np.argmax(good, axis=0), -1)
+    start = found[0].height.copy()
+    start[asked] = np.where(highest >= 0, heights[highest, np.arange(len(asked))], np.nan)
+    return start
+
+
+def _balance(
+    capture: Capture,
+    tile: Tile,
+    asked: Int64[np.ndarray, " a"],
+    heights: Float64[np.ndarray, "l a"],
+    numbers: Sequence[int],
+) -> Int64[np.ndarray, "l a"]:
+    """How many more photos see a surface than look through it."""
+    east, north = capture.lattice.centres(tile).reshape(-1, 2)[asked].T
+    balance = np.zeros(heights.shape, np.int64)
+    if not asked.size:
+        return balance
+    for number in reversed(numbers):  # the last ones are still at hand; whole numbers add up in any order
+        found = capture.depths(number)
+        view = sight(found, place_in(found.camera, east, north, heights), capture.lattice.cell_m)
+        balance += view.seen.astype(np.int64) - view.through
+    return balance

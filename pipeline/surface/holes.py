@@ -1,0 +1,48 @@
+"""Small holes in a height model, filled from their surroundings."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+REACH = 4  # cells: wider holes stay
+SIDES = 3  # of the four directions in which there has to be something within reach
+STEP_CELLS = 3.0  # heights this many cells above the lowest around are another surface: a hole at a wall is ground
+
+
+def filled(
+    height: Float64[np.ndarray, "h w"], cell_m: float
+) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Fill cells that have heights near by on three sides at least.
+
+    Args:
+        height: Metres, nan in holes; looked at within ``REACH`` cells of each.
+        cell_m: Side of a cell.
+
+    Returns:
+        The heights, and which are new. What lies behind an edge is hidden rather than the edge itself, so a hole
+        between two surfaces takes the lower one's.
+    """
+    rows, columns = np.nonzero(np.isnan(height))
+    wide = np.pad(height, REACH, constant_values=np.nan)
+    values, nearness = [], []
+    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        value, distance = np.full(len(rows), np.nan), np.full(len(rows), np.inf)
+        for step in range(REACH, 0, -1):
+            there = wide[rows + REACH + step * down, columns + REACH + step * right]
+            known = np.isfinite(there)
+            value[known], distance[known] = there[known], step
+        values.append(value)
+        nearness.append(1.0 / distance)
+    value, weight = np.stack(values), np.stack(nearness)
+    known = weight > 0.0
+    enough = known.sum(axis=0) >= SIDES
+    lowest = np.min(np.where(known, value, np.inf), axis=0)
+    used = np.where(known & (value <= lowest + STEP_CELLS * cell_m), weight, 0.0)
+    total = used[0] + used[1] + used[2] + used[3]
+    parts = used * np.where(known, value, 0.0)
+    mean = (parts[0] + parts[1] + parts[2] + parts[3]) / np.where(total > 0.0, total, 1.0)
+    result, new = height.copy(), np.zeros(height.shape, np.bool_)
+    result[rows[enough], columns[enough]] = mean[enough]
+    new[rows[enough], columns[enough]] = True
+    return result, new

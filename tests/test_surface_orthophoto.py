@@ -1,0 +1,175 @@
+"""The orthophoto of a scene whose colours are known: walls are red and nothing else is."""
+
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatpipe.pipeline.surface import mosaic
+from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.height_field import HeightField
+from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.orthophoto import SPREAD, Album, Orthophoto, orthophotos, tile_orthophoto
+from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, sampled, tone_curve
+from splatpipe.pipeline.surface.sight import Place
+from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from house_site import cameras, depths_of, edge_distance, photo_of, true_height, true_orthophoto
+
+HEIGHTS = Lattice(-11.04, 8.07, 0.1, 220, 160)
+FINE = Lattice(-11.04, 8.07, 0.1, 220, 160)
+WHOLE = Tile(0, 0, 160, 220)
+RELIEF = Relief(-1.0, 8.0)
+EXPOSURES = 2.0 ** np.random.default_rng(2).uniform(-0.3, 0.3, len(cameras()))
+
+
+@cache
+def plain_album() -> Album:
+    """All photos, each exposed differently."""
+    sources = []
+    for camera, exposure in zip(cameras(), EXPOSURES, strict=True):
+        found = depths_of(camera)
+        photo = np.asarray(cv2.LUT(photo_of(camera), tone_curve(np.full(3, exposure)).reshape(1, 256, 3)))
+        depths = DepthSource(camera, lambda found=found: found)
+        sources.append(PhotoSource(camera, lambda photo=photo: photo, depths))
+    east, north = np.moveaxis(HEIGHTS.centres(WHOLE), -1, 0)
+    surface = HeightField(HEIGHTS, true_height(east, north).astype(np.float32))
+    return Album(sources, surface, FINE, RELIEF, np.ones((len(sources), 3)), Shelf(1 << 28), Shelf(1 << 28))
+
+
+@cache
+def album() -> Album:
+    """The same with exposures levelled."""
+    return replace(plain_album(), gains=exposure_gains(plain_album(), threads=1))
+
+
+@cache
+def made() -> Orthophoto:
+    return tile_orthophoto(album(), WHOLE)
+
+
+def truth(lattice: Lattice, tile: Tile) -> np.ndarray:
+    centres = lattice.centres(tile)
+    off = ((np.arange(4) + 0.5) / 4 - 0.5) * lattice.cell_m
+    return np.mean([true_orthophoto(centres[..., 0] + e, centres[..., 1] + n) for e in off for n in off], axis=0)
+
+
+def psnr(colour: np.ndarray, true: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / np.mean(np.square(colour - true))))
+
+
+def test_it_is_what_a_look_straight_down_would_be() -> None:
+    assert made().known.all()
+    assert psnr(made().colour, truth(FINE, WHOLE)) > 30.0
+
+
+def test_walls_do_not_lean() -> None:
+    red = (made().colour[..., 0] > 150) & (made().colour[..., 1] < 90)
+    assert red.mean() < 1e-3
+
+
+def test_nothing_is_shown_twice_beside_the_eaves() -> None:
+    east, north = np.moveaxis(FINE.centres(WHOLE), -1, 0)
+    near = (edge_distance(east, north) < 1.0) & (edge_distance(east, north) > 0.15) & (true_height(east, north) == 0.0)
+    off = np.abs(made().colour.astype(float) - truth(FINE, WHOLE)).max(axis=-1)
+    assert (off[near] > 40.0).mean() < 0.002  # lawn and roof differ by 100 in blue
+
+
+def test_stripes_keep_their_contrast() -> None:
+    east, north = np.moveaxis(FINE.centres(WHOLE), -1, 0)
+    lawn = (edge_distance(east, north) > 0.5) & (true_height(east, north) == 0.0)
+    assert made().colour[..., 1][lawn].std() > 0.9 * truth(FINE, WHOLE)[..., 1][lawn].std()
+
+
+def test_exposures_are_levelled() -> None:
+    left = np.log2(album().gains[:, 1] * EXPOSURES)
+    assert np.ptp(left) < 0.06
+    assert np.ptp(np.log2(EXPOSURES)) > 0.4
+
+
+def test_tiles_and_threads_change_no_bit() -> None:
+    for part in orthophotos(album(), list(FINE.tiles(90))[::-1], threads=3):
+        tile = part.tile
+        cut = np.s_[tile.row : tile.row + tile.height, tile.column : tile.column + tile.width]
+        for name in ("colour", "label", "photos", "known"):
+            assert np.array_equal(getattr(part, name), getattr(made(), name)[cut])
+
+
+def test_a_cell_that_nobody_sees_is_filled_and_told() -> None:
+    whole = album()
+    height = whole.surface.height.copy()
+    height[20:24, 20:24] += 3.0  # photos see the lawn there, three metres lower
+    height[100:160, 0:60] = np.nan
+    part = tile_orthophoto(replace(whole, surface=HeightField(HEIGHTS, height)), WHOLE)
+    assert (part.label[21:23, 21:23] == -1).all()
+    assert (part.photos[21:23, 21:23] == 0).all()
+    assert part.known[21:23, 21:23].all()
+    assert part.colour[21:23, 21:23, 1].min() > 100
+    assert not part.known[101:, :59].any()
+    assert not part.colour[101:, :59].any()
+
+
+def test_far_from_all_that_is_seen_there_is_no_colour() -> None:
+    known = np.zeros((60, 60), np.bool_)
+    known[:, 0] = True
+    colour = np.full((60, 60, 3), 9, np.uint8)
+    colour[~known] = 0
+    result, reached = mosaic.spread(colour, known, np.ones_like(known), SPREAD)
+    assert reached[:, : SPREAD + 1].all()
+    assert not reached[:, SPREAD + 1 :].any()
+    assert (result[reached] == 9).all()
+
+
+def test_a_photo_without_depths_colours_nothing() -> None:
+    whole = plain_album()
+    blind = replace(
+        whole, sources=[replace(source, depths=None) for source in whole.sources[:3]], gains=np.ones((3, 3))
+    )
+    part = tile_orthophoto(blind, Tile(0, 0, 12, 10))
+    assert not part.known.any()
+    assert (part.label == -1).all()
+    assert np.array_equal(exposure_gains(blind, threads=1), np.ones((3, 3)))
+
+
+def test_pixels_of_another_size_are_refused() -> None:
+    whole = plain_album()
+    odd = replace(whole.sources[0], load=lambda: np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(ValueError, match="pixels of"):
+        tile_orthophoto(replace(whole, sources=[odd], pixels=Shelf(1)), WHOLE)
+
+
+def test_a_finer_photo_is_softened_and_an_equal_one_is_not() -> None:
+    board = np.indices((64, 64)).sum(axis=0) % 2 * 255
+    pixels = np.repeat(board[..., None], 3, axis=2).astype(np.uint8)
+    row, column = np.mgrid[4:12, 4:12] + 0.5
+    inside, ones = np.ones((8, 8), np.bool_), np.ones((8, 8))
+    same = sampled(pixels, Place(column, row, ones, ones, inside), np.zeros((8, 8), np.int64), PLAIN_TONE)
+    assert np.array_equal(same[..., 0], board[4:12, 4:12])
+    coarse = Place(column * 4, row * 4, ones, ones, inside)
+    assert np.ptp(sampled(pixels, coarse, np.full((8, 8), 2, np.int64), PLAIN_TONE)) <= 1
+
+
+def test_a_seam_runs_where_two_photos_look_alike() -> None:
+    grey = np.full((2, 40, 60), 100, np.uint8)
+    grey[1, :, 25:29] = 200  # a car that only one of them has
+    cost = np.full((2, 40, 60), 300, np.int32)
+    cost[0] += np.arange(60, dtype=np.int32) * 2  # the first is better on the left, the second on the right
+    cost[1] += (59 - np.arange(60, dtype=np.int32)) * 2
+    label = mosaic.labels(cost, np.ones_like(grey, np.bool_), grey, parity=0)
+    crossings = np.flatnonzero(label[20, 1:] != label[20, :-1])
+    assert crossings.size == 1
+    assert grey[0, 20, crossings[0]] == grey[1, 20, crossings[0]]
+
+
+def test_heights_between_cells_are_straight_on_slopes_and_sharp_at_steps() -> None:
+    lattice = Lattice(0.0, 2.0, 0.5, 4, 4)
+    height = np.tile(np.array([0.0, 0.2, 0.4, 5.0], np.float32), (4, 1))
+    field = HeightField(lattice, height)
+    at = field.at(np.array([0.5, 1.4, 1.6, 9.0]), np.full(4, 1.0))
+    assert np.allclose(at[:3], [0.1, 0.4, 5.0])
+    assert np.isnan(at[3])
