@@ -10,8 +10,9 @@ import pytest
 
 from splatpipe.pipeline.surface.heights import Capture, Heights, surface_heights, tile_heights
 from splatpipe.pipeline.surface.holes import filled
-from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.tiles import Tile
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from house_site import EAVES_M, ExactDepths, cameras, depths_of, edge_distance, photo_camera, true_height

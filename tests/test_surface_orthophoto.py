@@ -12,11 +12,12 @@ import pytest
 from splatpipe.pipeline.surface import mosaic
 from splatpipe.pipeline.surface.exposures import exposure_gains
 from splatpipe.pipeline.surface.height_field import HeightField
-from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.orthophoto import SPREAD, Album, Orthophoto, orthophotos, tile_orthophoto
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, sampled, tone_curve
 from splatpipe.pipeline.surface.sight import Place
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
+from splatpipe.pipeline.surface.tiles import Tile
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from house_site import cameras, depths_of, edge_distance, photo_of, true_height, true_orthophoto

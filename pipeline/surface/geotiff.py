@@ -32,8 +32,9 @@ from rasterio.shutil import copy as copy_raster
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.surface.grid import TILE, Grid, Tile
+from splatpipe.pipeline.surface.grid import TILE, Grid
 from splatpipe.pipeline.surface.map_crs import unit_name
+from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.whole_file import whole_file
 
 NODATA_HEIGHT = -9999.0

@@ -16,8 +16,9 @@ from affine import Affine
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface.smooth_map import SPACING_M, SmoothMap, sample_map
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
+from splatpipe.pipeline.surface.smooth_map import SPACING_M, SmoothMap, sample_map
+from splatpipe.pipeline.surface.tiles import Tile, tiled
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.world import World
 
@@ -33,23 +34,6 @@ HEIGHT_MARGIN_M = 10.0  # of the lattice beyond the scene: heights are straight 
 
 
 Exact = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
-
-
-@dataclass(frozen=True)
-class Tile:
-    """Some of a grid's cells: what one looks at at a time.
-
-    Attributes:
-        column: Of the first.
-        row: Of the first.
-        width: In cells.
-        height: In cells.
-    """
-
-    column: int
-    row: int
-    width: int
-    height: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +76,7 @@ class Grid:
 
     def tiles(self, size: int = TILE) -> Iterator[Tile]:
         """All of it, row by row of tiles."""
-        for row in range(0, self.height, size):
-            for column in range(0, self.width, size):
-                yield Tile(column, row, min(size, self.width - column), min(size, self.height - row))
+        return tiled(self.height, self.width, size)
 
     def cells_from_local(self, local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """East, north, up (metres) to column, row and height in the CRS's unit."""

@@ -11,9 +11,10 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.holes import REACH, filled
-from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sight import place_in, sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, PhotoWindow, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, fitted, joined, layers, photo_votes, undecided
 
 TILE = 256  # cells a side

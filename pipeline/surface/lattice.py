@@ -9,26 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-
-@dataclass(frozen=True)
-class Tile:
-    """A rectangle of cells; it may reach beyond its lattice.
-
-    Attributes:
-        row: Its first row.
-        column: Its first column.
-        height: Rows.
-        width: Columns.
-    """
-
-    row: int
-    column: int
-    height: int
-    width: int
-
-    def grown(self, cells: int) -> Tile:
-        """The same with so many more cells on every side."""
-        return Tile(self.row - cells, self.column - cells, self.height + 2 * cells, self.width + 2 * cells)
+from splatpipe.pipeline.surface.tiles import Tile, tiled
 
 
 @dataclass(frozen=True)
@@ -57,9 +38,7 @@ class Lattice:
 
     def tiles(self, side: int) -> Iterator[Tile]:
         """All of it in tiles of so many cells a side at most, row by row."""
-        for row in range(0, self.height, side):
-            for column in range(0, self.width, side):
-                yield Tile(row, column, min(side, self.height - row), min(side, self.width - column))
+        return tiled(self.height, self.width, side)
 
     def centres(self, tile: Tile) -> Float64[np.ndarray, "h w 2"]:
         """East and north of the cells' centres, the same bits whatever the tile is."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int16, Int32, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.height_field import HeightField
-from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.mosaic import (
     HIDDEN,
     MARGIN,
@@ -27,6 +27,7 @@ from splatpipe.pipeline.surface.mosaic import (
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, halvings, loader, sampled, tone_curve
 from splatpipe.pipeline.surface.sight import LEAST_SINE, Place, Sight, place_in, sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells a side
 SPREAD = 24  # cells that colours are spread to where no photo sees; further off there is none

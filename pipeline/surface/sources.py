@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.tiles import Tile
 
 Loaded = TypeVar("Loaded")
 

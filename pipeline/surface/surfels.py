@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief
+from splatpipe.pipeline.surface.tiles import Tile
 
 SAME_PX = 10.0  # depths that differ by more than so many pixels' widths are not one surface
 STEEPEST = 3.0  # rise over run; steeper is a façade, whose height at a place says nothing

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.lattice import Lattice, Tile
+from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief
 from splatpipe.pipeline.surface.surfels import splats, surfels
+from splatpipe.pipeline.surface.tiles import Tile
 
 STEP_M = 1e-4  # heights are counted in steps of it: sums of whole numbers are the same in any order
 # A key is one whole number, to be sorted: the cell, the height, how much of the cell is covered, and the confidence.

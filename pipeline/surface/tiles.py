@@ -1,0 +1,40 @@
+"""Rectangles of a raster's cells: what is made, written and held in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of cells; a grown one may reach beyond its raster.
+
+    Attributes:
+        row: Its first row.
+        column: Its first column.
+        height: Rows.
+        width: Columns.
+    """
+
+    row: int
+    column: int
+    height: int
+    width: int
+
+    def grown(self, cells: int) -> Tile:
+        """The same with so many more cells on every side."""
+        return Tile(self.row - cells, self.column - cells, self.height + 2 * cells, self.width + 2 * cells)
+
+
+def tiled(height: int, width: int, side: int) -> Iterator[Tile]:
+    """All cells of a raster in tiles of so many a side at most, row by row.
+
+    Args:
+        height: Rows of the raster.
+        width: Its columns.
+        side: Of a tile.
+    """
+    for row in range(0, height, side):
+        for column in range(0, width, side):
+            yield Tile(row, column, min(side, height - row), min(side, width - column))
