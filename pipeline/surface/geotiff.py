@@ -176,7 +176,7 @@ def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
 
 
 def _written_crs(grid: Grid, form: RasterForm) -> CRS:
-    """Heights have theirs, but for a datum by parameters (+towgs84): GDAL drops those from a compound CRS in a GeoTIFF."""
+    """Heights have theirs, but for a datum by parameters (+towgs84): a GeoTIFF of a compound CRS loses those in GDAL."""
     plane = grid.crs.horizontal
     crs = grid.crs.compound if form.has_heights and not plane.is_bound else plane
     return CRS.from_wkt(crs.to_wkt("WKT1_GDAL" if plane.is_engineering else "WKT2_2019"))
