@@ -176,7 +176,7 @@ def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
 
 
 def _written_crs(grid: Grid, form: RasterForm) -> CRS:
-    """Heights have theirs, but for a datum by parameters (+towgs84): a GeoTIFF of a compound CRS loses those in GDAL."""
+    """Heights have theirs, but for a datum by parameters (+towgs84): in a compound CRS, GDAL loses those on the way."""
     plane = grid.crs.horizontal
     crs = grid.crs.compound if form.has_heights and not plane.is_bound else plane
     return CRS.from_wkt(crs.to_wkt("WKT1_GDAL" if plane.is_engineering else "WKT2_2019"))
