@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from hills import IDENTITY, box, from_middle, hill, hill_grid, placed, write_hill
 
 STEP_M = 0.5 / 1024.0  # half of a height's step
+RINGING = 10  # of JPEG beside the black outside, of 90
 FORMS = {"heights": HEIGHTS, "confidence": CONFIDENCE, "colours": COLOURS, "jpeg": COLOURS_AS_JPEG}
 EXTRA_SAMPLES, UNASSOCIATED_ALPHA = 338, 2  # of TIFF 6.0
 
@@ -97,6 +98,16 @@ def test_crs_of_heights_has_its_vertical_datum_where_it_is_known(
     assert list(tmp_path.iterdir()) == [path]  # no .aux.xml beside it
 
 
+def test_parameters_of_a_datum_are_kept(tmp_path: Path) -> None:
+    shift = "598.1,73.7,418.2,0.202,0.045,-2.455,6.7"
+    crs = f"+proj=tmerc +lat_0=50 +lon_0=10 +k=1 +ellps=bessel +towgs84={shift} +units=m"
+    path = tmp_path / "dsm.tif"
+    write_hill(path, hill_grid(placed(crs, "EPSG:7837"), 0.5))
+    with rasterio.open(path) as raster:
+        assert "TOWGS84[598.1,73.7,418.2" in raster.crs.to_wkt()
+        assert raster.tags()["VERTICAL_DATUM"] == "EPSG:7837 (DHHN2016 height), metre"
+
+
 def test_crs_in_feet_has_heights_in_feet(tmp_path: Path) -> None:
     origin = type(placed().origin)(40.7, -73.9, 30.0)
     frame = Frame("enu", IDENTITY, origin, "EPSG:5703", crs="EPSG:2263", approximate_crs=True)
@@ -142,6 +153,21 @@ def test_colours_as_jpeg_are_near_with_a_mask_that_is_exact(tmp_path: Path) -> N
         np.testing.assert_array_equal(raster.dataset_mask(), wanted[3])
         off = np.abs(raster.read().astype(int) - wanted[:3])[:, wanted[3] > 0]
     assert float(off.mean()) < 3.0  # 8 where a gradient starts again from zero
+
+
+@pytest.mark.parametrize("form, off_most", [(COLOURS, 0), (COLOURS_AS_JPEG, RINGING)], ids=["lossless", "jpeg"])
+def test_overviews_of_colours_have_no_dark_fringe(tmp_path: Path, form: RasterForm, off_most: int) -> None:
+    path = tmp_path / "ortho.tif"
+    with raster_file(path, hill_grid(gsd_m=0.05), form) as file:
+        for tile in hill_grid(gsd_m=0.05).tiles():
+            values = np.full((4, tile.height, tile.width), 90, np.uint8)
+            values[3] = 255
+            values[3, 101:, :77] = 0  # odd: cells of the overview are half outside
+            file.write(tile, values)
+    with rasterio.open(path, overview_level=0) as raster:
+        seen = raster.dataset_mask() > 0
+        off = np.abs(raster.read([1, 2, 3]).astype(int) - 90)[:, seen]
+    assert not seen.all() and off.max() <= off_most
 
 
 @pytest.mark.parametrize("name", FORMS)

@@ -30,7 +30,7 @@ DXF_VERSION = "R2000"
 DXF_UNITS = {"metre": 6, "foot": 2, "US survey foot": 21}  # of $INSUNITS
 LAYER, INDEX_LAYER = "CONTOURS", "CONTOURS_INDEX"
 LINE_WEIGHTS = {LAYER: 13, INDEX_LAYER: 35}  # hundredths of a millimetre
-COLOURS = {LAYER: 8, INDEX_LAYER: 7}  # AutoCAD's grey; black or white, as the background asks
+LAYER_COLOURS = {LAYER: 8, INDEX_LAYER: 7}  # AutoCAD's grey; black or white, as the background asks
 DEGREE_DIGITS = 9  # a tenth of a millimetre
 UNIT_DIGITS = 4  # the same, of metres and feet
 
@@ -83,7 +83,7 @@ def write_dxf(path: Path, contours: Contours, crs: MapCrs) -> None:
         drawing.header["$MEASUREMENT"] = 1
         about = f"every {contours.interval:g}, {crs.described_heights()}; {crs.horizontal.name}"
         for name in (LAYER, INDEX_LAYER):
-            layer = drawing.layers.add(name, color=COLOURS[name], lineweight=LINE_WEIGHTS[name])
+            layer = drawing.layers.add(name, color=LAYER_COLOURS[name], lineweight=LINE_WEIGHTS[name])
             layer.description = f"Contours {about}"
         model = drawing.modelspace()
         scale = crs.height_unit_m / crs.unit_m

@@ -90,7 +90,7 @@ class RasterFile:
         Args:
             tile: Of the grid.
             values: (bands, height, width), or (height, width) of a raster of one band; of the form's type. Heights that
-                are not finite are nodata.
+                are not finite are nodata, and so are colours whose alpha is 0.
 
         Raises:
             ValueError: if they are not of the form's type and the tile's size.
@@ -101,6 +101,8 @@ class RasterFile:
             raise ValueError(f"{values.dtype} {values.shape} is not {self._form.dtype} of {self._form.bands} in {tile}")
         if self._form.has_heights:
             values = _packed_heights(values)
+        elif self._form.bands == _RGBA:
+            values = np.where(values[3] > 0, values, 0).astype(values.dtype)
         self._raster.write(values, window=Window(tile.column, tile.row, tile.width, tile.height))
 
 
@@ -153,7 +155,6 @@ _COG = {"BLOCKSIZE": str(TILE), "OVERVIEW_RESAMPLING": "AVERAGE", "BIGTIFF": "IF
 
 def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
     """What the tiled raster is made with, from which the final one is copied."""
-    crs = grid.crs.compound if form.has_heights else grid.crs.horizontal
     return {
         "driver": "GTiff",
         "width": grid.width,
@@ -161,7 +162,7 @@ def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
         "count": len(form.bands),
         "dtype": form.dtype,
         "nodata": form.nodata,
-        "crs": CRS.from_wkt(crs.to_wkt("WKT1_GDAL" if grid.crs.world is None else "WKT2_2019")),
+        "crs": _written_crs(grid, form),
         "transform": grid.transform,
         "tiled": True,
         "blockxsize": TILE,
@@ -173,6 +174,13 @@ def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
         "zlevel": 1,
         **({"photometric": "RGB", "alpha": "unspecified"} if form.bands == _RGBA else {}),
     }
+
+
+def _written_crs(grid: Grid, form: RasterForm) -> CRS:
+    """Heights have theirs, but for a datum by parameters (+towgs84): in a compound CRS, GDAL loses those on the way."""
+    plane = grid.crs.horizontal
+    crs = grid.crs.compound if form.has_heights and not plane.is_bound else plane
+    return CRS.from_wkt(crs.to_wkt("WKT1_GDAL" if plane.is_engineering else "WKT2_2019"))
 
 
 def _describe(raster: Any, grid: Grid, form: RasterForm) -> None:

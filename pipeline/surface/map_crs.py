@@ -17,11 +17,24 @@ from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.survey.crs import ELLIPSOIDAL, Crs, describe_vertical, open_operation, same_datum, utm_of
+from splatpipe.pipeline.survey.crs import (
+    ELLIPSOIDAL,
+    UNKNOWN,
+    Crs,
+    describe_vertical,
+    open_operation,
+    same_datum,
+    utm_of,
+)
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.world import World, open_world
 
 LOCAL = "local"
+HEIGHTS_FOR_PEOPLE = {
+    LOCAL: "above the local zero",
+    ELLIPSOIDAL: "above the WGS 84 ellipsoid",
+    UNKNOWN: "datum unknown",
+}
 LOCAL_WKT = (
     'ENGCRS["Local metres, z up, arbitrary place and heading",EDATUM["The reconstruction"],CS[Cartesian,2],'
     'AXIS["easting (E)",east],AXIS["northing (N)",north],LENGTHUNIT["metre",1]]'
@@ -59,9 +72,7 @@ class MapCrs:
 
     def described_heights(self) -> str:
         """Datum and unit of the heights, for people."""
-        datum = {LOCAL: "above the local zero", ELLIPSOIDAL: "above the WGS 84 ellipsoid"}.get(self.heights)
-        if datum is None:
-            datum = describe_vertical(self.heights) if self.vertical is not None else "datum unknown"
+        datum = HEIGHTS_FOR_PEOPLE.get(self.heights) or describe_vertical(self.heights)
         return f"{datum}, {unit_name(self.height_unit_m)}"
 
     def crs_from_local(self, local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

@@ -25,8 +25,8 @@ from splatpipe.pipeline.surface.whole_file import whole_file
 
 SCALE = 0.001  # of coordinates: a millimetre, or a thousandth of a foot
 NORMAL_STEPS = 127.0
-NORMALS = ("NormalX", "NormalY", "NormalZ")
-CONFIDENCE = "Confidence"
+NORMAL_FIELDS = ("NormalX", "NormalY", "NormalZ")
+CONFIDENCE_FIELD = "Confidence"
 SIXTEEN_BITS = 257  # 255 becomes 65,535
 ROWS = 1 << 18  # points converted at a time
 LIMITS_KNOWN = 0b110  # of an extra byte's options: laspy 2.7 takes them from the first point of each chunk alone
@@ -87,10 +87,10 @@ def _header(grid: Grid, taken_on: date) -> laspy.LasHeader:
     header.offsets = np.array([np.floor(west), np.floor(south), 0.0])
     header.creation_date = taken_on
     header.system_identifier = header.generating_software = PROGRAM
-    for name in NORMALS:
+    for name in NORMAL_FIELDS:
         steps = {"scales": np.array([1.0 / NORMAL_STEPS]), "offsets": np.zeros(1)}
         header.add_extra_dim(laspy.ExtraBytesParams(name, "int8", "unit normal", **steps))
-    header.add_extra_dim(laspy.ExtraBytesParams(CONFIDENCE, "uint8", "photos that confirm it"))
+    header.add_extra_dim(laspy.ExtraBytesParams(CONFIDENCE_FIELD, "uint8", "photos that confirm it"))
     for field in header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs:
         field.options &= ~LIMITS_KNOWN
     header.vlrs.append(WktCoordinateSystemVlr(grid.crs.compound.to_wkt("WKT1_GDAL")))
@@ -116,9 +116,9 @@ def _record(chunk: CloudChunk, grid: Grid, header: laspy.LasHeader) -> laspy.Sca
     for band, name in enumerate(("red", "green", "blue")):
         record[name] = chunk.colours[:, band].astype(np.uint16) * SIXTEEN_BITS
     normals = chunk.normals @ _turn(grid).T
-    for axis, name in enumerate(NORMALS):
+    for axis, name in enumerate(NORMAL_FIELDS):
         record.array[name] = np.rint(np.clip(normals[:, axis], -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
-    record.array[CONFIDENCE] = chunk.confidence
+    record.array[CONFIDENCE_FIELD] = chunk.confidence
     record["return_number"] = np.ones(len(steps), np.uint8)
     record["number_of_returns"] = np.ones(len(steps), np.uint8)
     return record
