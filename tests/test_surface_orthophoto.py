@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.surface import mosaic
 from splatpipe.pipeline.surface.exposures import exposure_gains
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.orthophoto import SPREAD, Album, Orthophoto, orthophotos, tile_orthophoto
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, sampled, tone_curve
+from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, photo_source, sampled, tone_curve
 from splatpipe.pipeline.surface.sight import Place
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
 from splatpipe.pipeline.surface.tiles import Tile
@@ -142,6 +143,17 @@ def test_pixels_of_another_size_are_refused() -> None:
     odd = replace(whole.sources[0], load=lambda: np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(ValueError, match="pixels of"):
         tile_orthophoto(replace(whole, sources=[odd], pixels=Shelf(1)), WHOLE)
+
+
+def test_a_photo_of_the_dataset_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
+    source = plain_album().sources[0]
+    path = tmp_path / "photo.png"
+    opened = photo_source(View(source.camera, path, None), source.camera, source.depths)
+    assert cv2.imwrite(str(path), source.load()[..., ::-1])
+    part = tile_orthophoto(replace(plain_album(), sources=[opened], pixels=Shelf(1)), Tile(120, 10, 8, 8))
+    same = tile_orthophoto(replace(plain_album(), sources=[source], pixels=Shelf(1)), Tile(120, 10, 8, 8))
+    assert part.known.all()
+    assert np.array_equal(part.colour, same.colour)
 
 
 def test_a_finer_photo_is_softened_and_an_equal_one_is_not() -> None:

@@ -19,6 +19,7 @@ DARKEST, LIGHTEST = 8, 247  # values that are not cut off
 REST = 3.0  # places' worth with which a photo keeps to its own exposure
 STRANGE = 0.15  # logarithm of light by which a photo may differ from the others; further off counts less
 ROUNDS = 4
+DIGITS = 5  # of gains: what solvers do otherwise for another number of threads lies far below
 
 
 def exposure_gains(album: Album, threads: int) -> Float64[np.ndarray, "n 3"]:
@@ -38,7 +39,7 @@ def exposure_gains(album: Album, threads: int) -> Float64[np.ndarray, "n 3"]:
     light = np.stack([row for row, _ in rows]) if rows else np.zeros((0, 0, 3))
     seen = np.stack([there for _, there in rows]) if rows else np.zeros((0, 0), np.bool_)
     gains = [_levelled(light[..., channel], seen) for channel in range(3)]
-    return np.asarray(np.clip(np.exp(np.stack(gains, axis=-1)), 1.0 / MOST_GAIN, MOST_GAIN))
+    return np.asarray(np.round(np.clip(np.exp(np.stack(gains, axis=-1)), 1.0 / MOST_GAIN, MOST_GAIN), DIGITS))
 
 
 def _places(surface: HeightField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

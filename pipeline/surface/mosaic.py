@@ -9,14 +9,15 @@ from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 NEVER = np.int32(1 << 28)  # cost of a photo that does not see a cell
 HIDDEN = 4000  # what such a cell adds to the cost around it: photos end before they end; and no cost is higher
 SMOOTH = 10  # cells on either side that a cell's costs are averaged over
-ODD_FREE = 20  # grey values that a photo may differ from the others without being odd...
+SOFT = 2  # cells on either side over which photos are softened before they are compared
+ODD_FREE = 15  # grey values that a photo may differ from the others without being odd...
 ODD = 15  # ...and what each more costs
 ODD_MOST = 60  # more differ by no more
 SEAM = 60  # cost of a seam between two cells,
 SEAM_STEP = 12  # and of each grey value that the photos differ there
 SWEEPS = 6  # in which seams move to better places
 FEATHER = 2  # cells on either side of a seam over which photos blend
-MARGIN = SMOOTH + 2 * SWEEPS + FEATHER + 1  # cells around a tile that its colours depend on
+MARGIN = SMOOTH + SOFT + 2 * SWEEPS + FEATHER + 1  # cells around a tile that its colours depend on
 
 
 def likeness_cost(
@@ -24,16 +25,24 @@ def likeness_cost(
 ) -> Int32[np.ndarray, "n h w"]:
     """What is added to photos that show something else than most: cars that drove on, what depths did not know.
 
-    The others' grey is a mean in which better photos count more, taken again without those that are far from it.
+    The others' grey is a mean in which better photos count more, taken again without those that are far from it; all
+    softened, for a texture that two photos show a fraction of a pixel apart is not odd.
     """
+    soft = np.stack([_softened(*pair) for pair in zip(grey, seen, strict=True)])
     weight = np.where(seen, np.int32(1 << 16) // (cost + 64), np.int32(0))  # 1024 at most: sums of 255 × it fit
     mean = np.zeros(grey.shape[1:], np.int32)
     for _ in range(2):
         total = np.maximum(weight.sum(axis=0, dtype=np.int32), 1)
-        mean = (weight * grey).sum(axis=0, dtype=np.int32) // total
-        off = np.abs(grey - mean)
+        mean = (weight * soft).sum(axis=0, dtype=np.int32) // total
+        off = np.abs(soft - mean)
         weight = weight // np.maximum(1, off // ODD_FREE) ** 2
     return np.where(seen, ODD * np.clip(off - ODD_FREE, 0, ODD_MOST), 0).astype(np.int32)
+
+
+def _softened(grey: UInt8[np.ndarray, "h w"], seen: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
+    """The mean around each cell of those that the photo sees."""
+    total, count = (_box(part, SOFT) for part in (np.where(seen, grey, 0).astype(np.int32), seen.astype(np.int32)))
+    return np.asarray(total // np.maximum(count, 1))
 
 
 def labels(

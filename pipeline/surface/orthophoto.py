@@ -187,5 +187,9 @@ def _cost(camera: Camera, place: Place, cell_m: float) -> Int32[np.ndarray, "h w
         np.minimum(place.column, camera.width - place.column), np.minimum(place.row, camera.height - place.row)
     )
     rim = np.clip(1.0 - edge / (RIM * camera.width), 0.0, 1.0)
-    total = LEANING * (1.0 - sine) + COARSE * np.clip(pixel / cell_m - 1.0, 0.0, 4.0) + RIM_COST * rim
+    total = (
+        LEANING * np.sqrt(1.0 - np.square(np.minimum(sine, 1.0)))
+        + COARSE * np.clip(pixel / cell_m - 1.0, 0.0, 4.0)
+        + RIM_COST * rim
+    )
     return scaled_cost(np.where(place.inside, total, 0.0))

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.images import load_colour
 from splatpipe.pipeline.surface.sight import Place
 from splatpipe.pipeline.surface.sources import DepthSource
 
@@ -33,6 +35,17 @@ class PhotoSource:
     camera: Camera
     load: Callable[[], UInt8[np.ndarray, "h w 3"]]
     depths: DepthSource | None
+
+
+def photo_source(view: View, camera: Camera, depths: DepthSource | None) -> PhotoSource:
+    """A photo of the dataset, decoded when a tile asks for it.
+
+    Args:
+        view: Whose photo; its camera is in the dataset's frame.
+        camera: The same in local metres.
+        depths: The photo's, or None.
+    """
+    return PhotoSource(camera, partial(load_colour, view), depths)
 
 
 def halvings(camera: Camera, place: Place, cell_m: float) -> Int64[np.ndarray, " *n"]:

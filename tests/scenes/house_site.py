@@ -135,14 +135,14 @@ def colours(kind: NDArray[np.int64], east: Array, north: Array) -> Array:
     return colour + np.where((kind == GROUND) | (kind == ROOF_SIDE), stripe * 50.0, 0.0)[..., None]
 
 
-def photo_of(camera: Camera, parts: int = 3, exposure: float = 1.0) -> NDArray[np.uint8]:
+def photo_of(camera: Camera, parts: int = 2) -> NDArray[np.uint8]:
     """What the camera sees, each pixel the mean of some samples."""
     origin, ray = camera.centre(), _rays(camera, parts)
     depth, kind = trace(origin, ray)
     safe = np.where(np.isfinite(depth), depth, 0.0)
     sampled = colours(kind, origin[0] + safe * ray[0], origin[1] + safe * ray[1])
     mean = sampled.reshape(camera.height, parts, camera.width, parts, 3).mean(axis=(1, 3))
-    return np.clip(mean * exposure, 0, 255).round().astype(np.uint8)
+    return np.clip(mean, 0, 255).round().astype(np.uint8)
 
 
 def true_orthophoto(east: Array, north: Array) -> Array:
