@@ -18,7 +18,7 @@ from PIL import Image
 
 from .house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE
 from .mesh import Array, Plane
-from .scene import PLOT_YAW_DEG, build_scene, turned
+from .scene import build_scene, turned
 
 PIXEL_M = 0.014  # half of the photos' GSD
 TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # of what is seen from above; nothing within it is so high
