@@ -14,8 +14,6 @@ from surface_measures import figures, fitted_colours, harmonic, near_steps, psnr
 from surface_products import Facade, Points, Raster, colours
 from surface_scene import GSD_M, STEP_CELLS, STEP_M, Site, Truth, site_of, true_picture
 from tables import Row
-from texture_contrast import EDGE_PX
-from texture_contrast import figures as contrast_figures
 from triangle_distances import Surface, spread, surface_of, thinned
 
 from splatpipe.demo import CAPTURE
@@ -118,6 +116,9 @@ def measure_ortho(site: Site, raster: Raster, true: Path | None) -> tuple[Row, l
 def _contrasts(
     site: Site, picture: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], counts: Bool[np.ndarray, "h w"]
 ) -> list[Row]:
+    from texture_contrast import EDGE_PX  # here, for it loads torch
+    from texture_contrast import figures as contrast_figures
+
     rows = []
     kernel = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
     for name, part in {"tiles": TILED, "slates": SLATED, "metal roof": SHEETED, "ground": GROUND}.items():
@@ -157,7 +158,7 @@ def measure_facades(truth: Truth, facades: list[Facade]) -> list[Row]:
         view = facade_view(name, GSD_M)
         relief = seen_in(view, truth.triangles)
         parts = np.where(relief.triangle >= 0, truth.parts[relief.triangle], -1)
-        near = np.abs(relief.height + AHEAD_M) < WALL_M
+        near = np.abs(relief.height + AHEAD_M[name]) < WALL_M
         clear = ~near_steps(relief.height, STEP_M, STEP_CELLS)
         row, column = np.nonzero(np.isin(parts, WALL_PARTS) & near & clear & (relief.cosine > 0.0))
         points = view.from_grid(np.column_stack([column + 0.5, row + 0.5, -relief.height[row, column]]))

@@ -22,7 +22,8 @@ from .scene import build_scene, turned
 
 PIXEL_M = 0.014  # half of the photos' GSD
 TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # of what is seen from above; nothing within it is so high
-AHEAD_M = 5.5  # where a façade is looked at from: farther than annex, eaves and steps, nearer than trees and vans
+# Where a façade is looked at from: farther than annex, eaves and steps, nearer than trees, and the van in the south.
+AHEAD_M = {"south": 4.0, "north": 5.5, "west": 5.5, "east": 5.5}
 MARGIN_M = 0.3  # around a wall
 STRIP_ROWS = 512
 SEED = 20261123
@@ -100,7 +101,7 @@ def wall_planes() -> dict[str, tuple[Plane, float, float]]:
 def facade_view(name: str, pixel_m: float = PIXEL_M) -> View:
     """A wall of the house from before it, with a margin around."""
     wall, span, high = wall_planes()[name]
-    origin = wall.point(-MARGIN_M, high + MARGIN_M, AHEAD_M)
+    origin = wall.point(-MARGIN_M, high + MARGIN_M, AHEAD_M[name])
     size = (round(metres / pixel_m) for metres in (span + 2.0 * MARGIN_M, high + 2.0 * MARGIN_M))
     return View(name, origin, wall.u, -wall.v, pixel_m, *size)
 

@@ -25,6 +25,7 @@ from splatpipe.pipeline.survey.world import open_world
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import surface_checks
 from rays import first_hits
 from surface_checks import matching, measure_dsm, measure_facades, measure_points, target_difference
 from surface_products import Facade, Raster, plan_crs, read_cloud, read_facades, read_mesh, read_raster, true_frame
@@ -44,10 +45,9 @@ def surface() -> Triangles:
 
 @pytest.fixture(scope="module")
 def truth(surface: Triangles) -> Truth:
-    """Seen by five photos from above, and one of each façade, small ones."""
-    cameras = depth_maps.true_cameras()[1]
-    small = [cameras[k].scaled(118, 88) for k in (0, 4, 8, 12, 31, 33, 35, 37, 39)]
-    sights = [Sight(camera, depth_map(camera, surface).astype(np.float32)) for camera in small]
+    """Of photos that look through everything, which is quickly made: what hides what is told by other tests."""
+    cameras = [camera.scaled(118, 88) for camera in depth_maps.true_cameras()[1]]
+    sights = [Sight(camera, np.full((88, 118), np.inf, np.float32)) for camera in cameras]
     return Truth(surface, parts.parts_of(surface), sights)
 
 
@@ -83,7 +83,8 @@ def test_reliefs_are_what_parallel_rays_hit(surface: Triangles) -> None:
         found = seen_in(view, surface)
         for row, column in zip(*(rng.integers(0, size, 5) for size in found.height.shape), strict=True):
             start = view.from_grid(np.array([column + 0.5, row + 0.5, 0.0]))
-            hit = first_hits(start, view.ahead[None], surface)[0]
+            with np.errstate(invalid="ignore"):  # triangles that are seen edge-on
+                hit = first_hits(start, view.ahead[None], surface)[0]
             assert -found.height[row, column] == pytest.approx(hit, abs=1e-6)
 
 
@@ -107,7 +108,7 @@ def test_views_look_where_they_say() -> None:
         view = facade_view(name)
         assert view.ahead @ wall.n == pytest.approx(-1.0) and abs(wall.n[2]) < 1e-12
         left, right = view.to_grid(np.stack([wall.origin, wall.point(span, 0.0)]))
-        assert left[0] < right[0] and left[2] == pytest.approx(AHEAD_M)
+        assert left[0] < right[0] and left[2] == pytest.approx(AHEAD_M[name])
 
 
 def test_parts_are_where_they_are_built(surface: Triangles) -> None:
@@ -162,9 +163,9 @@ def wall_facade(name: str, surface: Triangles, ahead: float = 0.0) -> Facade:
     """A wall's true elevation, exactly as large as the wall; its depths with an error."""
     wall, span, high = wall_planes()[name]
     pixel = 0.05
-    view = replace(facade_view(name, pixel), origin=wall.point(0.0, high, AHEAD_M))
+    view = replace(facade_view(name, pixel), origin=wall.point(0.0, high, AHEAD_M[name]))
     view = replace(view, width=round(span / pixel), height=round(high / pixel))
-    depth = seen_in(view, surface).height + AHEAD_M + ahead
+    depth = seen_in(view, surface).height + AHEAD_M[name] + ahead
     corners = np.stack([wall.point(0.0, high), wall.point(span, high), wall.point(span, 0.0), wall.point(0.0, 0.0)])
     return Facade(name, corners, np.where(np.isfinite(depth), depth, np.nan))
 
@@ -215,14 +216,15 @@ def test_photos_see_what_nothing_hides() -> None:
     assert photos_that_see(places, level, sights)[0] == 6  # three stand straight above: seen as a line
 
 
-def test_clouds_and_meshes_are_judged_on_both_sides() -> None:
+def test_clouds_and_meshes_are_judged_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_checks, "SAMPLES", 8_000)
     triangles, sights = plate()
     scene = Truth(triangles, np.full(2, parts.GROUND, np.int8), sights)
     rng = np.random.default_rng(0)
     true = surface_of(triangles, 0.1, rng)
-    points = spread(triangles, 200_000, rng)[0]
+    points = spread(triangles, 40_000, rng)[0]
     row = measure_points(scene, true, points, true.distances)
-    assert row["precision"] == row["recall"] == row["f1"] == 1.0 and row["true places"] > 10_000
+    assert row["precision"] == row["recall"] == row["f1"] == 1.0 and row["true places"] > 1_000
     floating = np.concatenate([points, points + np.array([0.0, 0.0, 3 * GSD_M])])
     assert measure_points(scene, true, floating, true.distances)["precision"] == pytest.approx(0.5, abs=0.02)
     half = surface_of(triangles[:1], 0.1, rng)
