@@ -60,10 +60,15 @@ def develop(radiance: Array, exposure_ev: float, rng: np.random.Generator) -> ND
     """Radiance (h, w, 3) to an 8-bit sRGB photo: exposure, sensor noise, soft highlights."""
     light = radiance * GAIN * 2**exposure_ev * WHITE_BALANCE
     light = light + rng.standard_normal(light.shape) * np.sqrt(SHOT_NOISE * light + READ_NOISE)
+    return coded(light)
+
+
+def coded(light: Array) -> NDArray[np.uint8]:
+    """Light on the sensor (h, w, 3) to 8-bit sRGB, with soft highlights."""
     light = np.where(light < 0.7, light, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.3))
     light = np.clip(light, 0, 1)
-    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.asarray(coded * 255 + 0.5, np.uint8)
+    values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.asarray(values * 255 + 0.5, np.uint8)
 
 
 def compress(photos: list[NDArray[np.uint8]], budget: float) -> list[bytes]:

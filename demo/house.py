@@ -20,11 +20,13 @@ SLOPE = (RIDGE - EAVES) / HALF_WIDTH
 STONE = slabs(("a79c8a", "958a79", "b7ad9b", "8a8175", "a8977c"), "6f6759", 0.55, 0.3, 0.4)
 FRAME = painted("e8e6df", 0.3)
 CREAM = plaster("d9c6a0", "a58d6a")
+NORTH_PLASTER = plaster("c9c3b4", "8f9079")
 BRICK = bricks(("8d4a34", "a2593d", "b56e4b", "7a3d2e", "9c6148", "c0825e"), "b5aa9a")
 CLADDING = planks(("7a5a3c", "8d6b49", "6b4c33", "a07d56"))
 TILES = roof_tiles(("8f5340", "a2634a", "7d4a3c", "b27a5c", "6f4438", "9c6e58"))
 SLATE = roof_tiles(("59616b", "6b727a", "4a515c", "7d8388", "66605f"))
 METAL = painted("6f7274", 0.8)
+SHEET = mottled(("7c8a80", "8f9a8c", "69756d", "9ba394"), 1.6, 0.15, 0.07)  # of the annex
 WOOD = planks(("6a4a30", "7d5a3a", "5a3d28"), 0.14, 1.5)
 
 
@@ -95,7 +97,7 @@ def _walls(b: Builder) -> None:
     north = Plane.make((HALF_LENGTH, HALF_WIDTH, 0), (-1, 0, 0), (0, 0, 1))
     back = [Window(4.6, 0.35, 7.2, 2.45, 3), Window(1.3, 1.0, 2.6, 2.3), Window(9.0, 0.95, 10.5, 2.3, 3)]
     back += [Window(a, 3.35, a + 1.2, 4.6, 2, blue) for a in (1.4, 5.3, 9.2)]
-    add_wall(b, north, box, back, plaster("c9c3b4", "8f9079"), 20)
+    add_wall(b, north, box, back, NORTH_PLASTER, 20)
     gable = [(0.0, 0.0), (width, 0.0), (width, EAVES), (width / 2, RIDGE), (0.0, EAVES)]
     west = Plane.make((-HALF_LENGTH, HALF_WIDTH, 0), (0, -1, 0), (0, 0, 1))
     side = [
@@ -237,8 +239,7 @@ def _annex(b: Builder) -> None:
     b.rect(front.at(0, 0, 0.065), (0.9, 1.75), (3.4, 2.1), interior("4c5560", "a9b7bf"), gloss=True)
     roof = Plane.make((x1, y0, low), (0, 1, 0), (-span, 0, high - low))
     length = float(np.hypot(span, high - low))
-    sheet = mottled(("7c8a80", "8f9a8c", "69756d", "9ba394"), 1.6, 0.15, 0.07)
-    b.box(roof, (-0.35, -0.4, 0.0), (y1 - y0 + 0.35, length, 0.14), WOOD, top=sheet)
+    b.box(roof, (-0.35, -0.4, 0.0), (y1 - y0 + 0.35, length, 0.14), WOOD, top=SHEET)
     for u in np.arange(0.3, y1 - y0, 1.1):  # standing seams
         b.box(roof, (u, -0.4, 0.14), (u + 0.06, length, 0.2), METAL)
 

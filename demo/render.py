@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from .cameras import Lens, Pose
 from .mesh import Array
+from .orthographic import View
 from .scene import Scene
 
 SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG = 46.0, 222.0
@@ -88,28 +90,53 @@ class Renderer:
         import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
-        count = lens.width * lens.height
-        index = dr.arange(mi.UInt32, count)
-        px, py = mi.Float(index % lens.width) + 0.5, mi.Float(index // lens.width) + 0.5
         rotation = mi.Matrix3f(pose.world_from_cam[:3, :3].tolist())
         origin = mi.Point3f(*(float(x) for x in pose.world_from_cam[:3, 3]))
         dr.make_opaque(rotation, origin)  # literals would be compiled in, anew for each photo and sample
+
+        def ray(px: Any, py: Any) -> Any:
+            xd, yd = (px - lens.cx) / lens.f, (py - lens.cy) / lens.f
+            if lens.is_simple:
+                scale = _undistort_scale(dr.sqrt(xd * xd + yd * yd), lens.k)
+                x, y = xd * scale, yd * scale
+            else:
+                x, y = lens.undistort(xd, yd)
+            return mi.Ray3f(origin, dr.normalize(rotation @ mi.Vector3f(x, y, 1.0)))
+
+        return self._picture(lens.width, lens.height, ray, spp, seed)
+
+    def orthographic(self, view: View, spp: int, seed: int) -> NDArray[np.float32]:
+        """Radiance of each pixel, (h, w, 3), along parallel rays; as ``photo`` otherwise."""
+        import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
+
+        mi = self.mi
+        steps = (view.right * view.pixel_m, view.down * view.pixel_m, view.ahead)
+        right, down, ahead = (mi.Vector3f(*vector.tolist()) for vector in steps)
+        origin = mi.Point3f(*view.origin.tolist())
+        dr.make_opaque(right, down, ahead, origin)
+        return self._picture(
+            view.width, view.height, lambda x, y: mi.Ray3f(origin + right * x + down * y, ahead), spp, seed
+        )
+
+    def _picture(
+        self, width: int, height: int, ray: Callable[[Any, Any], Any], spp: int, seed: int
+    ) -> NDArray[np.float32]:
+        """Mean radiance of each pixel, (h, w, 3), along the rays of places in it (pixels)."""
+        import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
+
+        mi = self.mi
+        count = width * height
+        index = dr.arange(mi.UInt32, count)
+        px, py = mi.Float(index % width) + 0.5, mi.Float(index // width) + 0.5
         offsets = _filter_offsets(spp, seed)
         total = np.zeros((count, 3), np.float32)
         for sample in range(spp):
             shift = mi.Point2f(*(float(x) for x in offsets[sample]))
             number = dr.opaque(mi.UInt32, sample)
             dr.make_opaque(shift)
-            xd, yd = (px + shift.x - lens.cx) / lens.f, (py + shift.y - lens.cy) / lens.f
-            if lens.is_simple:
-                scale = _undistort_scale(dr.sqrt(xd * xd + yd * yd), lens.k)
-                x, y = xd * scale, yd * scale
-            else:
-                x, y = lens.undistort(xd, yd)
-            ray = mi.Ray3f(origin, dr.normalize(rotation @ mi.Vector3f(x, y, 1.0)))
-            radiance = self._path(ray, index, number, dr.opaque(mi.UInt32, seed))
+            radiance = self._path(ray(px + shift.x, py + shift.y), index, number, dr.opaque(mi.UInt32, seed))
             total += np.array(dr.minimum(radiance, RADIANCE_CAP)).T
-        return np.asarray(total.reshape(lens.height, lens.width, 3) / spp, np.float32)
+        return np.asarray(total.reshape(height, width, 3) / spp, np.float32)
 
     def _path(self, ray: Any, pixel: Any, sample: Any, seed: Any) -> Any:
         """Radiance along rays: the sun by one shadow ray at each surface, the sky where the path leaves the scene.

@@ -77,6 +77,11 @@ def _turn(plot_yaw_deg: float) -> Array:
     return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
 
 
+def turned(points: Array) -> Array:
+    """Plot coordinates (..., 3) to east, north, up."""
+    return np.asarray(points @ _turn(PLOT_YAW_DEG).T)
+
+
 def build_scene(seed: int = SEED) -> Scene:
     """Build and paint the scene; some 20 s."""
     builder = Builder()

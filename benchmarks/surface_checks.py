@@ -1,0 +1,237 @@
+"""Each product of a run against the demo's truth: rows of figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+from roof_edges import edge_distances, edge_figures
+from surface_measures import figures, fitted_colours, harmonic, near_steps, psnr, reached, relief_errors, rmse
+from surface_products import Facade, Points, Raster, colours
+from surface_scene import GSD_M, STEP_CELLS, STEP_M, Site, Truth, site_of, true_picture
+from tables import Row
+from triangle_distances import Surface, spread, surface_of, thinned
+
+from splatpipe.demo import CAPTURE
+from splatpipe.demo.orthographic import AHEAD_M, MARGIN_M, facade_view, top_view, wall_planes
+from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED
+from splatpipe.demo.relief import seen_in
+from splatpipe.demo.visibility import FEWEST, photos_that_see
+from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
+
+TOLERANCE_GSD = 2.0  # of clouds and meshes
+SAMPLES = 100_000  # of the true surface and of a product: a share's deviation is below 0.002
+SPACING_M = 0.05  # between places on the true surface
+SEED = 18
+TARGET_REACH_PX = 32  # of the crop that a target is looked for in; a target is some 18 px
+FOUND_PX = 12.0  # farther off, it is another one, or nonsense
+SEEN_M = 0.05  # a target that lies deeper than what is seen from above is hidden
+WALL_M = 0.5  # before or behind a wall's plane, what belongs to it: reveals, sills, frames, steps of the roof's edge
+SAME_NORMAL = 0.9  # cosine, of a façade and the wall that it is of
+SAME_WALL_M = 2.0  # between their planes, at most
+WALL_PARTS = (HOUSE, PLAIN, BRICKS)
+MAIN_ROOF_M = 4.3  # its eaves' height, less a little; the annex and the canopy are lower
+
+
+def measure_dsm(site: Site, raster: Raster) -> list[Row]:
+    """A row for what counts, each class of it, and what is counted apart."""
+    found = site.cut(np.where(raster.there, raster.bands[0].astype(np.float64), np.nan), np.nan)
+    errors = relief_errors(found, site.relief.height, site.relief.cosine)
+    clear = site.below & ~site.steps
+    counts, roofs = site.seen & clear, site.roofs | site.ground
+    others = ~(site.ground | site.house)
+    rows = {
+        "roofs and ground": counts & roofs,
+        "roofs": counts & site.roofs,
+        "ground": counts & site.ground,
+        "metal roof": counts & (site.parts == SHEETED),
+        "apart: near steps": site.seen & site.below & site.steps & roofs,
+        "apart: fewer than 3 photos": site.below & ~site.seen & roofs,
+        "apart: trees and things": site.seen & site.below & others,
+    }
+    return [{"what": what} | figures(errors[mask], GSD_M) for what, mask in rows.items()]
+
+
+def target_differences(
+    site: Site, picture: UInt8[np.ndarray, "h w 3"], cell_m: float
+) -> dict[str, Float64[np.ndarray, " 2"]]:
+    """Metres east and south from each target's true place to where the orthophoto shows it; NaN where it does not.
+
+    Targets that are truly to be seen from above, by three photos.
+    """
+    points = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["points"]
+    apart = {}
+    for point in points:
+        if point["where"] == "wall":
+            continue
+        column, row, height = site.way(np.array([point["xyz_m"]]))[0]
+        at = int(row), int(column)
+        inside = 0 <= at[0] < picture.shape[0] and 0 <= at[1] < picture.shape[1]
+        if inside and site.seen[at] and abs(site.relief.height[at] - height) < SEEN_M:
+            apart[point["name"]] = target_difference(picture, np.array([column, row])) * cell_m
+    return apart
+
+
+def target_difference(
+    picture: UInt8[np.ndarray, "h w 3"], place: Float64[np.ndarray, " 2"]
+) -> Float64[np.ndarray, " 2"]:
+    """Pixels from a place to the quadrant target that is found there; NaN where there is none."""
+    left, top = np.maximum(place.astype(int) - TARGET_REACH_PX, 0)
+    crop = picture[top : top + 2 * TARGET_REACH_PX, left : left + 2 * TARGET_REACH_PX]
+    found = [np.array([t.x + left, t.y + top]) - place for t in find_quadrant_targets(np.ascontiguousarray(crop))]
+    near = min(found, key=lambda apart: float(np.hypot(*apart)), default=np.full(2, np.inf))
+    return near if np.hypot(*near) <= FOUND_PX else np.full(2, np.nan)
+
+
+def measure_ortho(site: Site, raster: Raster, true: Path | None) -> tuple[Row, list[Row]]:
+    """Its figures, and a row of contrasts of each texture; without the true picture only the targets.
+
+    Args:
+        site: The truth on its grid.
+        raster: The orthophoto.
+        true: The true picture from above.
+    """
+    picture, there = site.cut(colours(raster), 0), site.cut(raster.there, False)
+    apart = target_differences(site, picture, raster.cell)
+    places = np.array(list(apart.values())).reshape(-1, 2)
+    off = rmse(places)
+    row: Row = {"targets": len(apart), "found": int(np.isfinite(places).all(axis=1).sum())}
+    row |= {"rmse": None if off is None else off / GSD_M, "complete": float(there[site.seen].mean())}
+    if true is None:
+        return row, []
+    truth, whole = true_picture(true, top_view(), site)
+    counts = site.seen & whole
+    row["psnr"] = psnr(picture, truth, counts)
+    row["psnr_cc"] = psnr(np.where(there[..., None], fitted_colours(picture, truth, counts & there), 0), truth, counts)
+    main = site.house & (site.true_heights > MAIN_ROOF_M)
+    distances = [edge_distances(picture, truth, roof, counts) for roof in (main, site.house & ~main)]
+    row |= edge_figures(np.concatenate(distances))
+    return row, _contrasts(site, picture, truth, counts)
+
+
+def _contrasts(
+    site: Site, picture: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], counts: Bool[np.ndarray, "h w"]
+) -> list[Row]:
+    from texture_contrast import EDGE_PX  # here, for it loads torch
+    from texture_contrast import figures as contrast_figures
+
+    rows = []
+    kernel = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
+    for name, part in {"tiles": TILED, "slates": SLATED, "metal roof": SHEETED, "ground": GROUND}.items():
+        inner = cv2.erode((counts & (site.parts == part)).astype(np.uint8), kernel, borderValue=0) > 0
+        rows.append({"texture": name} | contrast_figures([(truth, picture, inner)]))
+    return rows
+
+
+def matching(facades: list[Facade], name: str) -> Facade | None:
+    """The elevation of a wall of the house; None where there is none."""
+    wall, span, high = wall_planes()[name]
+    middle = wall.point(span / 2.0, high / 2.0)
+    near = []
+    for facade in facades:
+        normal = facade.axes()[2]
+        off = abs(float((facade.corners.mean(axis=0) - middle) @ wall.n))
+        if normal @ wall.n > SAME_NORMAL and off < SAME_WALL_M:
+            near.append((float(np.linalg.norm(facade.corners.mean(axis=0) - middle)), len(near), facade))
+    return min(near)[2] if near else None
+
+
+def facade_errors(facade: Facade, points: Points, normals: Points) -> Float64[np.ndarray, " n"]:
+    """Distances normal to the true surface at places on it, positive outside; NaN where the elevation has no depth."""
+    right, down, normal = facade.axes()
+    axes = np.stack([right / (right @ right), down / (down @ down), normal])
+    column, row, depth = ((points - facade.corners[0]) @ axes.T).T
+    height, width = facade.depth.shape
+    inside = (column >= 0.0) & (row >= 0.0) & (column < width) & (row < height)
+    at = np.where(inside, row, 0.0).astype(np.intp), np.where(inside, column, 0.0).astype(np.intp)
+    return np.asarray(np.where(inside, facade.depth[at] - depth, np.nan) * np.abs(normals @ normal))
+
+
+def measure_facades(truth: Truth, facades: list[Facade]) -> list[Row]:
+    """A row a wall, then all of them and the plain ones; a wall that no elevation is of is missing altogether."""
+    rows, every, plain = [], [], []
+    for name, (wall, span, _high) in wall_planes().items():
+        view = facade_view(name, GSD_M)
+        relief = seen_in(view, truth.triangles)
+        parts = np.where(relief.triangle >= 0, truth.parts[relief.triangle], -1)
+        near = np.abs(relief.height + AHEAD_M[name]) < WALL_M
+        clear = ~near_steps(relief.height, STEP_M, STEP_CELLS)
+        row, column = np.nonzero(np.isin(parts, WALL_PARTS) & near & clear & (relief.cosine > 0.0))
+        points = view.from_grid(np.column_stack([column + 0.5, row + 0.5, -relief.height[row, column]]))
+        normals = truth.normals[relief.triangle[row, column]]
+        seen = photos_that_see(points, normals, truth.sights) >= FEWEST
+        within = (points[seen] - wall.origin) @ wall.u
+        assert within.size == 0 or (within.min() > -2.0 * MARGIN_M and within.max() < span + 2.0 * MARGIN_M)
+        facade = matching(facades, name)
+        errors = np.full(int(seen.sum()), np.nan)
+        line: Row = {"what": name, "corners": None}
+        if facade is not None:
+            errors = facade_errors(facade, points[seen], normals[seen])
+            line["corners"] = corner_distance(facade, wall.origin, wall.point(span, 0.0)) / GSD_M
+        rows.append(line | figures(errors, GSD_M))
+        every.append(errors)
+        plain.append(errors[parts[row, column][seen] == PLAIN])
+    worst = [row["corners"] for row in rows]
+    whole: Row = {"what": "all walls", "corners": None if None in worst else max(worst)}
+    rows.append(whole | figures(np.concatenate(every), GSD_M))
+    return [*rows, {"what": "plain walls"} | figures(np.concatenate(plain), GSD_M)]
+
+
+def corner_distance(facade: Facade, left: Float64[np.ndarray, " 3"], right: Float64[np.ndarray, " 3"]) -> float:
+    """The farthest, in plan, of an elevation's four corners from the wall's own, metres."""
+    pairs = zip(facade.corners[:, :2], np.stack([left, right, right, left])[:, :2], strict=True)
+    return max(float(np.linalg.norm(found - true)) for found, true in pairs)
+
+
+def measure_points(
+    truth: Truth, surface: Surface, points: Points, distances_to: Callable[[Points], Float64[np.ndarray, " n"]]
+) -> Row:
+    """Precision, recall and F1 at 2 GSD of a cloud, or of places spread over a mesh.
+
+    Args:
+        truth: The scene.
+        surface: Its triangles below the flight.
+        points: Of the product, the truth's metres.
+        distances_to: From places of the true surface to the product.
+    """
+    rng = np.random.default_rng(SEED)
+    own = thinned(points[truth.flown_over(points)], GSD_M)
+    own = own[rng.permutation(len(own))[:SAMPLES]]
+    bound = TOLERANCE_GSD * GSD_M
+    precision = reached(surface.distances(own), bound)
+    places = seen_places(truth, rng)
+    recall = reached(distances_to(places), bound)
+    figure: Row = {"points": len(points), "true places": len(places), "precision": precision, "recall": recall}
+    return figure | {"f1": harmonic(precision, recall)}
+
+
+def near_triangles(truth: Truth) -> Bool[np.ndarray, " m"]:
+    """Triangles of which some part may lie below the flight."""
+    (west, south), (east, north) = truth.flown_box
+    x, y = truth.triangles[..., 0], truth.triangles[..., 1]
+    return np.asarray(
+        (x.max(axis=1) > west) & (x.min(axis=1) < east) & (y.max(axis=1) > south) & (y.min(axis=1) < north)
+    )
+
+
+def seen_places(truth: Truth, rng: np.random.Generator) -> Points:
+    """Places of the true surface below the flight that at least three photos see, as many a square metre everywhere."""
+    rows = np.flatnonzero(near_triangles(truth))
+    places, of = spread(truth.triangles[rows], 3 * SAMPLES, rng)
+    below = truth.flown_over(places)
+    places, of = places[below][:SAMPLES], rows[of[below]][:SAMPLES]
+    return places[photos_that_see(places, truth.normals[of], truth.sights) >= FEWEST]
+
+
+def true_surface_of(truth: Truth) -> Surface:
+    """What precision is measured to."""
+    return surface_of(truth.triangles[near_triangles(truth)], SPACING_M, np.random.default_rng(SEED))
+
+
+def ortho_site(truth: Truth, raster: Raster, crs_from_true: Callable[[Points], Points]) -> Site:
+    """The truth on an orthophoto's grid: whether photos see it is told for 4 × 4 pixels at a time."""
+    return site_of(truth, raster, crs_from_true, every=4)

@@ -1,0 +1,121 @@
+"""What is measured on surfaces: figures of arrays, which know nothing of who made them.
+
+Errors are NaN where something is missing that should be there. That is wrong: it is farther off than any bound, in
+shares, in quantiles and in the NMAD. Only the bias, which has a sign, is of what is there; completeness tells the rest.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+from tables import Row
+
+NMAD_OF_MAD = 1.4826  # the deviation of normal errors (Höhle and Höhle, 2009)
+LARGEST = 255.0  # of a colour
+MOVED_LIMIT = 1e3  # dB: of pictures that are the same
+
+
+def figures(errors_m: Float64[np.ndarray, " n"], gsd_m: float) -> Row:
+    """Errors of places that count, in GSD.
+
+    Args:
+        errors_m: Signed, normal to the surface; NaN where missing.
+        gsd_m: Of the original photos.
+
+    Returns:
+        ``cells``, ``complete`` (share that is there), ``bias`` (median) and ``mean`` of what is there; ``nmad``,
+        ``p95`` and the shares ``within_2``, ``within_25`` (2.5) and ``within_3`` of all; None where it is not finite.
+    """
+    row: Row = {"cells": int(errors_m.size)}
+    if errors_m.size == 0:
+        return row
+    errors = errors_m / gsd_m
+    there = np.isfinite(errors)
+    row["complete"] = float(there.mean())
+    size = np.where(there, np.abs(errors), np.inf)
+    row |= {f"within_{name}": float((size <= bound).mean()) for name, bound in (("2", 2), ("25", 2.5), ("3", 3))}
+    row["p95"] = _finite(float(np.quantile(size, 0.95, method="higher")))
+    if not there.any():
+        return row | {"bias": None, "mean": None, "nmad": None}
+    middle = float(np.median(errors[there]))
+    apart = np.where(there, np.abs(errors - middle), np.inf)
+    nmad = _finite(NMAD_OF_MAD * float(np.quantile(apart, 0.5, method="higher")))
+    return row | {"bias": middle, "mean": float(errors[there].mean()), "nmad": nmad}
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def near_steps(heights: Float64[np.ndarray, "h w"], step_m: float, cells: int) -> Bool[np.ndarray, "h w"]:
+    """Cells within some of a step of the true heights: where neighbours differ by more, or one of them is nothing.
+
+    Args:
+        heights: True; not finite where there is nothing.
+        step_m: What neighbours of a roof never differ by.
+        cells: How near.
+    """
+    held = np.where(np.isfinite(heights), heights, -1e9)
+    step = np.zeros(heights.shape, bool)
+    for axis in (0, 1):
+        first, second = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        apart = np.abs(np.diff(held, axis=axis)) > step_m
+        step[first] |= apart
+        step[second] |= apart
+    reach = max(cells - 1, 0)  # both cells of a step are within one of it
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.dilate(step.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
+
+
+def relief_errors(
+    found: Float64[np.ndarray, "h w"], true: Float64[np.ndarray, "h w"], cosine: Float64[np.ndarray, "h w"]
+) -> Float64[np.ndarray, "h w"]:
+    """Distances normal to the true surface of heights over a grid, positive outside it; NaN where either is missing.
+
+    Args:
+        found: NaN where missing.
+        true: Not finite where there is nothing.
+        cosine: Between the true normal and the direction of heights.
+    """
+    return np.asarray(np.where(np.isfinite(true), found - np.where(np.isfinite(true), true, 0.0), np.nan) * cosine)
+
+
+def psnr(
+    picture: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], counts: Bool[np.ndarray, "h w"]
+) -> float:
+    """Of the pixels that count, dB; where the picture has none it is to be black."""
+    apart = picture[counts].astype(np.float64) - truth[counts]
+    mean = float(np.square(apart).mean())
+    return MOVED_LIMIT if mean == 0.0 else 10.0 * math.log10(LARGEST**2 / mean)
+
+
+def fitted_colours(
+    picture: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], counts: Bool[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with the affine change of each channel that is nearest to the truth where it counts."""
+    result = np.empty_like(picture)
+    for channel in range(3):
+        known = np.stack([picture[counts, channel].astype(np.float64), np.ones(int(counts.sum()))], axis=1)
+        gain, offset = np.linalg.lstsq(known, truth[counts, channel].astype(np.float64), rcond=None)[0]
+        result[..., channel] = np.clip(picture[..., channel] * gain + offset + 0.5, 0.0, LARGEST)
+    return result
+
+
+def reached(distances_m: Float64[np.ndarray, " n"], bound_m: float) -> float:
+    """The share within a bound; zero of nothing, for what is not there reaches nothing."""
+    return float((distances_m <= bound_m).mean()) if distances_m.size else 0.0
+
+
+def harmonic(precision: float, recall: float) -> float:
+    """F1."""
+    return 2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0
+
+
+def rmse(apart: Float64[np.ndarray, "n 2"]) -> float | None:
+    """Of distances, from differences; None if one is missing (NaN), or there are none: what is not found is wrong."""
+    if apart.size == 0 or not np.isfinite(apart).all():
+        return None
+    return float(np.sqrt(np.square(apart).sum(axis=1).mean()))

@@ -1,0 +1,246 @@
+"""The demo's truth on a product's own grid: heights, parts, which places count, and the true picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int8, UInt8
+from PIL import Image
+from scipy.spatial import Delaunay
+from surface_measures import near_steps
+from surface_products import Points, Raster
+
+from splatpipe.demo.orthographic import View
+from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED, parts_of, unit_normals
+from splatpipe.demo.relief import Relief, surface_model
+from splatpipe.demo.truth import Triangles, centre, true_poses, true_surface
+from splatpipe.demo.visibility import FEWEST, Sight, photos_that_see, true_sights
+
+GSD_M = 0.028  # of the original photos, at the house
+STEP_M = 4.0 * GSD_M  # more than roofs (slope 0.9) rise between cells of 2 GSD; chimneys, dormers and walls are higher
+STEP_CELLS = 2
+ROOF_UP = 0.5  # upward part of a roof's normal: 60°
+ROOF_M = 2.0  # height of the lowest roof, less a little: steps and sills are none
+BUILT = (HOUSE, TILED, SLATED, SHEETED, PLAIN, BRICKS)
+BOX = np.array([[x, y, z] for x in (-24.0, 24.0) for y in (-24.0, 24.0) for z in (0.0, 11.0)])  # what is measured in
+STRAIGHT_M = 2e-3  # that the way to a CRS may bend within that box
+LINEAR_OF_CODED = np.where(
+    np.arange(256) <= 10, np.arange(256) / 255.0 / 12.92, ((np.arange(256) / 255.0 + 0.055) / 1.055) ** 2.4
+).astype(np.float32)  # sRGB, IEC 61966-2-1
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The demo scene and its flight.
+
+    Attributes:
+        triangles: Of the whole scene.
+        parts: What each is of.
+        sights: What the photos truly see.
+    """
+
+    triangles: Triangles
+    parts: Int8[np.ndarray, " m"]
+    sights: list[Sight]
+
+    @cached_property
+    def normals(self) -> Float64[np.ndarray, "m 3"]:
+        """Unit normals of the triangles."""
+        return unit_normals(self.triangles)
+
+    @cached_property
+    def _flown(self) -> Delaunay:
+        return Delaunay(np.array([centre(pose)[:2] for pose in true_poses().values()]))
+
+    def flown_over(self, points: Points) -> Bool[np.ndarray, " n"]:
+        """Which places lie below the flight: within the hull of the cameras, seen from above. Nothing else counts."""
+        return np.asarray(self._flown.find_simplex(points[:, :2]) >= 0)
+
+    @property
+    def flown_box(self) -> Float64[np.ndarray, "2 2"]:
+        """Least and largest east and north of that."""
+        return np.stack([self._flown.points.min(axis=0), self._flown.points.max(axis=0)])
+
+
+def load_truth(depths: Path | None = None) -> Truth:
+    """Of the capture; depths as ``true_sights`` takes them."""
+    triangles = true_surface()
+    return Truth(triangles, parts_of(triangles), true_sights(triangles, depths))
+
+
+@dataclass(frozen=True)
+class Way:
+    """An affine map of points and its inverse: a frame's axes and zero.
+
+    Attributes:
+        matrix: (3, 3).
+        offset: (3,).
+    """
+
+    matrix: Float64[np.ndarray, "3 3"]
+    offset: Float64[np.ndarray, " 3"]
+
+    def __call__(self, points: Points) -> Points:
+        return np.asarray(points @ self.matrix.T + self.offset)
+
+    def back(self, points: Points) -> Points:
+        """The inverse."""
+        return np.asarray(np.linalg.solve(self.matrix, (points - self.offset).T).T)
+
+
+def straight(way: Callable[[Points], Points], cell: float) -> Way:
+    """The affine map that a map is within the scene.
+
+    Args:
+        way: From the truth's metres to a grid's cells and metres of height.
+        cell: Metres of a cell.
+    """
+    there = way(BOX)
+    known = np.column_stack([BOX, np.ones(len(BOX))])
+    solved = np.linalg.lstsq(known, there, rcond=None)[0]
+    off = np.abs(known @ solved - there) * [cell, cell, 1.0]
+    assert off.max() < STRAIGHT_M, off.max()
+    return Way(solved[:3].T, solved[3])
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """The truth on a part of a product's grid, which is all that was flown over.
+
+    Attributes:
+        truth: The scene.
+        way: From the truth's metres to column and row of this part, and height.
+        left: The product's column that is this part's first; may be negative.
+        top: The product's row likewise.
+        relief: True heights.
+        seen: Where at least three photos truly see what is there, below the flight.
+        below: What lies below the flight.
+    """
+
+    truth: Truth
+    way: Way
+    left: int
+    top: int
+    relief: Relief
+    seen: Bool[np.ndarray, "h w"]
+    below: Bool[np.ndarray, "h w"]
+
+    @cached_property
+    def parts(self) -> Int8[np.ndarray, "h w"]:
+        """Of what is there; -1 where there is nothing."""
+        return np.where(self.relief.triangle >= 0, self.truth.parts[self.relief.triangle], np.int8(-1))
+
+    @cached_property
+    def _up(self) -> Float64[np.ndarray, "h w"]:
+        return np.asarray(np.abs(self.truth.normals[self.relief.triangle, 2]))
+
+    @cached_property
+    def true_heights(self) -> Float64[np.ndarray, "h w"]:
+        """Of the truth's own frame: what a roof's height above the plot is."""
+        rows, columns = np.indices(self.relief.height.shape)
+        places = np.column_stack([columns.ravel() + 0.5, rows.ravel() + 0.5, self.relief.height.ravel()])
+        places[:, 2] = np.where(np.isfinite(places[:, 2]), places[:, 2], 0.0)
+        return self.way.back(places)[:, 2].reshape(rows.shape)
+
+    @cached_property
+    def ground(self) -> Bool[np.ndarray, "h w"]:
+        """The plot."""
+        return np.asarray(self.parts == GROUND)
+
+    @cached_property
+    def roofs(self) -> Bool[np.ndarray, "h w"]:
+        """What of the house faces up, higher than a person: slopes, and what lies on them."""
+        return np.asarray(np.isin(self.parts, BUILT) & (self._up > ROOF_UP) & (self.true_heights > ROOF_M))
+
+    @cached_property
+    def house(self) -> Bool[np.ndarray, "h w"]:
+        """All of the house that is so high."""
+        return np.asarray(np.isin(self.parts, BUILT) & (self.true_heights > ROOF_M))
+
+    @cached_property
+    def steps(self) -> Bool[np.ndarray, "h w"]:
+        """Cells within two of a height step."""
+        return near_steps(self.relief.height, STEP_M, STEP_CELLS)
+
+    def cut(self, band: np.ndarray, fill: float) -> np.ndarray:
+        """This part of the product's band; what it does not reach is filled."""
+        height, width = self.relief.height.shape
+        part = np.full((height, width, *band.shape[2:]), fill, band.dtype)
+        top, left = max(0, self.top), max(0, self.left)
+        bottom, right = min(band.shape[0], self.top + height), min(band.shape[1], self.left + width)
+        if bottom > top and right > left:
+            rows, columns = slice(top - self.top, bottom - self.top), slice(left - self.left, right - self.left)
+            part[rows, columns] = band[top:bottom, left:right]
+        return part
+
+
+def site_of(truth: Truth, raster: Raster, crs_from_true: Callable[[Points], Points], every: int = 1) -> Site:
+    """The truth on a product's grid.
+
+    Args:
+        truth: The scene.
+        raster: The product.
+        crs_from_true: From the truth's metres to its CRS.
+        every: Cells, a side, that share whether three photos see them.
+    """
+    whole = straight(lambda points: raster.to_grid(crs_from_true(points)), raster.cell)
+    (west, south), (east, north) = truth.flown_box
+    corners = whole(np.array([[x, y, 0.0] for x in (west, east) for y in (south, north)]))[:, :2]
+    (left, top), (right, bottom) = np.floor(corners.min(axis=0)).astype(int), np.ceil(corners.max(axis=0)).astype(int)
+    way = Way(whole.matrix, whole.offset - [left, top, 0.0])
+    relief = surface_model(truth.triangles, way, int(right - left), int(bottom - top), raster.cell)
+    seen, below = _seen(truth, relief, way, every)
+    return Site(truth, way, int(left), int(top), relief, seen, below)
+
+
+def _seen(
+    truth: Truth, relief: Relief, way: Way, every: int
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    height, width = relief.height.shape
+    row, column = np.mgrid[every // 2 : height + every // 2 : every, every // 2 : width + every // 2 : every]
+    row, column = np.minimum(row, height - 1), np.minimum(column, width - 1)
+    hit = relief.triangle[row, column].ravel()
+    heights = np.where(hit >= 0, relief.height[row, column].ravel(), 0.0)
+    places = way.back(np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5, heights]))
+    below = truth.flown_over(places) & (hit >= 0)
+    count = np.zeros(len(places), np.uint8)
+    count[below] = photos_that_see(places[below], truth.normals[hit[below]], truth.sights)
+    pair = ((count >= FEWEST).reshape(row.shape), below.reshape(row.shape))
+    seen, flown = (np.kron(each, np.ones((every, every), bool))[:height, :width] for each in pair)
+    return seen, flown
+
+
+def true_picture(path: Path, view: View, site: Site) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """The true picture on a site's grid, each pixel the mean of the light on it, and where there is one.
+
+    Args:
+        path: A picture by ``demo.orthographic``.
+        view: The view that it is of, its own size of pixels aside.
+        site: The product's grid.
+    """
+    coded = np.asarray(Image.open(path).convert("RGB"))
+    own = view.resampled(view.pixel_m * view.width / coded.shape[1])
+    height, width = site.relief.height.shape
+    corners = np.array([[0.0, 0.0, 0.0], [width, 0.0, 0.0], [0.0, height, 0.0]])
+    places = own.to_grid(site.way.back(corners))[:, :2]
+    steps = (places[1:] - places[0]) / [[width], [height]]
+    fine = max(1, round(float(np.linalg.norm(steps[0]))))  # samples a pixel, a side
+    light = LINEAR_OF_CODED[coded]
+    matrix = np.column_stack([steps[0] / fine, steps[1] / fine, places[0] - 0.5 + (steps[0] + steps[1]) / fine / 2.0])
+    size, flags = (width * fine, height * fine), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpAffine(light, matrix, size, flags=flags, borderValue=(-1.0, -1.0, -1.0))
+    mean = cv2.resize(warped, (width, height), interpolation=cv2.INTER_AREA)
+    beside = cv2.dilate((warped[..., 0] < 0.0).astype(np.float32), np.ones((3, 3), np.uint8))
+    whole = cv2.resize(beside, (width, height), interpolation=cv2.INTER_AREA) == 0.0
+    return coded_of(np.maximum(mean, 0.0)), np.asarray(whole)
+
+
+def coded_of(light: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Linear light, 0 to 1, as 8-bit sRGB."""
+    values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.asarray(np.clip(values * 255.0 + 0.5, 0.0, 255.0), np.uint8)

@@ -1,0 +1,145 @@
+"""True orthographic pictures of the scene: ``python -m splatpipe.demo.orthographic --out /tmp/demo-orthographic``.
+
+The house's plot from above and the house's four façades, by the renderer of the capture's photos: same light, same
+textures, no sensor noise, exposure 0 EV. Pixels are half of the photos' GSD, for pictures of any grid to be made from
+them by averaging. What it needs is what ``generate`` needs; about two CPU minutes at 8 paths a pixel. The pictures are
+too large for the repository: whoever compares with them renders them. Finished strips are kept in ``--out``: an
+interrupted run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from .house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE
+from .mesh import Array, Plane
+from .scene import build_scene, turned
+
+PIXEL_M = 0.014  # half of the photos' GSD
+TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # of what is seen from above; nothing within it is so high
+# Where a façade is looked at from: farther than annex, eaves and steps, nearer than trees, and the van in the south.
+AHEAD_M = {"south": 4.0, "north": 5.5, "west": 5.5, "east": 5.5}
+MARGIN_M = 0.3  # around a wall
+STRIP_ROWS = 512
+SEED = 20261123
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture by parallel rays.
+
+    Attributes:
+        name: Of its files.
+        origin: Of the first pixel's first corner, from where rays start; east, north, up in metres.
+        right: Unit vector along the rows.
+        down: Unit vector along the columns.
+        pixel_m: A pixel's side.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    name: str
+    origin: Array
+    right: Array
+    down: Array
+    pixel_m: float
+    width: int
+    height: int
+
+    @property
+    def ahead(self) -> Array:
+        """Where the rays go: a unit vector."""
+        return np.asarray(np.cross(self.right, self.down))
+
+    def to_grid(self, points: Array) -> Array:
+        """World points (..., 3) to column, row (pixels; the first pixel's centre is (0.5, 0.5)) and metres ahead."""
+        axes = np.stack([self.right / self.pixel_m, self.down / self.pixel_m, self.ahead])
+        return np.asarray((points - self.origin) @ axes.T)
+
+    def from_grid(self, places: Array) -> Array:
+        """Column, row and metres ahead (..., 3) to world points."""
+        axes = np.stack([self.right * self.pixel_m, self.down * self.pixel_m, self.ahead])
+        return np.asarray(places @ axes + self.origin)
+
+    def resampled(self, pixel_m: float) -> View:
+        """The same picture with pixels of another size."""
+        width, height = (round(count * self.pixel_m / pixel_m) for count in (self.width, self.height))
+        return replace(self, pixel_m=pixel_m, width=width, height=height)
+
+
+def top_view(pixel_m: float = PIXEL_M) -> View:
+    """The plot from above, north up."""
+    count = round(2.0 * TOP_HALF_M / pixel_m)
+    origin = np.array([-TOP_HALF_M, TOP_HALF_M, TOP_HEIGHT_M])
+    return View("top", origin, np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0]), pixel_m, count, count)
+
+
+def wall_planes() -> dict[str, tuple[Plane, float, float]]:
+    """The four walls of the house by their names: lower left corner, level and upright axis; length; greatest height.
+
+    In the world's axes; seen from outside, u points to the right and the plane's normal to the viewer.
+    """
+    length, width = 2.0 * HALF_LENGTH, 2.0 * HALF_WIDTH
+    sides = {
+        "south": ((-HALF_LENGTH, -HALF_WIDTH, 0), (1, 0, 0), length, EAVES),
+        "north": ((HALF_LENGTH, HALF_WIDTH, 0), (-1, 0, 0), length, EAVES),
+        "west": ((-HALF_LENGTH, HALF_WIDTH, 0), (0, -1, 0), width, RIDGE),
+        "east": ((HALF_LENGTH, -HALF_WIDTH, 0), (0, 1, 0), width, RIDGE),
+    }
+    up = (0, 0, 1)
+    return {
+        name: (Plane.make(turned(np.array(corner, float)), turned(np.array(u, float)), up), span, high)
+        for name, (corner, u, span, high) in sides.items()
+    }
+
+
+def facade_view(name: str, pixel_m: float = PIXEL_M) -> View:
+    """A wall of the house from before it, with a margin around."""
+    wall, span, high = wall_planes()[name]
+    origin = wall.point(-MARGIN_M, high + MARGIN_M, AHEAD_M[name])
+    size = (round(metres / pixel_m) for metres in (span + 2.0 * MARGIN_M, high + 2.0 * MARGIN_M))
+    return View(name, origin, wall.u, -wall.v, pixel_m, *size)
+
+
+def views(pixel_m: float = PIXEL_M) -> list[View]:
+    """All of them."""
+    return [top_view(pixel_m), *(facade_view(name, pixel_m) for name in wall_planes())]
+
+
+def main() -> None:
+    from .generate import GAIN, WHITE_BALANCE, coded
+    from .render import Renderer
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the pictures")
+    parser.add_argument("--spp", type=int, default=8, help="paths a pixel")
+    parser.add_argument("--pixel", type=float, default=PIXEL_M, help="metres a pixel")
+    parser.add_argument("--only", action="append", help="names of the pictures")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    renderer = Renderer(build_scene())
+    for number, view in enumerate(views(arguments.pixel)):
+        if arguments.only and view.name not in arguments.only:
+            continue
+        strips = []
+        for top in range(0, view.height, STRIP_ROWS):
+            rows = min(STRIP_ROWS, view.height - top)
+            strip = replace(view, origin=view.origin + view.down * (top * view.pixel_m), height=rows)
+            file = arguments.out / f"{view.name}.{view.pixel_m:g}.{arguments.spp}.{top}.npy"
+            if not file.exists():
+                seed = SEED + 1000 * number + top // STRIP_ROWS
+                partial = file.with_suffix(".part.npy")
+                np.save(partial, renderer.orthographic(strip, arguments.spp, seed).astype(np.float16))
+                partial.rename(file)
+            strips.append(coded(np.load(file).astype(np.float64) * GAIN * WHITE_BALANCE))
+            print(f"{view.name}: {top + rows} of {view.height} rows", flush=True)
+        Image.fromarray(np.concatenate(strips)).save(arguments.out / f"{view.name}.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""What each triangle of the true surface is: ground, a roof, a wall, or something else."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from jaxtyping import Float64, Int8
+
+from splatpipe.demo import CAPTURE
+from splatpipe.demo.house import BRICK, CREAM, NORTH_PLASTER, SHEET, SLATE, TILES
+from splatpipe.demo.scene import building_corners
+from splatpipe.demo.truth import Triangles
+
+OTHER, GROUND, HOUSE, TILED, SLATED, SHEETED, PLAIN, BRICKS = range(8)
+NAMES = ("others", "ground", "house", "tiles", "slates", "metal roof", "plain walls", "bricks")
+PAINTS = {TILED: TILES, SLATED: SLATE, SHEETED: SHEET, BRICKS: BRICK}
+PLASTERS = (CREAM, NORTH_PLASTER)
+GROUND_M = 0.02  # targets lie 12 mm above the plot, which is level and at 0
+TARGET_REACH_M = 0.36  # from a target's centre to its corners, at most
+TARGET_OFF_M = 1e-3  # of its plane
+TARGETS_ON = {"roof": TILED, "wall": HOUSE, "ground": GROUND}
+FLAT = 0.9999  # upward part of the plot's normal
+
+
+def parts_of(triangles: Triangles) -> Int8[np.ndarray, " m"]:
+    """The part that each triangle is of, a constant of this module; targets count as what they lie on.
+
+    Args:
+        triangles: Of ``true_surface``.
+    """
+    parts = np.full(len(triangles), OTHER, np.int8)
+    up = unit_normals(triangles)[:, 2]
+    heights = triangles[..., 2]
+    parts[(np.abs(heights) < GROUND_M).all(axis=1) & (np.abs(up) > FLAT)] = GROUND
+    rows = {key: row for row, key in enumerate(_keys(triangles))}
+    for part, corners in ((HOUSE, building_corners()), *((p, building_corners(paint)) for p, paint in PAINTS.items())):
+        parts[_rows(rows, corners)] = part
+    for paint in PLASTERS:
+        parts[_rows(rows, building_corners(paint))] = PLAIN
+    for point in json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["points"]:
+        apart = triangles - np.array(point["xyz_m"])
+        near = (np.linalg.norm(apart, axis=2) < TARGET_REACH_M) & (np.abs(apart @ point["normal"]) < TARGET_OFF_M)
+        parts[near.all(axis=1)] = TARGETS_ON[point["where"]]
+    return parts
+
+
+def _rows(rows: dict[bytes, int], corners: Triangles) -> list[int]:
+    return [rows[key] for key in _keys(corners) if key in rows]  # slivers that are no triangles were left out
+
+
+def _keys(triangles: Triangles) -> list[bytes]:
+    """The same for the same three corners, whatever their order."""
+    order = np.lexsort((triangles[..., 2], triangles[..., 1], triangles[..., 0]), axis=-1)
+    in_order = np.take_along_axis(triangles, order[..., None], axis=1) + 0.0  # no negative zeros
+    return [corners.astype(np.float32).tobytes() for corners in in_order]
+
+
+def unit_normals(triangles: Triangles) -> Float64[np.ndarray, "m 3"]:
+    """Unit normals, as the corners turn; zero for slivers."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))

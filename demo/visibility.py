@@ -1,0 +1,70 @@
+"""Which of the capture's photos truly see a place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from splatpipe.demo.depth_maps import load, true_cameras
+from splatpipe.demo.truth import Triangles, depth_map
+from splatpipe.pipeline.geometry.camera import Camera
+
+BEHIND_M = 0.03  # what a photo sees may lie so far before a place that it sees: less than half a pixel's slant
+LEAST_COSINE = 0.087  # of 85°: from flatter, a surface is seen as a line
+HALF = 2  # over this, the size of photos that depths are made at where none are given
+FEWEST = 3  # photos that tell a place's position with something to spare
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A photo's camera and what it truly sees, metres along its axis; infinite where there is nothing."""
+
+    camera: Camera
+    depth: Float32[np.ndarray, "h w"]
+
+
+def true_sights(surface: Triangles, folder: Path | None = None) -> list[Sight]:
+    """All photos of the capture.
+
+    Args:
+        surface: All triangles.
+        folder: What ``demo.depth_maps`` wrote; None to make depths here, at half the size, in a CPU minute.
+    """
+    if folder is not None:
+        held = [load(path) for path in sorted(folder.glob("*.npz"))]
+        return [Sight(camera, np.where(depth > 0.0, depth, np.float32(np.inf))) for camera, depth, _ in held]
+    halves = [camera.scaled(camera.width // HALF, camera.height // HALF) for camera in true_cameras()[1]]
+    return [Sight(camera, depth_map(camera, surface).astype(np.float32)) for camera in halves]
+
+
+def photos_that_see(
+    places: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"], sights: Iterable[Sight]
+) -> UInt8[np.ndarray, " n"]:
+    """How many photos see each place of a surface.
+
+    Args:
+        places: East, north, up.
+        normals: Unit normals there, to either side.
+        sights: The photos.
+    """
+    count = np.zeros(len(places), np.uint8)
+    for sight in sights:
+        rows, pixels, depths = sight.camera.in_view(places)
+        rays = sight.camera.centre() - places[rows]
+        facing = np.abs((rays * normals[rows]).sum(axis=1)) > LEAST_COSINE * np.linalg.norm(rays, axis=1)
+        count[rows[facing & _is_first(sight.depth, pixels, depths)]] += 1
+    return count
+
+
+def _is_first(
+    depth: Float32[np.ndarray, "h w"], pixels: Float64[np.ndarray, "n 2"], expected: Float64[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether nothing lies before places: by the farthest of the four pixels about each."""
+    farthest = cv2.dilate(depth, np.ones((2, 2), np.uint8), anchor=(1, 1), borderType=cv2.BORDER_REPLICATE)
+    column, row = np.clip(np.floor(pixels + 0.5).astype(np.intp), 0, np.array(depth.shape[::-1]) - 1).T
+    return np.asarray(expected <= farthest[row, column] + BEHIND_M)
