@@ -129,7 +129,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=4,
+    version=5,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views", "georef.boundary"),
     parts={"splat": "init.ply"},
