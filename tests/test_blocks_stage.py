@@ -345,6 +345,13 @@ def test_the_history_of_blocks_is_one_curve_after_the_coarse_pass() -> None:
     assert joint["skipped_gradients"] == 3 and len(joint["blocks"]) == 2
 
 
+def test_the_size_that_is_told_is_the_blocks_own_not_the_coarse_passes(tmp_path: Path) -> None:
+    summaries = {"blocks": {"coarse": {"train_megapixels": 0.49}}, "train.1": {"train_megapixels": 1.9466}}
+    summaries |= {"train.2": {"train_megapixels": 0.0}}  # one that had nothing to train
+    given = replace(Inputs({}, tmp_path), summaries=summaries, shards=(tmp_path,) * 2)
+    assert assembly._told(given, {"curve": []}, 100)["train_megapixels"] == 1.9466
+
+
 def test_why_blocks_trained_fewer_iterations_is_told(tmp_path: Path) -> None:
     parts = [{"iterations": 90, "planned_iterations": 100, "flat_at": 80}, {"iterations": 70, "planned_iterations": 70}]
     parts.append({"iterations": 60, "planned_iterations": 80, "sizes_ended": [30], "flat_at": 50})

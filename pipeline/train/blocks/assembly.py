@@ -19,7 +19,7 @@ from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan, load_site_plan
 
 OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # are the coarse pass's, which looked at the whole
-FROM_COARSE = ("train_megapixels", "sky_photos", "device", "instruction_set", "mode")
+FROM_COARSE = ("sky_photos", "device", "instruction_set", "mode")
 
 
 def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -134,6 +134,8 @@ def _told(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JS
         "train_seconds": round(sum(float(part.get("train_seconds", 0.0)) for part in parts), 1),
         "peak_memory_bytes": max(int(part.get("peak_memory_bytes", 0)) for part in parts),
     }
+    if sizes := [float(part["train_megapixels"]) for part in each if part.get("train_megapixels")]:
+        found["train_megapixels"] = max(sizes)
     if flat := {name: told for name, part in _named(first, each).items() if (told := _ended_flat(part))}:
         found["flat"] = flat
     if robust := [part for part in each if "robust_left_out" in part]:
