@@ -30,7 +30,7 @@ class Relief:
     cosine: Float64[np.ndarray, "h w"]
 
 
-def relief(corners: Triangles, width: int, height: int, cell_m: float) -> Relief:
+def relief(corners: Triangles, width: int, height: int, cell_m: float, highest_m: float = np.inf) -> Relief:
     """Rasterise triangles that are given in a grid's own coordinates; exact at the cells' centres.
 
     Args:
@@ -38,6 +38,7 @@ def relief(corners: Triangles, width: int, height: int, cell_m: float) -> Relief
         width: Cells.
         height: Cells.
         cell_m: A cell's side.
+        highest_m: What is higher lies behind the viewer.
     """
     highest = np.full((height, width), -np.inf)
     hit = np.full((height, width), -1, np.int32)
@@ -56,7 +57,7 @@ def relief(corners: Triangles, width: int, height: int, cell_m: float) -> Relief
             weights.append(u * (down - sy) - v * (across - sx))
         inside = (weights[0] >= 0.0) & (weights[1] >= 0.0) & (weights[2] >= 0.0)
         z = sum(weight * corner for weight, corner in zip(weights, corners[k, :, 2], strict=True))
-        inside &= z > highest[top:bottom, left:right]
+        inside &= (z > highest[top:bottom, left:right]) & (z <= highest_m)
         highest[top:bottom, left:right][inside] = z[inside]
         hit[top:bottom, left:right][inside] = k
     return Relief(highest, hit, np.where(hit >= 0, _cosines(corners, cell_m)[hit], 0.0))
@@ -91,6 +92,6 @@ def seen_in(view: View, triangles: Triangles) -> Relief:
     """What an orthographic view sees; heights are metres towards the viewer from the plane where its rays start."""
     places = view.to_grid(triangles) * [1.0, 1.0, -1.0]
     ahead = (places[..., 2] <= 0.0).any(axis=1)  # what lies behind the viewer is not seen
-    found = relief(places[ahead], view.width, view.height, view.pixel_m)
+    found = relief(places[ahead], view.width, view.height, view.pixel_m, highest_m=0.0)
     rows = np.append(np.flatnonzero(ahead), -1).astype(np.int32)
     return Relief(found.height, rows[found.triangle], found.cosine)
