@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster import reference
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.sh import rgb_to_dc
@@ -110,6 +111,21 @@ def test_gaussians_behind_the_near_plane_or_outside_are_not_visible() -> None:
     result = draw(Gaussians.concat([gaussian(p, 0.1, 0.5, [1.0, 1.0, 1.0]) for p in positions]), camera(), near=0.2)
     assert result.visible.tolist() == [True, False, False, False]
     assert (result.radii > 0).tolist() == [True, False, False, False]
+
+
+def test_gaussians_that_reach_the_cameras_plane_are_not_visible() -> None:
+    sizes = (0.99, 1.01)  # of a third of their depth: its plane is three deviations away
+    ahead = [gaussian([0, 0, 3.0], size, 0.5, [1.0, 1.0, 1.0]) for size in sizes]
+    aside = [gaussian([12.0, 0, 3.0], size, 0.5, [1.0, 1.0, 1.0]) for size in sizes]
+    assert draw(Gaussians.concat([*ahead, *aside]), camera()).visible.tolist() == [True, False, False, False]
+
+
+def test_a_disc_below_the_camera_is_no_veil_over_its_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    disc = gaussian([0.0, 2.0, 0.6], 1.5, 0.9999, [1.0, 1.0, 1.0])  # ground, of which next to nothing is in view
+    disc.log_scales[:, 1] = -5.0
+    assert draw(disc, camera(focal=8.0)).alpha.max() == 0.0
+    monkeypatch.setattr(reference, "PLANE_SIGMAS", 0.0)
+    assert draw(disc, camera(focal=8.0)).alpha.mean() > 0.1  # else it would
 
 
 def test_projection_agrees_with_the_cameras_own() -> None:

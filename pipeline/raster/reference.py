@@ -28,6 +28,7 @@ from splatpipe.pipeline.raster.definitions import (
     MAX_VARIANCE_PX2,
     MEDIAN_SHIFT_MAX,
     MEDIAN_TRANSMITTANCE,
+    PLANE_SIGMAS,
     QUAT_EPSILON,
     RADIUS_SIGMAS,
     TRANSMITTANCE_MIN,
@@ -53,7 +54,7 @@ class Splats:
         depth_slopes: By how much the depth at which a ray is deepest in the Gaussian grows over a pixel, along x and y.
         opacities: At the centre, compensated in the anti-aliased variant.
         colours: Red, green, blue, ≥ 0.
-        usable: False where anything is not finite, behind the near plane, or beyond the limits.
+        usable: False where anything is not finite, behind the near plane, across the camera's, or beyond the limits.
     """
 
     means: Float[Tensor, "n 2"]
@@ -156,6 +157,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> Spl
         raw.isfinite().all(-1)
         & ((gaussians.quats**2).sum(-1) <= MAX_QUAT_NORM2)
         & (z > options.near)
+        & ((PLANE_SIGMAS * row_z).square().sum(-1) < z * z)
         & (z <= MAX_DEPTH)
         & (means2d.abs() <= MAX_SCREEN_PX).all(-1)
         & (covariances[:, [0, 2]] <= MAX_VARIANCE_PX2).all(-1)

@@ -21,6 +21,7 @@ constexpr float kMedianTransmittance = 0.5f;
 constexpr float kMedianShiftMax = 0.5f;
 constexpr float kBlurPx2 = 0.3f;
 constexpr float kFrustumMargin = 0.3f;
+constexpr float kPlaneSigmas = 3.0f;
 constexpr float kCompensationMin = 2.5e-5f;
 constexpr float kQuatEpsilon = 1e-12f;
 constexpr float kRadiusSigmas = 3.0f;

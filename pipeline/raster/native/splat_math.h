@@ -96,6 +96,8 @@ SPLAT_INLINE Projection project_lanes(const View& view, const Lanes& in) {
     const Floats xx = dot(p.row0, p.row0), yy = dot(p.row1, p.row1), blur = fill(kBlurPx2);
     p.xx = xx + blur, p.xy = dot(p.row0, p.row1), p.yy = yy + blur;
     p.row2 = times(w2.x * p.r0 + w2.y * p.r1 + w2.z * p.r2, p.scale);
+    const Vec3 reach = fill(kPlaneSigmas) * p.row2;  // of the depth
+    p.usable = both(p.usable, less(dot(reach, reach), p.point.z * p.point.z));
     p.zx = dot(p.row2, p.row0), p.zy = dot(p.row2, p.row1);
     p.normal = cross(p.row0, p.row1);
     p.sharp = dot(p.normal, p.normal);
