@@ -137,7 +137,7 @@ INITIALIZE = Stage(
 )
 BLOCKS = Stage(
     "blocks",
-    version=8,
+    version=9,
     config=BlocksConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={"plan": "blocks.json", "coarse": "coarse", "prospects": "prospects"},
@@ -147,7 +147,7 @@ BLOCKS = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=13,
+    version=14,
     config=TrainConfig,
     reads=(
         "undistort.dataset",
@@ -177,7 +177,7 @@ TRAIN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=9,
+    version=10,
     config=EvaluateConfig,
     reads=(
         "train.model",
@@ -224,7 +224,7 @@ EXPORT = Stage(
 
 FLYTHROUGH = Stage(
     "flythrough",
-    version=3,
+    version=4,
     config=FlythroughConfig,
     reads=("train.model", "train.rendering", "train.sky", "undistort.dataset"),
     parts={"film": "film"},

@@ -42,8 +42,8 @@ def ending() -> Case:
 
 def long() -> Case:
     """Over more tile rows than a thread takes on by itself; a part of a picture, at the limits of the whole."""
-    scene = random_scene(13, 40, 0, size=-1.5)
-    scene.log_scales[:, 0] += 2.5
+    scene = random_scene(13, 120, 0, size=-1.5)
+    scene.log_scales[:, 0] += 2.0
     return case_of(scene, random_camera(13, 60, 180).cut(15, 10, 20, 150), depths=False, magnitudes=True)
 
 

@@ -63,14 +63,15 @@ def place(request: pytest.FixtureRequest) -> Place:
 
 
 def sheets(count: int) -> tuple[Tensor, ...]:
-    """Gaussians that cover the whole view, from near to far."""
+    """Discs that cover the whole view, from near to far."""
     generator = torch.Generator().manual_seed(3)
     means = torch.zeros(count, 3)
     means[:, 2] = torch.linspace(4.0, 9.0, count)
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     logits = torch.full((count,), math.log(OPACITY / (1.0 - OPACITY)))
     colours = torch.rand(count, 1, 3, generator=generator)
-    return means, torch.full((count, 3), math.log(100.0)), quats, logits, colours
+    log_scales = torch.tensor([math.log(100.0), math.log(100.0), -5.0]).repeat(count, 1)
+    return means, log_scales, quats, logits, colours
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,8 @@ def test_tiles_are_those_of_the_cpu_for_splats_of_all_sizes(library: CudaLibrary
     scene, camera = random_scene(7, count, 0), random_camera(7, width, height)
     scene.log_scales[30:60] += 1.5  # over many rows of tiles: their pairs are counted by whole warps
     scene.log_scales[60:] += 3.5  # over more than a warp has threads
+    scene.quats[30:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    scene.log_scales[30:, 2] = -5.0  # discs that face the camera: they do not reach its plane
     case = case_of(scene, camera, sh_degree=0, antialias=antialias, depths=False).changed(upstream={})
     made = run(library, case)
     frame = _native.Frame()

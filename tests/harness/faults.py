@@ -267,6 +267,12 @@ FAULTS = (
         "col < job.inner.right + (FAULT ? 1 : 0) &&",
     ),
     Fault(
+        "what reaches the camera's plane is seen",
+        "../splat_math.h",
+        "less(dot(reach, reach), p.point.z * p.point.z)",
+        "less(FAULT ? fill(0.0f) : dot(reach, reach), p.point.z * p.point.z)",
+    ),
+    Fault(
         "a part of a picture has limits of its own",
         "../view.h",
         "margin_x = kFrustumMargin * 0.5 * shot.whole_width",
