@@ -25,7 +25,7 @@ BLUR_PX2 = 0.3
 """Added to the variances on screen: no Gaussian is thinner than about a pixel (EWA's low-pass filter)."""
 FRUSTUM_MARGIN = 0.3
 """The projection's linearisation is held at the frustum plus this share of its half-width: it diverges outside."""
-PLANE_SIGMAS = 3.0
+PLANE_SIGMAS = 2.0
 """A Gaussian that reaches the camera's plane with so many standard deviations is skipped: the linearisation spreads one
 that lies beside the picture over all of it."""
 COMPENSATION_MIN = 2.5e-5
