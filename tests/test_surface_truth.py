@@ -353,7 +353,7 @@ def test_a_raster_without_a_crs_is_refused_and_nan_is_no_data(tmp_path: Path) ->
     heights = np.array([[1.0, np.nan], [3.0, 4.0]], np.float32)
     for name, crs in (("with.tif", CRS), ("without.tif", None)):
         profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "width": 2, "height": 2}
-        with rasterio.open(tmp_path / name, "w", crs=crs, transform=at * Affine.translation(9, 9), **profile) as file:
+        with rasterio.open(tmp_path / name, "w", crs=crs, transform=at @ Affine.translation(9, 9), **profile) as file:
             file.write(heights, 1)
     assert read_raster(tmp_path / "with.tif").there.tolist() == [[True, False], [True, True]]
     with pytest.raises(UsageError):
