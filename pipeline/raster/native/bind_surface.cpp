@@ -1,0 +1,124 @@
+// Python face of the surface model's kernels: checks around them; see _native.pyi.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/tuple.h>
+
+#include <array>
+#include <climits>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <tuple>
+
+#include "surface_votes.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+template <class T>
+using Plane = nb::ndarray<T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Row = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+using Camera = std::tuple<Pose, std::array<int, 2>, std::array<double, 4>>;  // width, height; fx, fy, cx, cy
+using Lattice = std::array<double, 3>;                                       // east, north, cell
+using Rectangle = std::array<int, 4>;
+
+constexpr int kMostCells = 1 << splat::kCellBits;
+constexpr int kFarthest = 1 << 30;  // rows and columns
+
+void require(bool holds, const char* message) {
+    if (!holds) throw nb::value_error(message);
+}
+
+bool all_finite(const double* values, int count) {
+    for (int k = 0; k < count; ++k)
+        if (!std::isfinite(values[k])) return false;
+    return true;
+}
+
+splat::SurfaceCamera camera_of(const Camera& given) {
+    const auto& [pose, size, lens] = given;
+    splat::SurfaceCamera camera{};
+    require(size[0] >= 1 && size[1] >= 1 && size[0] <= INT_MAX / size[1], "a photo without pixels, or with too many");
+    require(all_finite(pose.data(), 16) && all_finite(lens.data(), 4) && lens[0] > 0.0 && lens[1] > 0.0,
+            "a camera that is none");
+    camera.width = size[0], camera.height = size[1];
+    camera.fx = lens[0], camera.fy = lens[1], camera.cx = lens[2], camera.cy = lens[3];
+    for (int row = 0; row < 3; ++row) {
+        for (int column = 0; column < 3; ++column) camera.turn[3 * row + column] = pose(row, column);
+        camera.shift[row] = pose(row, 3);
+    }
+    for (int k = 0; k < 3; ++k)
+        camera.centre[k] = -(camera.turn[k] * camera.shift[0] + camera.turn[3 + k] * camera.shift[1] +
+                             camera.turn[6 + k] * camera.shift[2]);
+    return camera;
+}
+
+splat::CellTile tile_of(const Lattice& lattice, const Rectangle& tile, const std::array<double, 2>& relief) {
+    const auto [row, column, height, width] = tile;
+    const auto [low, high] = relief;
+    require(all_finite(lattice.data(), 3) && lattice[2] > 0.0, "a lattice without cells");
+    require(height >= 1 && width >= 1 && height <= kMostCells / width, "a tile without cells, or with too many");
+    require(std::abs(static_cast<double>(row)) <= kFarthest && std::abs(static_cast<double>(column)) <= kFarthest,
+            "a tile too far away");
+    const double most = std::ldexp(splat::kHeightStep, splat::kStepBits);
+    require(std::isfinite(low) && std::isfinite(high) && low < high && high - low < most, "heights too far apart");
+    return {lattice[0], lattice[1], lattice[2], row, column, height, width, low, high};
+}
+
+void add_votes(splat::CellVotes& votes, const Plane<const float>& depth, const Plane<const std::uint8_t>& confidence,
+               const Camera& camera, const Rectangle& window) {
+    const splat::DepthPicture picture{camera_of(camera), depth.data(), confidence.data()};
+    const auto [left, top, right, bottom] = window;
+    const auto width = static_cast<std::size_t>(picture.camera.width);
+    const auto height = static_cast<std::size_t>(picture.camera.height);
+    require(depth.shape(0) == height && depth.shape(1) == width && confidence.shape(0) == height &&
+                confidence.shape(1) == width,
+            "depths that are not of the camera's size");
+    require(left >= 0 && top >= 0 && left < right && top < bottom && right <= picture.camera.width &&
+                bottom <= picture.camera.height,
+            "a window beyond the photo");
+    const nb::gil_scoped_release released;
+    votes.add(picture, left, top, right, bottom);
+}
+
+template <class A>
+bool fits(const A& plane, std::size_t rows, const splat::CellVotes& votes) {
+    return plane.shape(0) == rows && plane.shape(1) == static_cast<std::size_t>(votes.cells());
+}
+
+void find_layers(splat::CellVotes& votes, const Plane<double>& height, const Plane<std::int32_t>& count,
+                 const Plane<double>& cover) {
+    constexpr std::size_t kRows = splat::kSurfaceLayers;
+    require(fits(height, kRows, votes) && fits(count, kRows, votes) && fits(cover, kRows, votes),
+            "results of another size");
+    const nb::gil_scoped_release released;
+    votes.layers({height.data(), count.data(), cover.data()});
+}
+
+void fit(splat::CellVotes& votes, const Row<const double>& start, const Row<double>& height, const Row<double>& sigma,
+         const Row<std::int32_t>& photos) {
+    const auto cells = static_cast<std::size_t>(votes.cells());
+    require(start.shape(0) == cells && height.shape(0) == cells && sigma.shape(0) == cells && photos.shape(0) == cells,
+            "starts or results of another size");
+    const nb::gil_scoped_release released;
+    votes.fit(start.data(), {height.data(), sigma.data(), photos.data()});
+}
+
+}  // namespace
+
+void bind_surface(nb::module_& m) {
+    nb::class_<splat::CellVotes>(m, "CellVotes")
+        .def(
+            "__init__",
+            [](splat::CellVotes* self, const Lattice& lattice, const Rectangle& tile,
+               const std::array<double, 2>& relief) { new (self) splat::CellVotes(tile_of(lattice, tile, relief)); },
+            "lattice"_a, "tile"_a, "relief"_a)
+        .def("add", &add_votes, "depth"_a.noconvert(), "confidence"_a.noconvert(), "camera"_a, "window"_a)
+        .def("layers", &find_layers, "height"_a.noconvert(), "count"_a.noconvert(), "cover"_a.noconvert())
+        .def("fit", &fit, "start"_a.noconvert(), "height"_a.noconvert(), "sigma"_a.noconvert(), "photos"_a.noconvert());
+}
