@@ -11,6 +11,9 @@
 #include <cstdint>
 #include <tuple>
 
+#include "surface_colours.h"
+#include "surface_mosaic.h"
+#include "surface_sight.h"
 #include "surface_votes.h"
 
 namespace nb = nanobind;
@@ -22,6 +25,14 @@ template <class T>
 using Plane = nb::ndarray<T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Row = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Cells = nb::ndarray<T, nb::c_contig, nb::device::cpu>;  // of any number of dimensions
+using PlaceArrays = std::tuple<Cells<const double>, Cells<const double>, Cells<const double>>;  // east, north, up
+using Pixels = nb::ndarray<const std::uint8_t, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Tone = nb::ndarray<const std::uint8_t, nb::shape<256, 3>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Stack = nb::ndarray<T, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using ColourStack = nb::ndarray<const std::uint8_t, nb::shape<-1, -1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
 using Camera = std::tuple<Pose, std::array<int, 2>, std::array<double, 4>>;  // width, height; fx, fy, cx, cy
 using Lattice = std::array<double, 3>;                                       // east, north, cell
@@ -70,14 +81,79 @@ splat::CellTile tile_of(const Lattice& lattice, const Rectangle& tile, const std
     return {lattice[0], lattice[1], lattice[2], row, column, height, width, low, high};
 }
 
+bool is_size(const splat::SurfaceCamera& camera, std::size_t height, std::size_t width) {
+    return height == static_cast<std::size_t>(camera.height) && width == static_cast<std::size_t>(camera.width);
+}
+
+splat::Places places_of(const PlaceArrays& given) {
+    const auto& [east, north, up] = given;
+    require(east.size() == up.size() && north.size() == up.size(), "places of different numbers");
+    return {static_cast<std::int64_t>(up.size()), east.data(), north.data(), up.data()};
+}
+
+void look(const Plane<const float>& depth, const Camera& camera, const PlaceArrays& points, double least,
+          const Cells<std::uint8_t>& said) {
+    const splat::DepthPicture picture{camera_of(camera), depth.data(), nullptr};
+    const splat::Places places = places_of(points);
+    require(is_size(picture.camera, depth.shape(0), depth.shape(1)), "depths that are not of the camera's size");
+    require(said.size() == std::get<2>(points).size(), "a result of another size");
+    const nb::gil_scoped_release released;
+    SPLAT_KERNELS(sight_kernels).look(picture, places, least, said.data());
+}
+
+std::int64_t rate(const Camera& given, const PlaceArrays& points, double cell, const Cells<const std::uint8_t>& said,
+                  const Cells<std::uint16_t>& cost, const Cells<std::uint8_t>& seen) {
+    const splat::SurfaceCamera camera = camera_of(given);
+    const splat::Places places = places_of(points);
+    const std::size_t size = std::get<2>(points).size();
+    require(cell > 0.0 && said.size() == size && cost.size() == size && seen.size() == size,
+            "results of another size, or cells of none");
+    const nb::gil_scoped_release released;
+    return SPLAT_KERNELS(sight_kernels).rate(camera, places, cell, said.data(), cost.data(), seen.data());
+}
+
+void sample_photo(const Pixels& pixels, const Tone& tone, const Camera& camera, const PlaceArrays& points, double cell,
+                  const Cells<const std::uint8_t>& seen, const Cells<std::uint8_t>& colour) {
+    const splat::Photo photo{camera_of(camera), pixels.data(), tone.data()};
+    const splat::Places places = places_of(points);
+    const std::size_t size = std::get<2>(points).size();
+    require(is_size(photo.camera, pixels.shape(0), pixels.shape(1)), "pixels that are not of the camera's size");
+    require(cell > 0.0 && seen.size() == size && colour.size() == 3 * size,
+            "results of another size, or cells of none");
+    const nb::gil_scoped_release released;
+    splat::sample_photo(photo, places, cell, seen.data(), colour.data());
+}
+
+void compose_mosaic(const Stack<const std::uint8_t>& seen, const Stack<std::uint16_t>& cost, const ColourStack& colour,
+                    int parity, const Plane<std::int16_t>& label, const Cells<std::uint8_t>& blended,
+                    const Plane<std::uint8_t>& seen_by) {
+    const std::size_t photos = seen.shape(0), height = seen.shape(1), width = seen.shape(2);
+    require(photos <= INT16_MAX && height >= 1 && width >= 1 && height <= kMostCells / width,
+            "too many photos or cells, or no cells");
+    for (std::size_t side = 0; side < 3; ++side)
+        require(cost.shape(side) == seen.shape(side) && colour.shape(side) == seen.shape(side),
+                "photos of different sizes");
+    require(label.shape(0) == height && label.shape(1) == width && seen_by.shape(0) == height &&
+                seen_by.shape(1) == width && blended.size() == 3 * height * width,
+            "results of another size");
+    require(parity == 0 || parity == 1, "a parity that is none");
+    const splat::MosaicJob job{static_cast<int>(photos),
+                               static_cast<int>(width),
+                               static_cast<int>(height),
+                               parity,
+                               seen.data(),
+                               colour.data(),
+                               cost.data()};
+    const nb::gil_scoped_release released;
+    splat::compose_mosaic(job, {label.data(), blended.data(), seen_by.data()});
+}
+
 void add_votes(splat::CellVotes& votes, const Plane<const float>& depth, const Plane<const std::uint8_t>& confidence,
                const Camera& camera, const Rectangle& window) {
     const splat::DepthPicture picture{camera_of(camera), depth.data(), confidence.data()};
     const auto [left, top, right, bottom] = window;
-    const auto width = static_cast<std::size_t>(picture.camera.width);
-    const auto height = static_cast<std::size_t>(picture.camera.height);
-    require(depth.shape(0) == height && depth.shape(1) == width && confidence.shape(0) == height &&
-                confidence.shape(1) == width,
+    require(is_size(picture.camera, depth.shape(0), depth.shape(1)) &&
+                is_size(picture.camera, confidence.shape(0), confidence.shape(1)),
             "depths that are not of the camera's size");
     require(left >= 0 && top >= 0 && left < right && top < bottom && right <= picture.camera.width &&
                 bottom <= picture.camera.height,
@@ -112,6 +188,16 @@ void fit(splat::CellVotes& votes, const Row<const double>& start, const Row<doub
 }  // namespace
 
 void bind_surface(nb::module_& m) {
+    m.attr("SEEN") = splat::kSeen, m.attr("THROUGH") = splat::kThrough;
+    m.attr("MIXED") = splat::kMixed, m.attr("UNKNOWN") = splat::kUnknown;
+    m.attr("MOSAIC_MARGIN") = splat::kMosaicMargin;
+    m.def("look", &look, "depth"_a.noconvert(), "camera"_a, "places"_a, "least"_a, "said"_a.noconvert());
+    m.def("rate", &rate, "camera"_a, "places"_a, "cell"_a, "said"_a.noconvert(), "cost"_a.noconvert(),
+          "seen"_a.noconvert());
+    m.def("sample_photo", &sample_photo, "pixels"_a.noconvert(), "tone"_a.noconvert(), "camera"_a, "places"_a, "cell"_a,
+          "seen"_a.noconvert(), "colour"_a.noconvert());
+    m.def("compose_mosaic", &compose_mosaic, "seen"_a.noconvert(), "cost"_a.noconvert(), "colour"_a.noconvert(),
+          "parity"_a, "label"_a.noconvert(), "blended"_a.noconvert(), "seen_by"_a.noconvert());
     nb::class_<splat::CellVotes>(m, "CellVotes")
         .def(
             "__init__",
