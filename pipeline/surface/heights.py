@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.holes import REACH, filled
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sight import place_in, sight
+from splatpipe.pipeline.surface.sight import sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, undecided
@@ -141,12 +141,13 @@ def _balance(
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
     """How many more photos see a surface than look through it."""
-    east, north = capture.lattice.centres(tile).reshape(-1, 2)[asked].T
+    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
     balance = np.zeros(heights.shape, np.int64)
     if not asked.size:
         return balance
     for number in reversed(numbers):  # the last ones are still at hand; whole numbers add up in any order
         found = capture.depths(number)
-        view = sight(found, place_in(found.camera, east, north, heights), capture.lattice.cell_m)
-        balance += view.seen.astype(np.int64) - view.through
+        for layer, height in enumerate(heights):
+            view = sight(found, (east, north, height), capture.lattice.cell_m)
+            balance[layer] += view.seen.astype(np.int64) - view.through
     return balance

@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
 #include <array>
@@ -9,6 +10,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <optional>
 #include <tuple>
 
 #include "surface_colours.h"
@@ -35,7 +37,9 @@ using Stack = nb::ndarray<T, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using ColourStack = nb::ndarray<const std::uint8_t, nb::shape<-1, -1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
 using Camera = std::tuple<Pose, std::array<int, 2>, std::array<double, 4>>;  // width, height; fx, fy, cx, cy
-using Lattice = std::array<double, 3>;                                       // east, north, cell
+using Lens = std::tuple<double, nb::ndarray<const double, nb::shape<-1, -1, 2>, nb::c_contig, nb::device::cpu>>;
+using Picture = std::tuple<Pixels, Tone, Camera, std::optional<Lens>>;
+using Lattice = std::array<double, 3>;  // east, north, cell
 using Rectangle = std::array<int, 4>;
 
 constexpr int kMostCells = 1 << splat::kCellBits;
@@ -91,14 +95,15 @@ splat::Places places_of(const PlaceArrays& given) {
     return {static_cast<std::int64_t>(up.size()), east.data(), north.data(), up.data()};
 }
 
-void look(const Plane<const float>& depth, const Camera& camera, const PlaceArrays& points, double least,
-          const Cells<std::uint8_t>& said) {
+void look(const Plane<const float>& depth, const Camera& camera, const PlaceArrays& points,
+          const std::optional<Cells<const double>>& sines, double least, const Cells<std::uint8_t>& said) {
     const splat::DepthPicture picture{camera_of(camera), depth.data(), nullptr};
     const splat::Places places = places_of(points);
     require(is_size(picture.camera, depth.shape(0), depth.shape(1)), "depths that are not of the camera's size");
-    require(said.size() == std::get<2>(points).size(), "a result of another size");
+    const std::size_t size = std::get<2>(points).size();
+    require(said.size() == size && (!sines || sines->size() == size), "sines or a result of another size");
     const nb::gil_scoped_release released;
-    SPLAT_KERNELS(sight_kernels).look(picture, places, least, said.data());
+    SPLAT_KERNELS(sight_kernels).look(picture, places, sines ? sines->data() : nullptr, least, said.data());
 }
 
 std::int64_t rate(const Camera& given, const PlaceArrays& points, double cell, const Cells<const std::uint8_t>& said,
@@ -112,12 +117,29 @@ std::int64_t rate(const Camera& given, const PlaceArrays& points, double cell, c
     return SPLAT_KERNELS(sight_kernels).rate(camera, places, cell, said.data(), cost.data(), seen.data());
 }
 
-void sample_photo(const Pixels& pixels, const Tone& tone, const Camera& camera, const PlaceArrays& points, double cell,
-                  const Cells<const std::uint8_t>& seen, const Cells<std::uint8_t>& colour) {
-    const splat::Photo photo{camera_of(camera), pixels.data(), tone.data()};
+splat::Photo photo_of(const Picture& given) {
+    const auto& [pixels, tone, camera, lens] = given;
+    splat::Photo photo{};
+    photo.camera = camera_of(camera), photo.width = photo.camera.width, photo.height = photo.camera.height;
+    photo.pixels = pixels.data(), photo.tone = tone.data();
+    require(lens || is_size(photo.camera, pixels.shape(0), pixels.shape(1)),
+            "pixels that are not of the camera's size");
+    if (!lens) return photo;
+    const auto& [step, nodes] = *lens;
+    const std::size_t height = pixels.shape(0), width = pixels.shape(1), rows = nodes.shape(0),
+                      columns = nodes.shape(1);
+    require(height >= 1 && width >= 1 && height <= INT_MAX / width, "a photo without pixels, or with too many");
+    require(step > 0.0 && rows >= 2 && columns >= 2 && rows <= INT_MAX / columns, "a lens that is none");
+    photo.width = static_cast<int>(width), photo.height = static_cast<int>(height);
+    photo.lens = {step, static_cast<int>(rows), static_cast<int>(columns), nodes.data()};
+    return photo;
+}
+
+void sample_photo(const Picture& given, const PlaceArrays& points, double cell, const Cells<const std::uint8_t>& seen,
+                  const Cells<std::uint8_t>& colour) {
+    const splat::Photo photo = photo_of(given);
     const splat::Places places = places_of(points);
     const std::size_t size = std::get<2>(points).size();
-    require(is_size(photo.camera, pixels.shape(0), pixels.shape(1)), "pixels that are not of the camera's size");
     require(cell > 0.0 && seen.size() == size && colour.size() == 3 * size,
             "results of another size, or cells of none");
     const nb::gil_scoped_release released;
@@ -191,11 +213,11 @@ void bind_surface(nb::module_& m) {
     m.attr("SEEN") = splat::kSeen, m.attr("THROUGH") = splat::kThrough;
     m.attr("MIXED") = splat::kMixed, m.attr("UNKNOWN") = splat::kUnknown;
     m.attr("MOSAIC_MARGIN") = splat::kMosaicMargin;
-    m.def("look", &look, "depth"_a.noconvert(), "camera"_a, "places"_a, "least"_a, "said"_a.noconvert());
+    m.def("look", &look, "depth"_a.noconvert(), "camera"_a, "places"_a, "sines"_a.noconvert().none(), "least"_a,
+          "said"_a.noconvert());
     m.def("rate", &rate, "camera"_a, "places"_a, "cell"_a, "said"_a.noconvert(), "cost"_a.noconvert(),
           "seen"_a.noconvert());
-    m.def("sample_photo", &sample_photo, "pixels"_a.noconvert(), "tone"_a.noconvert(), "camera"_a, "places"_a, "cell"_a,
-          "seen"_a.noconvert(), "colour"_a.noconvert());
+    m.def("sample_photo", &sample_photo, "photo"_a, "places"_a, "cell"_a, "seen"_a.noconvert(), "colour"_a.noconvert());
     m.def("compose_mosaic", &compose_mosaic, "seen"_a.noconvert(), "cost"_a.noconvert(), "colour"_a.noconvert(),
           "parity"_a, "label"_a.noconvert(), "blended"_a.noconvert(), "seen_by"_a.noconvert());
     nb::class_<splat::CellVotes>(m, "CellVotes")

@@ -20,8 +20,8 @@ int halved_size(int size, int times) { return (size + (1 << times) - 1) >> times
 std::vector<std::uint32_t> open_part(const Photo& photo, const Extent& extent, Halved* part) {
     const ColourKernels& kernels = SPLAT_KERNELS(colour_sample_kernels);
     const double side = 1 << part->times;
-    part->whole_width = halved_size(photo.camera.width, part->times);
-    part->whole_height = halved_size(photo.camera.height, part->times);
+    part->whole_width = halved_size(photo.width, part->times);
+    part->whole_height = halved_size(photo.height, part->times);
     part->left = std::max(static_cast<int>(extent.left / side) - kReach, 0);
     part->top = std::max(static_cast<int>(extent.top / side) - kReach, 0);
     part->width = std::min(static_cast<int>(extent.right / side) + kReach + 1, part->whole_width) - part->left;
@@ -52,7 +52,7 @@ void sample_photo(const Photo& photo, const Places& places, double cell, const s
     std::fill(colour, colour + 3 * count, std::uint8_t{0});
     std::vector<double> column(count), row(count);
     std::vector<std::int8_t> times(count);
-    kernels.find(photo.camera, places, cell, seen, column.data(), row.data(), times.data());
+    kernels.find(photo, places, cell, seen, column.data(), row.data(), times.data());
     Extent extents[kMostHalved + 1];
     for (std::size_t k = 0; k < count; ++k) {
         if (times[k] < 0) continue;

@@ -10,9 +10,19 @@ namespace splat {
 
 constexpr int kMostHalved = 6;  // times: a photo 64 times finer than the cells is softened no further
 
+// The way from a pinhole's pixels to a photo's: columns and rows of the photo at every `step` pixels of the pinhole's,
+// straight between.
+struct Lens {
+    double step;
+    int rows, columns;    // at least 2
+    const double* nodes;  // (rows, columns, 2); null: the photo is the pinhole's
+};
+
 // A photo, and what becomes of each of its values in each channel.
 struct Photo {
-    SurfaceCamera camera;
+    SurfaceCamera camera;  // a pinhole
+    Lens lens;
+    int width, height;           // of the photo itself
     const std::uint8_t* pixels;  // (height, width, 3)
     const std::uint8_t* tone;    // (256, 3)
 };
@@ -27,8 +37,8 @@ struct Halved {
 
 struct ColourKernels {
     // Where places lie in a photo, and how often it is halved there; -1: not seen.
-    void (*find)(const SurfaceCamera& camera, const Places& places, double cell, const std::uint8_t* seen,
-                 double* column, double* row, std::int8_t* times);
+    void (*find)(const Photo& photo, const Places& places, double cell, const std::uint8_t* seen, double* column,
+                 double* row, std::int8_t* times);
     // A row of a part, its values toned; the photo's rim goes on beyond it.
     void (*read)(const Photo& photo, int row, int left, int count, std::uint32_t* out);
     // Means of two by two pixels, of two rows of twice `count`.

@@ -18,24 +18,46 @@ SPLAT_INLINE Quad quad(uint32_t pixel) {
     return __builtin_convertvector(bytes, Quad);
 }
 
-void find(const SurfaceCamera& camera, const Places& places, double cell, const uint8_t* seen, double* column,
-          double* row, int8_t* times) {
+SPLAT_INLINE double within(double value, double last) { return value > 0.0 ? (value < last ? value : last) : 0.0; }
+
+// A pinhole's place in the photo; beyond its picture by that of its rim's squares.
+SPLAT_INLINE void through_lens(const Lens& lens, double* column, double* row) {
+    const double x = *column / lens.step, y = *row / lens.step;
+    const int left = static_cast<int>(within(x, lens.columns - 2)), top = static_cast<int>(within(y, lens.rows - 2));
+    const double* above = lens.nodes + 2 * (static_cast<int64_t>(top) * lens.columns + left);
+    const double *below = above + 2 * static_cast<int64_t>(lens.columns), across = x - left, down = y - top;
+    double found[2];
+    for (int axis = 0; axis < 2; ++axis) {
+        const double upper = above[axis] * (1.0 - across) + above[2 + axis] * across;
+        const double lower = below[axis] * (1.0 - across) + below[2 + axis] * across;
+        found[axis] = upper * (1.0 - down) + lower * down;
+    }
+    *column = found[0], *row = found[1];
+}
+
+void find(const Photo& photo, const Places& places, double cell, const uint8_t* seen, double* column, double* row,
+          int8_t* times) {
+    const SurfaceCamera& camera = photo.camera;
     const double focal = camera.fx > camera.fy ? camera.fx : camera.fy;
     InPhoto at;
     for (int64_t first = 0; first < places.count; first += kPlaces) {
         project(camera, places, first, &at);
         for (int k = 0; k < at.count; ++k) {
+            times[first + k] = -1;
+            if (!at.is_in[k] || !seen[first + k]) continue;
             const double finer = cell * focal / at.depth[k] / kFirstFiner;
             int halved = 0;
             for (int time = 0; time < kMostHalved; ++time) halved += finer >= static_cast<double>(1 << time);
-            column[first + k] = at.column[k], row[first + k] = at.row[k];
-            times[first + k] = static_cast<int8_t>(at.is_in[k] & (seen[first + k] != 0) ? halved : -1);
+            double x = at.column[k], y = at.row[k];
+            if (photo.lens.nodes) through_lens(photo.lens, &x, &y);
+            column[first + k] = within(x, photo.width), row[first + k] = within(y, photo.height);
+            times[first + k] = static_cast<int8_t>(halved);
         }
     }
 }
 
 void read(const Photo& photo, int row, int left, int count, uint32_t* out) {
-    const int width = photo.camera.width, height = photo.camera.height;
+    const int width = photo.width, height = photo.height;
     const uint8_t* from = photo.pixels + static_cast<int64_t>(row < height ? row : height - 1) * width * 3;
     for (int k = 0; k < count; ++k) {
         const uint8_t* pixel = from + static_cast<int64_t>(left + k < width ? left + k : width - 1) * 3;

@@ -23,8 +23,10 @@ constexpr std::uint8_t kUnknown = 8;  // it looks there, but has no depth: it ma
 constexpr std::uint16_t kHidden = 4000;  // cost of a photo that does not see a place; and no cost is higher
 
 struct SightKernels {
-    // What the depths say; differences of up to `least` metres are none.
-    void (*look)(const DepthPicture& picture, const Places& places, double least, std::uint8_t* said);
+    // What the depths say; differences of up to `least` metres are none. `sines` are of the rays' angles against the
+    // surface; null: against the ground.
+    void (*look)(const DepthPicture& picture, const Places& places, const double* sines, double least,
+                 std::uint8_t* said);
     // What it costs to colour cells by a photo of which `said` is said, and whether it sees them (0 or 1); returns how
     // many it sees.
     std::int64_t (*rate)(const SurfaceCamera& camera, const Places& places, double cell, const std::uint8_t* said,

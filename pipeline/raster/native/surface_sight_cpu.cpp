@@ -34,7 +34,7 @@ SPLAT_INLINE float least_around(const DepthPicture& picture, int row, int column
     return least;
 }
 
-void look(const DepthPicture& picture, const Places& places, double least_m, uint8_t* said) {
+void look(const DepthPicture& picture, const Places& places, const double* sines, double least_m, uint8_t* said) {
     const SurfaceCamera& camera = picture.camera;
     InPhoto at;
     for (int64_t first = 0; first < places.count; first += kPlaces) {
@@ -49,7 +49,8 @@ void look(const DepthPicture& picture, const Places& places, double least_m, uin
                 *out = kUnknown;
                 continue;
             }
-            const double depth = at.depth[k], flat = greater(at.sine[k], kFlattest);
+            const double depth = at.depth[k];
+            const double flat = greater(sines ? sines[first + k] : at.sine[k], kFlattest);
             const double limit = greater(kTolerancePixels * depth / focal(camera) / flat, least_m);
             const double behind = static_cast<double>(near) - depth;
             if (behind < -limit) continue;
