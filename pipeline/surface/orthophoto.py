@@ -105,7 +105,8 @@ def tile_orthophoto(album: Album, tile: Tile) -> Orthophoto:
     east, north = np.moveaxis(album.lattice.centres(wide), -1, 0)
     points = contiguous((east, north, album.surface.at(east, north)))
     windows = seen_by([source.camera for source in album.sources], album.lattice, wide, album.relief)
-    offers, numbers = _Offers.room(len(windows), east.shape), []
+    offers = _Offers.room(len(windows), east.shape)
+    numbers: list[int] = []
     for number, _ in windows:
         if _offer(album, number, points, offers, len(numbers)):
             numbers.append(number)
