@@ -13,6 +13,7 @@
 #include <optional>
 #include <tuple>
 
+#include "surface_cell_votes.h"
 #include "surface_colours.h"
 #include "surface_mosaic.h"
 #include "surface_sight.h"

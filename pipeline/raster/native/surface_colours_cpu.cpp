@@ -10,11 +10,11 @@ constexpr float kCubic = -0.75f;                   // Keys' parameter; OpenCV's,
 constexpr double kFirstFiner = 1.515716566510398;  // 2 to the power of 0.6: where a photo is halved first
 
 using Quad = float __attribute__((vector_size(16)));
-using QuadBytes = uint8_t __attribute__((vector_size(4)));
+using QuadInts = int32_t __attribute__((vector_size(16)));
 
 SPLAT_INLINE Quad quad(uint32_t pixel) {
-    QuadBytes bytes;
-    __builtin_memcpy(&bytes, &pixel, 4);
+    const int32_t bits = static_cast<int32_t>(pixel);
+    const QuadInts shift = {0, 8, 16, 24}, bytes = (QuadInts{bits, bits, bits, bits} >> shift) & 255;
     return __builtin_convertvector(bytes, Quad);
 }
 
@@ -41,9 +41,12 @@ void find(const Photo& photo, const Places& places, double cell, const uint8_t* 
     const double focal = camera.fx > camera.fy ? camera.fx : camera.fy;
     InPhoto at;
     for (int64_t first = 0; first < places.count; first += kPlaces) {
+        const int64_t last = first + kPlaces < places.count ? first + kPlaces : places.count;
+        bool is_any = false;
+        for (int64_t k = first; k < last; ++k) times[k] = -1, is_any |= seen[k] != 0;
+        if (!is_any) continue;
         project(camera, places, first, &at);
         for (int k = 0; k < at.count; ++k) {
-            times[first + k] = -1;
             if (!at.is_in[k] || !seen[first + k]) continue;
             const double finer = cell * focal / at.depth[k] / kFirstFiner;
             int halved = 0;
@@ -108,10 +111,9 @@ void sample(const Halved& part, int64_t count, const double* column, const doubl
             const int at = held(top - 2 + j, part.whole_height - 1) - part.top;
             sum += mixed(part.pixels + static_cast<int64_t>(at) * part.width, columns, across) * down[j];
         }
-        for (int channel = 0; channel < 3; ++channel) {
-            const float value = sum[channel];
-            colour[3 * k + channel] = static_cast<uint8_t>(value < 0.0f ? 0.0f : value > 255.0f ? 255.0f : value);
-        }
+        const Quad low = {}, high = low + 255.0f;
+        const QuadInts whole = __builtin_convertvector(sum < low ? low : sum > high ? high : sum, QuadInts);
+        for (int channel = 0; channel < 3; ++channel) colour[3 * k + channel] = static_cast<uint8_t>(whole[channel]);
     }
 }
 

@@ -34,57 +34,58 @@ SPLAT_INLINE float least_around(const DepthPicture& picture, int row, int column
     return least;
 }
 
+SPLAT_INLINE uint8_t said_of(const DepthPicture& picture, double y, double x, double depth, double limit) {
+    const int row = static_cast<int>(y), column = static_cast<int>(x);
+    const float near = picture.depth[static_cast<int64_t>(row) * picture.camera.width + column];
+    if (!(near > 0.0f)) return kUnknown;
+    const double behind = static_cast<double>(near) - depth;
+    if (behind < -limit) return 0;
+    const float least = least_around(picture, row, column);
+    const double least_behind = static_cast<double>(least) - depth;
+    if (behind <= limit) return static_cast<uint8_t>(kSeen | (least > 0.0f && least_behind < -limit ? kMixed : 0));
+    return least > 0.0f && least_behind > limit ? kThrough : 0;
+}
+
 void look(const DepthPicture& picture, const Places& places, const double* sines, double least_m, uint8_t* said) {
     const SurfaceCamera& camera = picture.camera;
+    const double pixel = kTolerancePixels / focal(camera);
     InPhoto at;
+    double limits[kPlaces];
     for (int64_t first = 0; first < places.count; first += kPlaces) {
         project(camera, places, first, &at);
-        for (int k = 0; k < at.count; ++k) {
-            uint8_t* out = said + first + k;
-            *out = 0;
-            if (!at.is_in[k]) continue;
-            const int row = static_cast<int>(at.row[k]), column = static_cast<int>(at.column[k]);
-            const float near = picture.depth[static_cast<int64_t>(row) * camera.width + column];
-            if (!(near > 0.0f)) {
-                *out = kUnknown;
-                continue;
-            }
-            const double depth = at.depth[k];
-            const double flat = greater(sines ? sines[first + k] : at.sine[k], kFlattest);
-            const double limit = greater(kTolerancePixels * depth / focal(camera) / flat, least_m);
-            const double behind = static_cast<double>(near) - depth;
-            if (behind < -limit) continue;
-            const float least = least_around(picture, row, column);
-            const double least_behind = static_cast<double>(least) - depth;
-            if (behind <= limit)
-                *out = static_cast<uint8_t>(kSeen | (least > 0.0f && least_behind < -limit ? kMixed : 0));
-            else if (least > 0.0f && least_behind > limit)
-                *out = kThrough;
-        }
+        const double* flat = sines ? sines + first : at.sine;
+        for (int k = 0; k < at.count; ++k)
+            limits[k] = greater(pixel * at.depth[k] / greater(flat[k], kFlattest), least_m);
+        for (int k = 0; k < at.count; ++k)
+            said[first + k] = at.is_in[k] ? said_of(picture, at.row[k], at.column[k], at.depth[k], limits[k]) : 0;
     }
 }
 
 int64_t rate(const SurfaceCamera& camera, const Places& places, double cell, const uint8_t* said, uint16_t* cost,
              uint8_t* seen) {
-    const double rim = kRim * camera.width, width = camera.width, height = camera.height;
+    const double per_rim = 1.0 / (kRim * camera.width), width = camera.width, height = camera.height;
+    const double per_cell = 1.0 / (focal(camera) * cell);
     int64_t count = 0;
     InPhoto at;
+    double totals[kPlaces];
     for (int64_t first = 0; first < places.count; first += kPlaces) {
         project(camera, places, first, &at);
         for (int k = 0; k < at.count; ++k) {
-            const uint8_t is = said[first + k];
             const double sine = greater(at.sine[k], kFlattest), straight = smaller(sine, 1.0);
-            const double pixel = at.depth[k] / focal(camera) / sine / cell - 1.0;
+            const double coarse = smaller(greater(at.depth[k] * per_cell / sine - 1.0, 0.0), kCoarsest);
             const double edge =
                 smaller(smaller(at.column[k], width - at.column[k]), smaller(at.row[k], height - at.row[k]));
-            const double total = kLeaning * __builtin_sqrt(1.0 - straight * straight) +
-                                 kCoarse * smaller(greater(pixel, 0.0), kCoarsest) +
-                                 kRimCost * greater(1.0 - edge / rim, 0.0) + (is & kMixed ? kMixedCost : 0.0) +
-                                 (is & kUnknown ? kUnknownCost : 0.0);
-            const bool is_seen = at.is_in[k] & ((is & kSeen) != 0), counts = at.is_in[k] & ((is & kUnknown) != 0);
-            const double whole = smaller(total * kCostUnit + 0.5, static_cast<double>(kHidden));
-            cost[first + k] = is_seen | counts ? static_cast<uint16_t>(static_cast<int>(whole)) : kHidden;
-            seen[first + k] = is_seen, count += is_seen;
+            totals[k] = kLeaning * __builtin_sqrt(1.0 - straight * straight) + kCoarse * coarse +
+                        kRimCost * greater(1.0 - edge * per_rim, 0.0);
+        }
+        for (int k = 0; k < at.count; ++k) {
+            const uint8_t is = said[first + k];
+            const bool is_seen = at.is_in[k] && (is & kSeen);
+            seen[first + k] = is_seen, cost[first + k] = kHidden, count += is_seen;
+            if (!at.is_in[k] || !(is & (kSeen | kUnknown))) continue;
+            const double whole =
+                kCostUnit * (totals[k] + (is & kMixed ? kMixedCost : 0.0) + (is & kUnknown ? kUnknownCost : 0.0)) + 0.5;
+            cost[first + k] = static_cast<uint16_t>(static_cast<int>(smaller(whole, kHidden)));
         }
     }
     return count;

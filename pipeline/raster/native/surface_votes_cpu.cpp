@@ -13,7 +13,7 @@ constexpr float kSamePixels = 10.0f;  // depths that differ by more than so many
 constexpr double kSteepest = 3.0;     // rise over run; steeper is a wall, whose height at a place says nothing
 constexpr double kCovered = 0.75;     // of a cell: pixels further apart than that are divided
 constexpr int kWidest = 4;            // cells from a pixel's centre to its edge; a larger one says too little
-constexpr int kBlock = 64;            // pixels at a time: their planes stay in the nearest cache
+constexpr int kBlock = kRowPadding;   // pixels at a time: their planes stay in the nearest cache
 constexpr int kMostConfident = (1 << kConfidenceBits) - 1;
 constexpr double kMostCover = (1 << kCoverBits) - 1;
 
@@ -57,13 +57,14 @@ bool place(const HeightRow& job, const RowRay& ray, Block* block) {
     const float* depth = job.picture.depth + static_cast<int64_t>(job.row) * camera.width + block->first;
     const double west = tile.column - 2 * kWidest, far = tile.column + tile.width + 2 * kWidest;
     const double top = tile.row - 2 * kWidest, bottom = tile.row + tile.height + 2 * kWidest;
+    const double per_pixel = 1.0 / camera.fx, per_cell = 1.0 / tile.cell;
     int near = 0;
     for (int k = 0; k < block->count; ++k) {
-        const double x = (block->first + k + 0.5 - camera.cx) / camera.fx, z = depth[k];
+        const double x = (block->first + k + 0.5 - camera.cx) * per_pixel, z = depth[k];
         const double east = camera.centre[0] + (ray.right[0] * x + ray.start[0]) * z;
         const double north = camera.centre[1] + (ray.right[1] * x + ray.start[1]) * z;
         const double up = camera.centre[2] + (ray.right[2] * x + ray.start[2]) * z;
-        const double across = (east - tile.east) / tile.cell, down = (tile.north - north) / tile.cell;
+        const double across = (east - tile.east) * per_cell, down = (tile.north - north) * per_cell;
         const bool is_near = (z > 0.0) & (up >= tile.low) & (up < tile.high) & (across >= west) & (across < far) &
                              (down >= top) & (down < bottom);
         block->x[k] = x, block->east[k] = east, block->north[k] = north, block->up[k] = up;
@@ -72,37 +73,33 @@ bool place(const HeightRow& job, const RowRay& ray, Block* block) {
     return near != 0;
 }
 
+SPLAT_INLINE Floats size(Floats v) { return max(v, fill(0.0f) - v); }  // NaN stays
+
 // How inverse depths grow from a pixel to the next one in a direction, by least squares over pairs of pixels on both
 // sides that lie in one plane with it; from one side alone at a surface's rim; NaN where there is no neighbour.
 SPLAT_INLINE void slope(const HeightRow& job, const Block& block, float same, bool is_down, float* out) {
     const int offset = block.first - job.left + kSlopeReach;
-    const float* centre = job.inverses[kSlopeReach] + offset;
-    float total[kBlock], weight[kBlock];
-    for (int k = 0; k < block.count; ++k) total[k] = weight[k] = 0.0f;
-    for (int along = 1; along <= 2; ++along) {
-        const float step = static_cast<float>(along);
-        for (int aside = -1; aside <= 1; ++aside) {
-            const int down = is_down ? along : aside, right = is_down ? aside : along;
-            const float* ahead = job.inverses[kSlopeReach + down] + offset + right;
-            const float* behind =
-                job.inverses[kSlopeReach + (is_down ? -along : aside)] + offset + (is_down ? aside : -along);
-            for (int k = 0; k < block.count; ++k) {
-                const float difference = ahead[k] - behind[k], bend = ahead[k] + behind[k] - 2.0f * centre[k];
-                const float near = centre[k] * same;
-                const bool is_flat =
-                    (__builtin_fabsf(bend) < near) & (__builtin_fabsf(difference) < 2.0f * step * near);
-                total[k] += is_flat ? step * difference : 0.0f;
-                weight[k] += is_flat ? 2.0f * step * step : 0.0f;
+    const auto row = [&](int down, int right) { return job.inverses[kSlopeReach + down] + offset + right; };
+    for (int k = 0; k < kBlock; k += kLanes) {
+        const Floats centre = load(row(0, 0) + k), near = centre * fill(same), twice = centre + centre;
+        Floats total = fill(0.0f), weight = fill(0.0f);
+        for (int along = 1; along <= 2; ++along) {
+            const Floats step = fill(static_cast<float>(along)), steep = fill(2.0f) * step * near;
+            for (int aside = -1; aside <= 1; ++aside) {
+                const Floats ahead = load((is_down ? row(along, aside) : row(aside, along)) + k);
+                const Floats behind = load((is_down ? row(-along, aside) : row(aside, -along)) + k);
+                const Floats difference = ahead - behind;
+                const Mask is_flat = both(less(size(ahead + behind - twice), near), less(size(difference), steep));
+                total = total + only(is_flat, step * difference);
+                weight = weight + only(is_flat, fill(2.0f) * step * step);
             }
         }
-    }
-    const float* ahead = is_down ? job.inverses[kSlopeReach + 1] + offset : centre + 1;
-    const float* behind = is_down ? job.inverses[kSlopeReach - 1] + offset : centre - 1;
-    for (int k = 0; k < block.count; ++k) {
-        const float near = centre[k] * same, onward = ahead[k] - centre[k], back = centre[k] - behind[k];
-        const float last = __builtin_fabsf(back) < near ? back : __builtin_nanf("");
-        const float single = __builtin_fabsf(onward) < near ? onward : last;
-        out[k] = weight[k] > 0.0f ? total[k] / weight[k] : single;
+        const Floats onward = load((is_down ? row(1, 0) : row(0, 1)) + k) - centre;
+        const Floats back = centre - load((is_down ? row(-1, 0) : row(0, -1)) + k);
+        const Floats last = select(less(size(back), near), back, fill(__builtin_nanf("")));
+        const Floats single = select(less(size(onward), near), onward, last);
+        const Mask is_paired = less(fill(0.0f), weight);
+        store(out + k, select(is_paired, total / select(is_paired, weight, fill(1.0f)), single));
     }
 }
 
@@ -113,7 +110,7 @@ void lay(const HeightRow& job, const RowRay& ray, Block* block) {
     const float* inverse = job.inverses[kSlopeReach] + (block->first - job.left + kSlopeReach);
     const float* depth = job.picture.depth + static_cast<int64_t>(job.row) * camera.width + block->first;
     const double widest = 2 * kWidest * job.tile.cell, covered = kCovered * job.tile.cell;
-    const double unit = covered * covered;
+    const double unit = 1.0 / (covered * covered), per_x = 1.0 / camera.fx, per_y = 1.0 / camera.fy;
     for (int k = 0; k < block->count; ++k) {
         const double w = inverse[k], z = depth[k], x = block->x[k];
         const double slope_x = block->slope_x[k], slope_y = block->slope_y[k];
@@ -122,18 +119,18 @@ void lay(const HeightRow& job, const RowRay& ray, Block* block) {
         const double n_north = turn[1] * a + turn[4] * b + turn[7] * c;
         const double n_up = turn[2] * a + turn[5] * b + turn[8] * c;
         const double ray_east = ray.right[0] * x + ray.start[0], ray_north = ray.right[1] * x + ray.start[1];
-        const double right_east = (turn[0] / camera.fx - ray_east * slope_x * z) * z;
-        const double right_north = (turn[1] / camera.fx - ray_north * slope_x * z) * z;
-        const double down_east = (turn[3] / camera.fy - ray_east * slope_y * z) * z;
-        const double down_north = (turn[4] / camera.fy - ray_north * slope_y * z) * z;
+        const double right_east = (turn[0] * per_x - ray_east * slope_x * z) * z;
+        const double right_north = (turn[1] * per_x - ray_north * slope_x * z) * z;
+        const double down_east = (turn[3] * per_y - ray_east * slope_y * z) * z;
+        const double down_north = (turn[4] * per_y - ray_north * slope_y * z) * z;
         // The normal looks away from the camera: down, where the plane is seen from above. NaN is not usable.
         const double level = kSteepest * n_up;
         const bool is_used = (block->is_near[k] != 0) & (n_up < 0.0) &
                              (n_east * n_east + n_north * n_north <= level * level) &
                              (__builtin_fabs(right_east) <= widest) & (__builtin_fabs(right_north) <= widest) &
                              (__builtin_fabs(down_east) <= widest) & (__builtin_fabs(down_north) <= widest);
-        const double wide = (right_east * right_east + right_north * right_north) / unit;
-        const double high = (down_east * down_east + down_north * down_north) / unit;
+        const double wide = (right_east * right_east + right_north * right_north) * unit;
+        const double high = (down_east * down_east + down_north * down_north) * unit;
         block->rise_east[k] = -n_east / n_up, block->rise_north[k] = -n_north / n_up;
         block->right_east[k] = right_east, block->right_north[k] = right_north;
         block->down_east[k] = down_east, block->down_north[k] = down_north;
@@ -148,14 +145,17 @@ SPLAT_INLINE int64_t floored(double value) {
     return whole - (value < static_cast<double>(whole));
 }
 
+SPLAT_TABLE double kShare[kMostParts + 1] = {0.0, 1.0, 0.5, 1.0 / 3.0, 0.25};  // of one of so many parts
+
 // The keys of one pixel.
 SPLAT_INLINE int64_t cover(const HeightRow& job, const Block& block, int k, uint64_t* keys) {
     const CellTile& tile = job.tile;
     const int wide = block.wide[k], high = block.high[k];
+    const double per_cell = 1.0 / tile.cell, part_wide = kShare[wide], part_high = kShare[high];
     const double east = block.east[k], north = block.north[k];
     const double area =
         __builtin_fabs(block.right_east[k] * block.down_north[k] - block.right_north[k] * block.down_east[k]);
-    const double share = kCoverUnit * area / (wide * high * tile.cell * tile.cell);
+    const double share = kCoverUnit * area * (part_wide * part_high * per_cell * per_cell);
     const uint64_t covered = static_cast<uint64_t>(static_cast<int64_t>(share < 1.0          ? 1.0
                                                                         : share > kMostCover ? kMostCover
                                                                                              : share));
@@ -165,13 +165,13 @@ SPLAT_INLINE int64_t cover(const HeightRow& job, const Block& block, int k, uint
         covered << kConfidenceBits | static_cast<uint64_t>(sure < kMostConfident ? sure : kMostConfident);
     int64_t written = 0;
     for (int i = 0; i < wide; ++i) {
-        const double right = (i + 0.5) / wide - 0.5;
+        const double right = (i + 0.5) * part_wide - 0.5;
         for (int j = 0; j < high; ++j) {
-            const double down = (j + 0.5) / high - 0.5;
+            const double down = (j + 0.5) * part_high - 0.5;
             const double off_east = block.right_east[k] * right + block.down_east[k] * down;
             const double off_north = block.right_north[k] * right + block.down_north[k] * down;
-            const int64_t column = floored((east + off_east - tile.east) / tile.cell);
-            const int64_t row = floored((tile.north - (north + off_north)) / tile.cell);
+            const int64_t column = floored((east + off_east - tile.east) * per_cell);
+            const int64_t row = floored((tile.north - (north + off_north)) * per_cell);
             const int64_t x = column - tile.column, y = row - tile.row;
             if (x < 0 || x >= tile.width || y < 0 || y >= tile.height) continue;
             const double to_east = tile.east + (static_cast<double>(column) + 0.5) * tile.cell - east;

@@ -1,8 +1,10 @@
-#include "surface_votes.h"
+#include "surface_cell_votes.h"
 
 #include <algorithm>
 #include <cmath>
 #include <limits>
+
+#include "surface_votes.h"
 
 namespace splat {
 namespace {
@@ -120,7 +122,7 @@ void CellVotes::read_window(const DepthPicture& picture, int left, int top, int 
     const VoteKernels& kernels = SPLAT_KERNELS(vote_kernels);
     const SurfaceCamera& camera = picture.camera;
     constexpr int kRows = 2 * kSlopeReach + 1;
-    const std::size_t width = static_cast<std::size_t>(right - left) + 2 * kSlopeReach;
+    const std::size_t width = static_cast<std::size_t>(right - left) + 2 * kSlopeReach + kRowPadding;
     std::vector<float> ring(kRows * width);
     std::vector<std::uint64_t> found(static_cast<std::size_t>(right - left) * kMostParts * kMostParts);
     const auto fill = [&](int row) {
