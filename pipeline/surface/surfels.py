@@ -58,14 +58,14 @@ def surfels(found: DepthMap, window: PhotoWindow, lattice: Lattice, tile: Tile, 
     """
     camera = found.camera
     columns, rows = np.arange(window.left, window.right), np.arange(window.top, window.bottom)
-    inverse, gradient = _inverse_and_gradient(found.depth, window, SAME_PX / max(camera.fx, camera.fy))
+    inverse, gradient = inverse_and_gradient(found.depth, window, SAME_PX / max(camera.fx, camera.fy))
     known = np.flatnonzero(np.isfinite(gradient).all(axis=0).ravel() & (inverse.ravel() > 0.0))
     row, column = np.divmod(known, len(columns))
     turn, centre = camera.cam_from_world[:3, :3].T, camera.centre()
     w = inverse.ravel()[known].astype(np.float64)
     x = ((columns + 0.5 - camera.cx) / camera.fx)[column]
     y = ((rows + 0.5 - camera.cy) / camera.fy)[row]
-    ray = _turned(turn, x, y)
+    ray = turned(turn, x, y)
     place = [centre[axis] + ray[axis] / w for axis in range(3)]
     there = (place[2] >= relief.low_m) & (place[2] < relief.high_m) & _near(lattice, tile, place[0], place[1])
     some = np.flatnonzero(there)
@@ -74,7 +74,7 @@ def surfels(found: DepthMap, window: PhotoWindow, lattice: Lattice, tile: Tile, 
     ray, place = [part[some] for part in ray], [part[some] for part in place]
     per_x, per_y = (g.ravel()[known].astype(np.float64) for g in gradient)
     across, down = per_x * camera.fx, per_y * camera.fy
-    normal = _turned(turn, across, down, w - across * x - down * y)
+    normal = turned(turn, across, down, w - across * x - down * y)
     step = [
         np.stack([(turn[axis, side] / f - ray[axis] * g / w) / w for axis in (0, 1)], axis=1)
         for side, f, g in ((0, camera.fx, per_x), (1, camera.fy, per_y))
@@ -98,7 +98,7 @@ def _near(
     return inside & (down >= tile.row - 2 * WIDEST) & (down < tile.row + tile.height + 2 * WIDEST)
 
 
-def _turned(
+def turned(
     turn: Float64[np.ndarray, "3 3"],
     x: Float64[np.ndarray, " n"],
     y: Float64[np.ndarray, " n"],
@@ -108,7 +108,7 @@ def _turned(
     return [turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z for i in range(3)]
 
 
-def _inverse_and_gradient(
+def inverse_and_gradient(
     depth: Float32[np.ndarray, "h w"], window: PhotoWindow, same: float
 ) -> tuple[Float32[np.ndarray, "wh ww"], Float32[np.ndarray, "2 wh ww"]]:
     """Inverse depths of a window, 0 where there are none, and how they grow a pixel to the right and down.
