@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.depth_points import place_of
-from splatpipe.pipeline.surface.photo_set import DepthPart, PhotoSet
+from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.sources import DepthMap
 
 SIDE = 8  # voxels of a block: a surface fills smaller blocks better than open3d's usual 16
@@ -54,8 +54,7 @@ def depths_in(box: Box, found: DepthMap) -> Float32[np.ndarray, "h w"]:
 
 
 def _places(found: DepthMap, row: np.ndarray, column: np.ndarray) -> Float64[np.ndarray, "3 n"]:
-    part = DepthPart(0, found.camera, found.depth, found.confidence)
-    return place_of(part, row, column, 1.0 / found.depth[row, column].astype(np.float64))
+    return place_of(found.camera, row, column, 1.0 / found.depth[row, column].astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, dot, look_at
 from splatpipe.pipeline.surface.sources import PhotoWindow, Relief
@@ -49,7 +50,7 @@ def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: Relief) 
     inverse, gradient = inverse_and_gradient(part.depth, window, SAME_PX / max(camera.fx, camera.fy))
     known = np.flatnonzero(np.isfinite(gradient).all(axis=0).ravel() & (inverse.ravel() > 0.0))
     row, column = np.divmod(known, camera.width)
-    xyz = place_of(part, row, column, inverse.ravel()[known].astype(np.float64))
+    xyz = place_of(camera, row, column, inverse.ravel()[known].astype(np.float64))
     some = np.flatnonzero(
         (lattice.cells(tile, xyz[0], xyz[1]) >= 0) & (xyz[2] >= relief.low_m) & (xyz[2] < relief.high_m)
     )
@@ -64,10 +65,9 @@ def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: Relief) 
 
 
 def place_of(
-    part: DepthPart, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], inverse: Float64[np.ndarray, " n"]
+    camera: Camera, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], inverse: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "3 n"]:
     """East, north, up of pixels' centres at inverse depths, each by itself."""
-    camera = part.camera
     x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
     ray = turned(camera.cam_from_world[:3, :3].T, x, y)
     centre = camera.centre()

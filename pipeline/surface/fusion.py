@@ -187,7 +187,7 @@ def _place_and_normal(
     A pixel's centre lies beside the point, but on its plane: along the normal it is as far off as the plane.
     """
     row, column = look.place.row[seen].astype(np.int64), look.place.column[seen].astype(np.int64)
-    offset = place_of(part, row, column, 1.0 / part.depth[row, column].astype(np.float64)) - pieces.xyz[:, seen]
+    offset = place_of(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64)) - pieces.xyz[:, seen]
     normal, flat = picture_normals(part, row, column)
     return offset, np.where(flat, normal, 0.0)
 

@@ -26,13 +26,11 @@ class PhotoSet:
     Attributes:
         sources: Photos, always in the same order.
         gains: By how much each photo's light is multiplied, a channel each.
-        pixels: Holds a few photos.
         depths: Holds a few of their depths.
     """
 
     sources: Sequence[PhotoSource]
     gains: Float64[np.ndarray, "n 3"]
-    pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]]
     depths: Shelf[DepthMap]
 
     def with_depths(self) -> list[int]:
@@ -104,7 +102,7 @@ class Facing:
     xyz: Float64[np.ndarray, "3 n"]
     normal: Float64[np.ndarray, "3 n"]
 
-    def select(self, rows: np.ndarray) -> Facing:
+    def select(self, rows: np.ndarray | slice) -> Facing:
         """Those of them."""
         return Facing(self.xyz[:, rows], self.normal[:, rows])
 
