@@ -11,6 +11,7 @@ import pytest
 from splatpipe.pipeline.surface.heights import Capture, Heights, surface_heights, tile_heights
 from splatpipe.pipeline.surface.holes import filled
 from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.sheet import Sheet
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf, seen_by
 from splatpipe.pipeline.surface.tiles import Tile
 
@@ -121,10 +122,18 @@ def test_cells_smaller_than_pixels_have_no_gaps_and_no_steps() -> None:
     assert np.percentile(np.abs(off), 95) < 0.05 * PIXEL_M
 
 
-def test_a_turned_lattice_gives_the_same_surface() -> None:
-    lattice = Lattice(-7.0, 3.0, CELL_M, 60, 50, turn_rad=0.3)
-    off, clear = errors(tile_heights(capture(exact(), lattice=lattice), Tile(0, 0, 50, 60)), lattice)
-    assert np.abs(off[clear]).max() < 0.2 * PIXEL_M  # on the round tree
+def test_a_turned_sheet_gives_the_same_surface() -> None:
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]
+    turn[:3, 3] = [0.5, -0.2, -2.0]
+    sheet = Sheet(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), Relief(-3.0, 6.0))
+    sources = sheet.depths([DepthSource(found.camera, lambda found=found: found) for found in exact()])
+    made = tile_heights(Capture(sources, sheet.lattice, sheet.relief, Shelf(1 << 30)), Tile(0, 0, 50, 60))
+    places = np.concatenate([sheet.lattice.centres(made.tile), made.height[..., None]], axis=-1)
+    east, north, up = np.moveaxis(sheet.local(places), -1, 0)
+    clear = edge_distance(east, north) > 2 * CELL_M
+    assert np.abs(up - true_height(east, north))[clear].max() < 0.2 * PIXEL_M  # on the round tree
+    assert np.allclose(sheet.place(sheet.local(places)), places, equal_nan=True)
 
 
 def test_what_two_photos_see_has_no_height() -> None:

@@ -50,9 +50,8 @@ def _places(surface: HeightField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     up = surface.height[row, column].astype(np.float64)
     known = np.isfinite(up)
     lattice = surface.lattice
-    x, y = (column[known] + 0.5) * lattice.cell_m, (row[known] + 0.5) * lattice.cell_m
-    cosine, sine = np.cos(lattice.turn_rad), np.sin(lattice.turn_rad)
-    east, north = lattice.east_m + x * cosine + y * sine, lattice.north_m + x * sine - y * cosine
+    east = lattice.east_m + (column[known] + 0.5) * lattice.cell_m
+    north = lattice.north_m - (row[known] + 0.5) * lattice.cell_m
     return east[None], north[None], up[known][None]
 
 

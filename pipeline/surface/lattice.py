@@ -1,4 +1,4 @@
-"""The grid of a raster product in local metres, and the tiles that it is made in."""
+"""Square cells on a plane, in metres, and the tiles that they are worked on in."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from splatpipe.pipeline.surface.tiles import Tile, tiled
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cells of one size, rows from north to south; turned against north where the map's grid is.
+    """Cells of one size, rows from north to south.
 
     Attributes:
-        east_m: Of the outer corner of the first row's first cell, local metres.
-        north_m: Likewise.
+        east_m: Of the outer corner of the first row's first cell, metres along the rows.
+        north_m: Likewise, against the columns.
         cell_m: Side of a cell.
         width: Columns.
         height: Rows.
-        turn_rad: By how much its rows' direction is turned from east towards north.
     """
 
     east_m: float
@@ -30,7 +29,6 @@ class Lattice:
     cell_m: float
     width: int
     height: int
-    turn_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.cell_m > 0.0 and math.isfinite(self.cell_m)) or min(self.width, self.height) < 1:
@@ -44,18 +42,13 @@ class Lattice:
         """East and north of the cells' centres, the same bits whatever the tile is."""
         columns = (np.arange(tile.column, tile.column + tile.width) + 0.5) * self.cell_m
         rows = (np.arange(tile.row, tile.row + tile.height) + 0.5)[:, None] * self.cell_m
-        cosine, sine = math.cos(self.turn_rad), math.sin(self.turn_rad)
-        east = self.east_m + (columns * cosine + rows * sine)
-        north = self.north_m + (columns * sine - rows * cosine)
-        return np.stack([east, north], axis=-1)
+        return np.stack(np.broadcast_arrays(self.east_m + columns, self.north_m - rows), axis=-1)
 
     def places(
         self, east: Float64[np.ndarray, " *n"], north: Float64[np.ndarray, " *n"]
     ) -> tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"]]:
         """Columns and rows of points, with fractions; the first cell's outer corner is (0, 0)."""
-        cosine, sine = math.cos(self.turn_rad), math.sin(self.turn_rad)
-        x, y = east - self.east_m, north - self.north_m
-        return (x * cosine + y * sine) / self.cell_m, (x * sine - y * cosine) / self.cell_m
+        return (east - self.east_m) / self.cell_m, (self.north_m - north) / self.cell_m
 
     def cells(
         self, tile: Tile, east: Float64[np.ndarray, " n"], north: Float64[np.ndarray, " n"]
