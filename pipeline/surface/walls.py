@@ -167,24 +167,17 @@ def named(walls: Sequence[Wall]) -> list[Wall]:
     return result
 
 
-def stated_wall(name: str, left: Plan, right: Plan, facets: Facets) -> Wall | None:
+def stated_wall(left: Plan, right: Plan, facets: Facets) -> Wall | None:
     """A wall in the plane that somebody states, with the heights of the facets near it; None where there are none.
 
     Args:
-        name: Of the wall.
         left: East and north of its left end, seen by who looks at it.
-        right: Of its right end.
+        right: Of its right end; another place.
         facets: Of all photos.
-
-    Raises:
-        ValueError: if both ends are one.
     """
-    if not np.linalg.norm(right - left) > 0.0:
-        raise ValueError("a wall from a place to itself")
-    wall = Wall(name, left, right, 0.0, 0.0)
+    wall = Wall("", left, right, 0.0, 0.0)
     line = _Line(wall.facing, float(wall.facing @ left))
-    ends = float(line.along @ left), float(line.along @ right)
-    face = _face(facets, line, ends, CLAIM_BANDS * BAND_M)
+    face = _face(facets, line, (float(line.along @ left), float(line.along @ right)), CLAIM_BANDS * BAND_M)
     if face is None:
         return None
     low, high = _reached(face.heights)
@@ -323,8 +316,8 @@ def _cornered(pieces: Sequence[_Piece]) -> list[_Piece]:
         met = [place for other in pieces if other is not piece and (place := piece.crossing(other)) is not None]
         ends = []
         for end in piece.ends:
-            near = min(met, key=lambda place, end=end: abs(place - end), default=math.inf)
-            ends.append(near if abs(near - end) <= CORNER_M else end)
+            near = min(((abs(place - end), place) for place in met), default=(math.inf, end))
+            ends.append(near[1] if near[0] <= CORNER_M else end)
         if (ends[0], ends[1]) != piece.ends or piece.heights[1] - piece.heights[0] >= FREE_HEIGHT_M:
             result.append(replace(piece, ends=(ends[0], ends[1])))
     return result
