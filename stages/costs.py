@@ -68,6 +68,9 @@ REFERENCE = Costs(
             "evaluate": StageCosts(0.303, 1215e6, 500.0, 0.844e6),
             "export": StageCosts(2.07e-05, 620e6, 560.0, 375.0),
             "flythrough": StageCosts(0.3, 486e6, 0.0, 0.13e6),
+            "depths": StageCosts(13.5, 400e6, 0.0, 5e6),
+            "dsm": StageCosts(3.0, 900e6, 0.0, 0.2e6),
+            "ortho": StageCosts(3.0, 1800e6, 0.0, 0.5e6),
         }
     ),
 )

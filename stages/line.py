@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from splatpipe.pipeline.engine.stage import NamedFile, Shards, Stage
 from splatpipe.pipeline.film.options import FlythroughConfig
-from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
+from splatpipe.pipeline.surface.options import DsmConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import TrainConfig
@@ -233,6 +234,52 @@ FLYTHROUGH = Stage(
     deliverables=("film",),
 )
 
+DEPTHS = Stage(
+    "depths",
+    version=1,
+    config=DepthsConfig,
+    reads=("undistort.dataset",),
+    parts={"maps": "maps"},
+    entry="splatpipe.stages.depths:run",
+    resumable=True,
+)
+DSM = Stage(
+    "dsm",
+    version=1,
+    config=DsmConfig,
+    reads=(
+        "depths.maps",
+        "undistort.dataset",
+        "georef.frame",
+        "georef.model",
+        "georef.boundary",
+        "ingest.photos",
+    ),
+    parts={"files": "files", "site": "site.json"},
+    entry="splatpipe.stages.dsm:run",
+    resumable=True,
+    deliverables=("files",),
+)
+ORTHO = Stage(
+    "ortho",
+    version=1,
+    config=OrthoConfig,
+    reads=(
+        "dsm.files",
+        "dsm.site",
+        "depths.maps",
+        "undistort.dataset",
+        "georef.frame",
+        "georef.model",
+        "georef.boundary",
+        "ingest.photos",
+    ),
+    parts={"files": "files"},
+    entry="splatpipe.stages.ortho:run",
+    resumable=True,
+    deliverables=("files",),
+)
+
 LINE = (
     INGEST,
     CONTROL,
@@ -249,4 +296,7 @@ LINE = (
     EVALUATE,
     EXPORT,
     FLYTHROUGH,
+    DEPTHS,
+    DSM,
+    ORTHO,
 )

@@ -7,10 +7,11 @@ from typing import ClassVar
 
 from splatpipe.pipeline.engine.stage import StageConfig
 from splatpipe.pipeline.film.options import FlythroughConfig
-from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
+from splatpipe.pipeline.surface.options import DsmConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import GONE as GONE_OF_TRAIN
@@ -52,3 +53,6 @@ class LineConfig(StageConfig):
     evaluate: EvaluateConfig = EvaluateConfig()
     export: ExportConfig = ExportConfig()
     flythrough: FlythroughConfig = FlythroughConfig()
+    depths: DepthsConfig = DepthsConfig()
+    dsm: DsmConfig = DsmConfig()
+    ortho: OrthoConfig = OrthoConfig()

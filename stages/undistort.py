@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import pycolmap
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import MODEL
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.photos.undistortion import Placed, pinhole_model, place, write_view
+from splatpipe.pipeline.photos.undistortion import Placed, pinhole_model, place, read_flown, write_view
 from splatpipe.pipeline.sfm.sparse_model import write_model
 
 
@@ -25,7 +23,7 @@ def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) ->
     Raises:
         SplatpipeError: if the model cannot be read, or its photos are not there.
     """
-    model = _read_model(inputs["georef.model"])
+    model = read_flown(inputs["georef.model"])
     photos = load_photo_list(inputs["ingest.photos"]).photos
     placed = place(model, photos, config.max_megapixels, report)
     dataset = out / "dataset"
@@ -50,13 +48,3 @@ def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) ->
         "points3d": result.num_points3D(),
         "masks": sum(view.photo.mask is not None for view in placed),
     }
-
-
-def _read_model(path: Path) -> pycolmap.Reconstruction:
-    try:
-        return pycolmap.Reconstruction(path)
-    except (OSError, ValueError, RuntimeError, IndexError) as error:
-        raise SplatpipeError(
-            f"The sparse model cannot be read: {' '.join(str(error).split())[:200]}",
-            hint="It must be COLMAP's cameras, images and points3D, as .bin or .txt.",
-        ) from error

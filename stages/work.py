@@ -66,6 +66,9 @@ PARALLEL = {
     "evaluate": 0.75,
     "export": 0.2,
     "flythrough": 0.7,
+    "depths": 0.97,
+    "dsm": 0.9,
+    "ortho": 0.9,
 }
 """Of each stage's CPU seconds, what more threads divide among themselves; measured with one and two."""
 
@@ -316,6 +319,8 @@ class Work:
         photos, pixels = float(size.photos), size.photos * size.megapixels
         keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
         judged = photos * min(self.kept_at, JUDGED_MEGAPIXELS)
+        searched = self.config.depths
+        depths = photos * min(self.kept_at, searched.max_megapixels) if searched.enabled else 0.0
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
         done = self.done
@@ -345,6 +350,9 @@ class Work:
             "evaluate": Units(judged, gaussians, judged),
             "export": Units(gaussians, gaussians, gaussians),
             "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
+            "depths": Units(depths, 0.0, depths),
+            "dsm": Units(pixels if self.config.dsm.enabled and depths else 0.0, 0.0, pixels),
+            "ortho": Units(pixels if self.config.ortho.enabled and depths else 0.0, 0.0, pixels),
         }
 
     @property

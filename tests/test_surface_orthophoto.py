@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.surface import mosaic
 from splatpipe.pipeline.surface.exposures import exposure_gains
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.orthophoto import SPREAD, Album, Orthophoto, orthophotos, tile_orthophoto
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, photo_source, sampled, tone_curve
+from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, sampled, tone_curve
 from splatpipe.pipeline.surface.sight import Place
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
 from splatpipe.pipeline.surface.tiles import Tile
@@ -44,10 +43,17 @@ def plain_album() -> Album:
     return Album(sources, surface, FINE, RELIEF, np.ones((len(sources), 3)), Shelf(1 << 28), Shelf(1 << 28))
 
 
+def gains(album: Album) -> np.ndarray:
+    """Levelled at places on the surface."""
+    centres, up = HEIGHTS.centres(WHOLE)[1::3, 1::3], album.surface.height[1::3, 1::3]
+    places = np.concatenate([centres, up[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
+    return exposure_gains(album.sources, places[np.isfinite(places[:, 2])], 2 * HEIGHTS.cell_m, threads=1)
+
+
 @cache
 def album() -> Album:
     """The same with exposures levelled."""
-    return replace(plain_album(), gains=exposure_gains(plain_album(), threads=1))
+    return replace(plain_album(), gains=gains(plain_album()))
 
 
 @cache
@@ -135,7 +141,7 @@ def test_a_photo_without_depths_colours_nothing() -> None:
     part = tile_orthophoto(blind, Tile(0, 0, 12, 10))
     assert not part.known.any()
     assert (part.label == -1).all()
-    assert np.array_equal(exposure_gains(blind, threads=1), np.ones((3, 3)))
+    assert np.array_equal(gains(blind), np.ones((3, 3)))
 
 
 def test_pixels_of_another_size_are_refused() -> None:
@@ -145,12 +151,15 @@ def test_pixels_of_another_size_are_refused() -> None:
         tile_orthophoto(replace(whole, sources=[odd], pixels=Shelf(1)), WHOLE)
 
 
-def test_a_photo_of_the_dataset_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
+def test_a_photo_is_seen_through_its_lens() -> None:
     source = plain_album().sources[0]
-    path = tmp_path / "photo.png"
-    opened = photo_source(View(source.camera, path, None), source.camera, source.depths)
-    assert cv2.imwrite(str(path), source.load()[..., ::-1])
-    part = tile_orthophoto(replace(plain_album(), sources=[opened], pixels=Shelf(1)), Tile(120, 10, 8, 8))
+    camera, shift = source.camera, 5
+    across, down = np.meshgrid(np.arange(0, camera.width + 8, 8.0), np.arange(0, camera.height + 8, 8.0))
+    nodes = np.stack([across + shift, down + shift], axis=-1)
+    lens = Lens(camera.width + 2 * shift, camera.height + 2 * shift, 8.0, nodes)
+    wide = np.pad(source.load(), ((shift, shift), (shift, shift), (0, 0)), mode="edge")
+    seen_through = replace(source, load=lambda: wide, lens=lens)
+    part = tile_orthophoto(replace(plain_album(), sources=[seen_through], pixels=Shelf(1)), Tile(120, 10, 8, 8))
     same = tile_orthophoto(replace(plain_album(), sources=[source], pixels=Shelf(1)), Tile(120, 10, 8, 8))
     assert part.known.all()
     assert np.array_equal(part.colour, same.colour)

@@ -6,22 +6,25 @@ texture at hand, and without them a third of a garden is missing.
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch
 from splatpipe.pipeline.photos.dataset import View
 
+LIST = "maps.json"
 WIDER = 2.0  # times nearer than sparse points: of a tree's crown before the camera there is none
 
 
@@ -37,33 +40,81 @@ class DepthMap:
     depth: Float32[np.ndarray, "h w"]
     confidence: UInt8[np.ndarray, "h w"]
 
-    def save(self, path: Path) -> None:
-        """Write it; `load_depth_map` reads it."""
-        np.savez(path, depth=self.depth, confidence=self.confidence)
+
+@dataclass(frozen=True, eq=False)
+class KeptMap:
+    """A depth map in its file.
+
+    Attributes:
+        camera: In the map's grid, the model's frame.
+        path: The file.
+    """
+
+    camera: Camera
+    path: Path
+
+    def load(self) -> DepthMap:
+        """Read it.
+
+        Raises:
+            StageError: if it is no map of that grid.
+        """
+        try:
+            with np.load(self.path, allow_pickle=False) as kept:
+                found = DepthMap(np.asarray(kept["depth"], np.float32), np.asarray(kept["confidence"], np.uint8))
+        except (OSError, ValueError, KeyError, BadZipFile) as error:
+            raise _unreadable(self.path.name) from error
+        if not found.depth.shape == found.confidence.shape == (self.camera.height, self.camera.width):
+            raise _unreadable(self.path.name)
+        return found
 
 
-def load_depth_map(path: Path, camera: Camera) -> DepthMap:
-    """Read what ``DepthMap.save`` left.
+def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> dict[str, float]:
+    """Write maps as they come: `00000.npz` and so on, and `maps.json`, whose they are.
 
     Args:
-        path: The file.
-        camera: In its grid.
+        folder: Where; made here.
+        maps: With their cameras.
+
+    Returns:
+        How many ``maps``, their ``megapixels``, and the share of pixels that have a depth as ``found``.
+    """
+    folder.mkdir()
+    told: list[dict[str, str | int]] = []
+    pixels = found = 0
+    for number, (camera, each) in enumerate(maps):
+        file = f"{number:05d}.npz"
+        np.savez(folder / file, depth=each.depth, confidence=each.confidence)
+        told.append({"photo": camera.name, "file": file, "width": camera.width, "height": camera.height})
+        pixels += each.depth.size
+        found += int(np.count_nonzero(each.confidence))
+    write_json(folder / LIST, {"maps": told})
+    return {"maps": len(told), "megapixels": pixels / 1e6, "found": found / max(pixels, 1)}
+
+
+def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[KeptMap]:
+    """What ``keep_depth_maps`` left, to be read one by one.
+
+    Args:
+        folder: Where.
+        views: The dataset's, with these photos among them.
 
     Raises:
-        StageError: if it is not a map of that grid.
+        StageError: if they are not there.
     """
+    cameras = {view.camera.name: view.camera for view in views}
     try:
-        with np.load(path, allow_pickle=False) as kept:
-            found = DepthMap(np.asarray(kept["depth"], np.float32), np.asarray(kept["confidence"], np.uint8))
-    except (OSError, ValueError, KeyError) as error:
-        raise _unreadable(path) from error
-    if not found.depth.shape == found.confidence.shape == (camera.height, camera.width):
-        raise _unreadable(path)
-    return found
+        told = json.loads((folder / LIST).read_text(encoding="utf-8"))["maps"]
+        return [
+            KeptMap(cameras[each["photo"]].scaled(int(each["width"]), int(each["height"])), folder / each["file"])
+            for each in told
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise _unreadable(LIST) from error
 
 
-def _unreadable(path: Path) -> StageError:
-    return StageError(f"{path.name} is no depth map of its photo.", hint="Run again with --rerun-from depths.")
+def _unreadable(name: str) -> StageError:
+    return StageError(f"{name} is none of this dataset's depth maps.", hint="Run again with --rerun-from depths.")
 
 
 def find_depth_maps(
@@ -75,20 +126,20 @@ def find_depth_maps(
         dataset: The folder that `undistort` left.
         views: Photos to use, in name order.
         megapixels: Of a map at most.
-        folder: Where there is room for 9 bytes a pixel of all maps meanwhile.
+        folder: Where there is room for 9 bytes a pixel of all maps meanwhile; what a killed run left there is gone on
+            from.
         threads: Photos at a time, and the kernel's.
         report: Told of progress.
 
     Raises:
         StageError: if the model or a photo cannot be read.
     """
-    with tempfile.TemporaryDirectory(prefix="depths-", dir=folder) as kept:
-        search = DepthSearch.begin(dataset, views, Path(kept), megapixels, WIDER, plain=True)
-        search.run(threads, report)
-        maps = ordered_map(partial(_confirmed_map, search), range(len(views)), threads)
-        for done, (camera, found) in enumerate(zip(search.cameras, maps, strict=True), start=1):
-            yield camera, found
-            report.progress(done, len(views), "comparing depths", "photos")
+    search = DepthSearch.begin(dataset, views, folder, megapixels, WIDER, plain=True)
+    search.run(threads, report)
+    maps = ordered_map(partial(_confirmed_map, search), range(len(views)), threads)
+    for done, (camera, found) in enumerate(zip(search.cameras, maps, strict=True), start=1):
+        yield camera, found
+        report.progress(done, len(views), "comparing depths", "photos")
 
 
 def _confirmed_map(search: DepthSearch, number: int) -> DepthMap:

@@ -99,7 +99,7 @@ class DepthSearch:
         return cls(views, cameras, tracks, neighbours(tracks, cameras, COMPARED), folder, megapixels, wider, plain)
 
     def run(self, threads: int, report: Reporter) -> None:
-        """Find the depths of every photo; the same for any number of threads.
+        """Find the depths of every photo that has none in the folder yet; the same for any number of threads.
 
         Args:
             threads: Photos at a time where they are decoded, and the kernel's.
@@ -155,24 +155,35 @@ class DepthSearch:
 
     def _keep_photo(self, number: int) -> None:
         """Make one photo small and keep it: its neighbours ask for it, too."""
+        if self._photo_path(number).is_file():
+            return
         _, colour, mask = small_view(self.views[number], self.megapixels)
         counts = np.ones(colour.shape[:2], np.bool_) if mask is None else mask
-        np.savez(self._photo_path(number), colour=colour, counts=counts)
+        _save_whole(self._photo_path(number), colour=colour, counts=counts)
 
     def _keep_depths(self, number: int) -> None:
         """Look at one photo and keep what it found."""
+        if self._depths_path(number).is_file():
+            return
         bounds = inverse_depths(self.tracks, number, self.cameras[number], self.wider)
         others = self.near[number]
         if bounds is None or len(others) < AGREEING:
             return
         pictures = [self._picture(other) for other in others]
         found = find_depths(self._picture(number), pictures, bounds, number, self.plain)
-        np.savez(self._depths_path(number), inverse=found.inverse, cost=found.cost)
+        _save_whole(self._depths_path(number), inverse=found.inverse, cost=found.cost)
 
     def _picture(self, number: int) -> Picture:
         with np.load(self._photo_path(number)) as kept:
             grey = np.asarray(cv2.cvtColor(kept["colour"], cv2.COLOR_RGB2GRAY), np.uint8)
             return Picture(self.cameras[number], grey, kept["counts"])
+
+
+def _save_whole(path: Path, **arrays: np.ndarray) -> None:
+    """A file that is there whole or not at all, however a process ends."""
+    aside = path.with_suffix(".part.npz")
+    np.savez(aside, **arrays)  # type: ignore[arg-type]
+    aside.replace(path)
 
 
 def confirmed(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from splatpipe.pipeline.engine.ranges import PositiveInt
+from splatpipe.pipeline.engine.ranges import PositiveFloat, PositiveInt
 from splatpipe.pipeline.engine.stage import StageConfig
 
 
@@ -20,3 +20,10 @@ class InitializeConfig(StageConfig):
     dense: bool = True
     """Add points where the sparse ones are thin, by PatchMatch between neighbouring photos: 0.6 CPU seconds a
     photo. At most 50,000; with the sparse ones they fill half of the training's cap at most, so that it can grow."""
+
+
+class DepthsConfig(StageConfig):
+    enabled: bool = True
+    """Find depths of all photos, which surface products are made from."""
+    max_megapixels: PositiveFloat = 1.2
+    """Photos are made this small before their depths are found: 15 CPU seconds a megapixel."""

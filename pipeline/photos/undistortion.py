@@ -86,6 +86,24 @@ def place(
     return [placed[name] for name in sorted(placed)]
 
 
+def read_flown(path: Path) -> pycolmap.Reconstruction:
+    """The model with the photos' own cameras.
+
+    Args:
+        path: The part ``georef.model``.
+
+    Raises:
+        SplatpipeError: if it is no model of COLMAP's.
+    """
+    try:
+        return pycolmap.Reconstruction(path)
+    except (OSError, ValueError, RuntimeError, IndexError) as error:
+        raise SplatpipeError(
+            f"The sparse model cannot be read: {' '.join(str(error).split())[:200]}",
+            hint="It must be COLMAP's cameras, images and points3D, as .bin or .txt.",
+        ) from error
+
+
 def _camera_for(image: pycolmap.Image, photo: Photo) -> pycolmap.Camera | None:
     """The model's camera in the photo's grid; None where they cannot belong together."""
     camera = pycolmap.Camera(image.camera.todict())

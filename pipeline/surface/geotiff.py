@@ -67,7 +67,7 @@ _DEFLATE = (("COMPRESS", "DEFLATE"), ("PREDICTOR", "YES"), ("LEVEL", "6"))
 _JPEG = (("COMPRESS", "JPEG"), ("QUALITY", str(JPEG_QUALITY)))
 _RGBA = ("red", "green", "blue", "alpha")
 HEIGHTS = RasterForm("float32", ("height",), NODATA_HEIGHT, _DEFLATE, has_heights=True)
-CONFIDENCE = RasterForm("uint8", ("photos that confirm the height",), 0.0, _DEFLATE)
+CONFIDENCE = RasterForm("uint16", ("photos that confirm the height", "expected deviation, mm"), 0.0, _DEFLATE)
 COLOURS = RasterForm("uint8", _RGBA, None, _DEFLATE)
 COLOURS_AS_JPEG = RasterForm("uint8", _RGBA, None, _JPEG)
 

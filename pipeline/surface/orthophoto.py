@@ -176,7 +176,7 @@ def _offer(album: Album, number: int, points: tuple[np.ndarray, np.ndarray, np.n
     pixels = album.pixels.get(number, loader(source))
     place = replace(place, inside=seen)
     level = halvings(source.camera, place, album.lattice.cell_m)
-    return _Offer(number, seen, cost, sampled(pixels, place, level, tone_curve(album.gains[number])))
+    return _Offer(number, seen, cost, sampled(pixels, source.in_photo(place), level, tone_curve(album.gains[number])))
 
 
 def _cost(camera: Camera, place: Place, cell_m: float) -> Int32[np.ndarray, "h w"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.photos.images import load_colour
 from splatpipe.pipeline.surface.sight import Place
 from splatpipe.pipeline.surface.sources import DepthSource
 
@@ -23,29 +21,70 @@ ROUND_UP = 0.4  # a photo is halved where its pixels are finer than a cell by 2 
 
 
 @dataclass(frozen=True, eq=False)
+class Lens:
+    """The way from a pinhole's pixels to those of the photo that it stands for.
+
+    Distortion is smooth: it is sampled every few pixels, and straight between (within 0.001 px for lenses that drones
+    have, where the lens model itself takes ten times as long).
+
+    Attributes:
+        width: Of the photo.
+        height: Of the photo.
+        step: Pinhole pixels from node to node.
+        nodes: Column and row in the photo of the pinhole's pixels (0, 0), (step, 0), …
+    """
+
+    width: int
+    height: int
+    step: float
+    nodes: Float64[np.ndarray, "rows columns 2"]
+
+    def pixels(
+        self, column: Float64[np.ndarray, " *n"], row: Float64[np.ndarray, " *n"]
+    ) -> tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"]]:
+        """The photo's columns and rows; of places beyond the pinhole's picture those of its rim's squares."""
+        rows, columns = self.nodes.shape[:2]
+        x, y = (np.nan_to_num(at / self.step) for at in (column, row))
+        left = np.clip(x, 0, columns - 2).astype(np.int64)
+        top = np.clip(y, 0, rows - 2).astype(np.int64)
+        x, y = x - left, y - top
+        flat, first = self.nodes.reshape(-1, 2), top * columns + left
+        found = []
+        for axis in (0, 1):
+            a, b, c, d = (flat[first + at, axis] for at in (0, 1, columns, columns + 1))
+            found.append((a * (1 - x) + b * x) * (1 - y) + (c * (1 - x) + d * x) * y)
+        return found[0], found[1]
+
+
+@dataclass(frozen=True, eq=False)
 class PhotoSource:
     """A photo that colours the surface.
 
     Attributes:
-        camera: Of the full-size photo, local metres.
-        load: Reads its pixels, (h, w, 3), 8 bits; a mapped file is best, of which only windows are read.
+        camera: A pinhole, local metres: of the photo as it is without its lens, or of the photo where it has none.
+        load: Reads the photo's own pixels, (h, w, 3), 8 bits.
         depths: What tells whether it sees a place; None where nothing does, and then it colours nothing.
+        lens: Where the photo's own pixels show what the pinhole's would; None where they are those. So colours are
+            taken from a photo once, and not from one that was made straight before.
     """
 
     camera: Camera
     load: Callable[[], UInt8[np.ndarray, "h w 3"]]
     depths: DepthSource | None
+    lens: Lens | None = None
 
+    def in_photo(self, place: Place) -> Place:
+        """Places of the pinhole's in the photo's own grid."""
+        if self.lens is None:
+            return place
+        column, row = self.lens.pixels(place.column, place.row)
+        inside = place.inside & (column >= 0.0) & (column < self.lens.width) & (row >= 0.0) & (row < self.lens.height)
+        return replace(place, column=column, row=row, inside=inside)
 
-def photo_source(view: View, camera: Camera, depths: DepthSource | None) -> PhotoSource:
-    """A photo of the dataset, decoded when a tile asks for it.
-
-    Args:
-        view: Whose photo; its camera is in the dataset's frame.
-        camera: The same in local metres.
-        depths: The photo's, or None.
-    """
-    return PhotoSource(camera, partial(load_colour, view), depths)
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the photo's own grid."""
+        return (self.camera.width, self.camera.height) if self.lens is None else (self.lens.width, self.lens.height)
 
 
 def halvings(camera: Camera, place: Place, cell_m: float) -> Int64[np.ndarray, " *n"]:
@@ -110,8 +149,9 @@ def loaded(source: PhotoSource) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
         ValueError: if it is not of its camera's size.
     """
     pixels = source.load()
-    if pixels.shape != (source.camera.height, source.camera.width, 3):
-        raise ValueError(f"{source.camera.name}: pixels of {pixels.shape} for {source.camera.height} rows")
+    width, height = source.size
+    if pixels.shape != (height, width, 3):
+        raise ValueError(f"{source.camera.name}: pixels of {pixels.shape} for {width} × {height}")
     return pixels, pixels.nbytes
 
 

@@ -1,0 +1,124 @@
+"""The surface model as files: `dsm.tif`, `dsm_confidence.tif`, and contours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.contour_files import write_dxf, write_geojson
+from splatpipe.pipeline.surface.contours import trace_contours
+from splatpipe.pipeline.surface.geotiff import CONFIDENCE, HEIGHTS, raster_file
+from splatpipe.pipeline.surface.grid import Grid, make_grid
+from splatpipe.pipeline.surface.heights import TILE, Capture, surface_heights
+from splatpipe.pipeline.surface.sheet import GridSheet, grid_sheets
+from splatpipe.pipeline.surface.sheet_work import Arrays, SheetWork
+from splatpipe.pipeline.surface.site import Site
+from splatpipe.pipeline.surface.sources import DepthSource, Shelf
+from splatpipe.pipeline.surface.tiles import Tile
+from splatpipe.pipeline.survey.frames import Frame
+
+HELD_BYTES = 512 << 20  # of depths in memory
+MILLIMETRES = 1000.0
+MOST_MILLIMETRES = np.iinfo(np.uint16).max
+
+
+@dataclass(frozen=True, eq=False)
+class DsmTask:
+    """What a surface model is made from.
+
+    Attributes:
+        frame: The run's.
+        site: What its photos show.
+        sources: Their depths, local metres.
+        area: Nothing outside of it is shown; None for all.
+        cell_m: Side of a cell on the ground.
+        threads: Tiles at a time.
+    """
+
+    frame: Frame
+    site: Site
+    sources: Sequence[DepthSource]
+    area: PlanArea | None
+    cell_m: float
+    threads: int
+
+
+def height_range(site: Site, grid: Grid) -> tuple[float, float]:
+    """Between which heights a site lies, the CRS's unit."""
+    mapped = grid.crs_from_local(
+        np.array([[e, n, up] for e in site.box[:, 0] for n in site.box[:, 1] for up in site.box[:, 2]])
+    )
+    return float(mapped[:, 2].min()), float(mapped[:, 2].max())
+
+
+def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
+    """Write the surface model; a killed one goes on from its last finished sheet.
+
+    Args:
+        task: What it is made from.
+        work: Folder of what is kept meanwhile.
+        out: Where the files go.
+        report: Told of progress.
+
+    Returns:
+        Figures for people: cells, their side, what share of the covered area has a height, expected accuracy.
+
+    Raises:
+        SplatpipeError: if the grid would be absurdly large.
+        MachineError: if the disk is full.
+    """
+    grid = make_grid(task.frame, task.site.box, task.cell_m)
+    sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
+    making = SheetWork(sheets, task.site, task.area, TILE, work, report, "surface model")
+
+    def heights(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
+        sources = sheet.sheet.depths(task.sources)
+        capture = Capture(sources, sheet.sheet.lattice, sheet.sheet.relief, Shelf(HELD_BYTES))
+        for part in surface_heights(capture, tiles, task.threads):
+            sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))
+            confidence = np.stack([part.photos, np.minimum(sigma, MOST_MILLIMETRES)], axis=-1).astype(np.uint16)
+            yield part.tile, {"height": sheet.heights(part.tile, part.height), "confidence": confidence}
+
+    making.run(heights)
+    with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
+        for part, arrays in making.finished():
+            file.write(part, arrays["height"].astype(np.float32))
+    known, total, sigmas = 0, 0, np.zeros(MOST_MILLIMETRES + 1, np.int64)
+    with raster_file(out / "dsm_confidence.tif", grid, CONFIDENCE) as file:
+        for part, arrays in making.finished():
+            file.write(part, np.moveaxis(arrays["confidence"], -1, 0))
+            counts = np.bincount(arrays["confidence"][..., 1].ravel(), minlength=len(sigmas))
+            known, total = known + int(counts[1:].sum()), total + int(counts.sum())
+            sigmas[1:] += counts[1:]
+    _write_contours(out, grid, report)
+    typical = int(np.searchsorted(np.cumsum(sigmas), known / 2)) / MILLIMETRES if known else None
+    return {
+        "cell": grid.cell,
+        "cell_m": round(grid.cell_m, 6),
+        "width": grid.width,
+        "height": grid.height,
+        "cells": known,
+        "area_m2": round(known * grid.cell_m**2, 1),
+        "covered": round(known * grid.cell_m**2 / max(task.site.area_m2(), 1e-9), 4),
+        "expected_deviation_m": typical,
+        "crs": grid.crs.horizontal.name,
+        "heights": grid.crs.described_heights(),
+    }
+
+
+def _write_contours(out: Path, grid: Grid, report: Reporter) -> None:
+    try:
+        contours = trace_contours(out / "dsm.tif")
+    except SplatpipeError as error:
+        report.warning(f"There are no contours: {error.message}", error.hint)
+        return
+    write_dxf(out / "contours.dxf", contours, grid.crs)
+    if grid.crs.world is not None:
+        write_geojson(out / "contours.geojson", contours, grid)

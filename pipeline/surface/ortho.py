@@ -1,0 +1,154 @@
+"""The orthophoto as a file: `ortho.tif`, drawn sheet by sheet on the surface model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from jaxtyping import Float64
+from rasterio.windows import Window
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.dsm import HELD_BYTES, height_range
+from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
+from splatpipe.pipeline.surface.grid import Grid, make_grid
+from splatpipe.pipeline.surface.height_field import HeightField
+from splatpipe.pipeline.surface.mosaic import MARGIN
+from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, Album, orthophotos
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.sheet import GridSheet, grid_sheets
+from splatpipe.pipeline.surface.sheet_work import Arrays, SheetWork
+from splatpipe.pipeline.surface.site import Site
+from splatpipe.pipeline.surface.sources import Shelf
+from splatpipe.pipeline.surface.tiles import Tile
+from splatpipe.pipeline.survey.frames import Frame
+
+PIXEL_BYTES = 1 << 30  # of decoded photos in memory
+AROUND = 3  # cells of the surface model more than the pixels drawn need: heights between cells
+COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
+
+
+@dataclass(frozen=True, eq=False)
+class OrthoTask:
+    """What an orthophoto is made from.
+
+    Attributes:
+        frame: The run's.
+        site: What its photos show.
+        photos: Local metres, with their depths.
+        dsm: `dsm.tif`.
+        dsm_cell_m: Side of its cells on the ground.
+        area: Nothing outside of it is shown; None for all.
+        gsd_m: Side of a pixel on the ground.
+        threads: Tiles at a time.
+    """
+
+    frame: Frame
+    site: Site
+    photos: Sequence[PhotoSource]
+    dsm: Path
+    dsm_cell_m: float
+    area: PlanArea | None
+    gsd_m: float
+    threads: int
+
+
+def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
+    """Write the orthophoto; a killed one goes on from its last finished sheet.
+
+    Args:
+        task: What it is made from.
+        work: Folder of what is kept meanwhile.
+        out: Where the file goes.
+        report: Told of progress.
+
+    Returns:
+        Figures for people: pixels, their side, by how much photos' exposures were levelled.
+
+    Raises:
+        SplatpipeError: if the grid would be absurdly large, or a photo is no longer what it was.
+        MachineError: if the disk is full.
+    """
+    grid = make_grid(task.frame, task.site.box, task.gsd_m)
+    heights = make_grid(task.frame, task.site.box, task.dsm_cell_m)
+    sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
+    gains = exposure_gains(task.photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
+    pixels: Shelf[Any] = Shelf(PIXEL_BYTES)
+
+    def colours(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
+        plane = sheet.sheet
+        depths = plane.depths([photo.depths for photo in task.photos if photo.depths is not None])
+        moved = iter(depths)
+        photos = [
+            replace(photo, camera=plane.moved(photo.camera), depths=photo.depths and next(moved))
+            for photo in task.photos
+        ]
+        surface = _surface(sheet, task.dsm, heights)
+        album = Album(photos, surface, plane.lattice, plane.relief, gains, pixels, Shelf(HELD_BYTES))
+        for part in orthophotos(album, tiles, task.threads):
+            alpha = np.where(part.known, 255, 0).astype(np.uint8)
+            yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}
+
+    making = SheetWork(sheets, task.site, task.area, TILE, work, report, "orthophoto")
+    making.run(colours)
+    known = 0
+    with raster_file(out / "ortho.tif", grid, COLOURS) as file:
+        for part, arrays in making.finished():
+            file.write(part, np.moveaxis(arrays["colour"], -1, 0))
+            known += int(np.count_nonzero(arrays["colour"][..., 3]))
+    return {
+        "pixel": grid.cell,
+        "pixel_m": round(grid.cell_m, 6),
+        "width": grid.width,
+        "height": grid.height,
+        "pixels": known,
+        "exposures_stops": round(float(np.ptp(np.log2(gains[:, 1]))), 3) if len(gains) else 0.0,
+        "crs": grid.crs.horizontal.name,
+    }
+
+
+def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
+    """The heights that a sheet's pixels lie on, over the sheet."""
+    margin = (MARGIN + SPREAD) * sheet.grid.cell + AROUND * heights.cell
+    west = (sheet.grid.left + sheet.part.column) * sheet.grid.cell - margin
+    north = (sheet.grid.top - sheet.part.row) * sheet.grid.cell + margin
+    east = west + sheet.part.width * sheet.grid.cell + 2.0 * margin
+    south = north - sheet.part.height * sheet.grid.cell - 2.0 * margin
+    left, right = (int(np.floor(at / heights.cell)) - heights.left for at in (west, east))
+    top, bottom = (heights.top - int(np.ceil(at / heights.cell)) for at in (north, south))
+    rows, columns = np.clip([top, bottom + 1], 0, heights.height), np.clip([left, right + 1], 0, heights.width)
+    part = Tile(int(rows[0]), int(columns[0]), int(max(rows[1] - rows[0], 1)), int(max(columns[1] - columns[0], 1)))
+    found = _read(dsm, part)
+    return HeightField(sheet.lattice_of(heights, part), sheet.over(heights, part, found).astype(np.float32))
+
+
+def _read(dsm: Path, part: Tile) -> Float64[np.ndarray, "h w"]:
+    """Heights of cells, nan where there are none."""
+    with gdal(dsm.parent), rasterio.open(dsm) as raster:
+        window = Window(part.column, part.row, part.width, part.height)
+        found = raster.read(1, window=window, masked=True, boundless=False)
+    return np.asarray(found.astype(np.float64).filled(np.nan))
+
+
+def _places(dsm: Path, heights: Grid) -> Float64[np.ndarray, "m 3"]:
+    """Some of the surface's cells, evenly, local metres."""
+    rows, columns = (
+        max(1, round((COMPARED_AT * a / b) ** 0.5))
+        for a, b in ((heights.height, heights.width), (heights.width, heights.height))
+    )
+    row = (np.arange(min(rows, heights.height)) + 0.5) * heights.height / min(rows, heights.height)
+    column = (np.arange(min(columns, heights.width)) + 0.5) * heights.width / min(columns, heights.width)
+    found = []
+    with gdal(dsm.parent), rasterio.open(dsm) as raster:
+        for at in row.astype(np.int64):
+            line = raster.read(1, window=Window(0, int(at), heights.width, 1), masked=True)[0]
+            height = line.astype(np.float64).filled(np.nan)[column.astype(np.int64)]
+            cells = np.stack([column.astype(np.int64) + 0.5, np.full(len(column), at + 0.5), height], axis=1)
+            found.append(cells[np.isfinite(height)])
+    return heights.local_from_cells(np.concatenate(found))

@@ -1,0 +1,102 @@
+"""A raster made sheet by sheet: what a killed run finished stays, and memory holds one sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.sheet import GridSheet
+from splatpipe.pipeline.surface.site import Site
+from splatpipe.pipeline.surface.tiles import Tile
+from splatpipe.pipeline.surface.whole_file import whole_file
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class SheetWork:
+    """Sheets to be made.
+
+    Attributes:
+        sheets: All of a grid's.
+        site: Where there is anything to be made.
+        area: Nothing outside of it is made; None for all.
+        tile: Cells of a tile's side.
+        folder: Where finished sheets are kept.
+        report: Told of progress.
+        what: Is being made, in a few words.
+    """
+
+    sheets: Sequence[GridSheet]
+    site: Site
+    area: PlanArea | None
+    tile: int
+    folder: Path
+    report: Reporter
+    what: str
+
+    def run(self, make: Callable[[GridSheet, Sequence[Tile]], Iterator[tuple[Tile, Arrays]]]) -> None:
+        """Make what is not there yet.
+
+        Args:
+            make: Yields the arrays of a sheet's tiles, each of a tile's size; what lies outside the area is set to 0,
+                or nan.
+        """
+        self.folder.mkdir(exist_ok=True)
+        wanted = [self._tiles(sheet) for sheet in self.sheets]
+        done, total = 0, sum(len(tiles) for tiles in wanted)
+        for number, (sheet, tiles) in enumerate(zip(self.sheets, wanted, strict=True)):
+            path = self._path(number)
+            if tiles and not path.is_file():
+                whole: Arrays = {}
+                for tile, arrays in make(sheet, tiles):
+                    self._take(whole, sheet, tile, arrays)
+                    done += 1
+                    self.report.progress(done, total, self.what, "tiles")
+                with whole_file(path) as aside, aside.open("wb") as file:
+                    np.savez(file, **whole)  # type: ignore[arg-type]
+            else:
+                done += len(tiles)
+
+    def finished(self) -> Iterator[tuple[Tile, Arrays]]:
+        """The sheets that have anything, with the part of the grid that each is."""
+        for number, sheet in enumerate(self.sheets):
+            path = self._path(number)
+            if path.is_file():
+                with np.load(path, allow_pickle=False) as kept:
+                    yield sheet.part, dict(kept)
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"{number:06d}.npz"
+
+    def _tiles(self, sheet: GridSheet) -> list[Tile]:
+        """Those that may have anything."""
+        lattice = sheet.sheet.lattice
+        found = []
+        for tile in lattice.tiles(self.tile):
+            corners = lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
+            local = sheet.sheet.local(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
+            if self.site.sees(np.stack([local.min(axis=0), local.max(axis=0)])):
+                found.append(tile)
+        return found
+
+    def _take(self, whole: Arrays, sheet: GridSheet, tile: Tile, arrays: Arrays) -> None:
+        outside = None if self.area is None else ~self._inside(self.area, sheet, tile)
+        for name, values in arrays.items():
+            empty = np.nan if np.issubdtype(values.dtype, np.floating) else 0
+            if name not in whole:
+                whole[name] = np.full((sheet.part.height, sheet.part.width, *values.shape[2:]), empty, values.dtype)
+            if outside is not None:
+                values[outside] = empty
+            whole[name][tile.row : tile.row + tile.height, tile.column : tile.column + tile.width] = values
+
+    @staticmethod
+    def _inside(area: PlanArea, sheet: GridSheet, tile: Tile) -> np.ndarray:
+        centres = sheet.sheet.lattice.centres(tile)
+        places = np.concatenate([centres, np.zeros((*centres.shape[:2], 1))], axis=-1)
+        return area.contains(sheet.sheet.local(places.reshape(-1, 3))).reshape(tile.height, tile.width)

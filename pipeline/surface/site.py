@@ -1,0 +1,192 @@
+"""The site that a run's depths show: how fine its photos are, between which heights it lies, what enough photos see.
+
+From a sample of every photo's depths, so that it costs seconds; the products' grids and tiles follow from it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+
+SAMPLES = 3000  # depths of a photo, evenly
+CELL_GSD = 100.0  # ground sample distances of a plan cell: so many samples of a photo lie in each that it sees
+LEAST_PHOTOS = 3  # that see a place
+FARTHEST = 4.0  # pixels on the ground so many times the usual are of the far land, which no product shows
+LEAST_PART = 0.02  # of what is seen: smaller parts that lie by themselves are left out
+NOISE = 0.001  # of the samples, the lowest and the highest, that may be wrong
+MARGIN = 0.1  # of the relief, below and above, for what samples missed,
+LEAST_MARGIN_M = 3.0  # and at least so much: a mast or a well
+CONFIRMED = 2  # photos that confirm a depth
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """What a run's photos show.
+
+    Attributes:
+        gsd_m: Of the photos as flown, on the ground, the median.
+        low_m: No height lies lower; local metres.
+        high_m: Nor higher.
+        corner: East and north of the plan's first cell's outer corner (its least ones), local metres.
+        cell_m: Of the plan.
+        covered: Which cells of the plan enough photos see, rows to the north.
+    """
+
+    gsd_m: float
+    low_m: float
+    high_m: float
+    corner: tuple[float, float]
+    cell_m: float
+    covered: Bool[np.ndarray, "rows columns"]
+
+    @property
+    def box(self) -> Float64[np.ndarray, "2 3"]:
+        """Least and largest east, north, up."""
+        rows, columns = self.covered.shape
+        east, north = self.corner
+        far = (east + columns * self.cell_m, north + rows * self.cell_m)
+        return np.array([[east, north, self.low_m], [*far, self.high_m]])
+
+    def sees(self, box: Float64[np.ndarray, "2 2"]) -> bool:
+        """Whether any of it lies in a rectangle: least and largest east and north."""
+        (left, bottom), (right, top) = np.floor((box - self.corner) / self.cell_m).astype(np.int64)
+        return bool(self.covered[max(bottom, 0) : max(top, -1) + 1, max(left, 0) : max(right, -1) + 1].any())
+
+    def area_m2(self) -> float:
+        """Of what is covered."""
+        return float(self.covered.sum()) * self.cell_m**2
+
+
+def save_site(path: Path, site: Site | None, dsm_cell_m: float = 0.0) -> None:
+    """As JSON; ``load_site`` reads it.
+
+    Args:
+        path: Where.
+        site: None where nothing is seen.
+        dsm_cell_m: Side of the surface model's cells.
+    """
+    if site is None:
+        write_json(path, None)
+        return
+    rows, columns = site.covered.shape
+    facts = {"gsd_m": site.gsd_m, "low_m": site.low_m, "high_m": site.high_m, "corner": list(site.corner)}
+    packed = np.packbits(site.covered).tobytes().hex()
+    plan = {"cell_m": site.cell_m, "rows": rows, "columns": columns, "covered": packed}
+    write_json(path, {**facts, **plan, "dsm_cell_m": dsm_cell_m})
+
+
+def load_site(path: Path) -> tuple[Site, float] | None:
+    """What ``save_site`` was given.
+
+    Raises:
+        StageError: if it is broken.
+    """
+    try:
+        told: dict[str, Any] | None = json.loads(path.read_text(encoding="utf-8"))
+        if told is None:
+            return None
+        shape = int(told["rows"]), int(told["columns"])
+        bits = np.unpackbits(np.frombuffer(bytes.fromhex(told["covered"]), np.uint8), count=shape[0] * shape[1])
+        gsd, low, high, east, north, cell, dsm_cell = (
+            float(each)
+            for each in (
+                told["gsd_m"],
+                told["low_m"],
+                told["high_m"],
+                *told["corner"],
+                told["cell_m"],
+                told["dsm_cell_m"],
+            )
+        )
+        return Site(gsd, low, high, (east, north), cell, bits.reshape(shape).astype(np.bool_)), dsm_cell
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StageError(f"The site {path.name} cannot be read: {error}", "Run again with --rerun dsm.") from error
+
+
+def survey_site(
+    sources: Sequence[DepthSource], sizes: Sequence[float], area: PlanArea | None, threads: int
+) -> Site | None:
+    """Look at the depths of all photos; None where nothing is seen by enough of them.
+
+    Args:
+        sources: In local metres.
+        sizes: How many times finer each photo as flown is than its depths.
+        area: Nothing outside of it counts; None where all does.
+        threads: Photos at a time.
+    """
+    numbers = range(len(sources))
+    looks = list(ordered_map(partial(_look, sources, sizes), numbers, threads))
+    seen = [look for look in looks if len(look)]
+    if not seen:
+        return None
+    gsd = float(np.median([np.median(look[:, 3]) for look in seen]))
+    number = np.repeat(np.arange(len(looks)), [len(look) for look in looks])
+    every = np.concatenate(looks)
+    near = every[:, 3] <= FARTHEST * gsd
+    if area is not None:
+        near &= area.contains(every[:, :3])
+    every, number = every[near], number[near]
+    if not len(every):
+        return None
+    cell = CELL_GSD * gsd
+    corner = np.floor(every[:, :2].min(axis=0) / cell) * cell
+    covered = _covered(np.floor((every[:, :2] - corner) / cell).astype(np.int64), number)
+    if not covered.any():
+        return None
+    low, high = _relief(every[:, 2])
+    rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
+    first = corner + np.array([columns[0], rows[0]]) * cell
+    part = covered[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return Site(gsd, low, high, (float(first[0]), float(first[1])), cell, part)
+
+
+def _look(sources: Sequence[DepthSource], sizes: Sequence[float], number: int) -> Float64[np.ndarray, "n 4"]:
+    """East, north, up of some depths, and how large a pixel of the photo is on the ground there."""
+    found: DepthMap = sources[number].load()
+    camera = found.camera
+    step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
+    row, column = (grid.ravel() for grid in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
+    sure = (found.depth[row, column] > 0.0) & (found.confidence[row, column] >= CONFIRMED)
+    row, column = row[sure], column[sure]
+    depth = found.depth[row, column].astype(np.float64)
+    points = camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), depth)
+    away = np.linalg.norm(points - camera.centre(), axis=1)
+    sine = (camera.centre()[2] - points[:, 2]) / np.maximum(away, 1e-9)
+    pixel = depth / max(camera.fx, camera.fy) / sizes[number] / np.maximum(sine, 1e-3)
+    return np.column_stack([points, pixel])
+
+
+def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "rows columns"]:
+    """Cells that enough photos see and that are not off by themselves, and their neighbours."""
+    columns, rows = cell.max(axis=0) + 1
+    if rows * columns > 1 << 28:
+        raise SplatpipeError("The photos' depths reach too far for a surface.", "Set a --boundary.")
+    place = cell[:, 1] * columns + cell[:, 0]
+    pairs = np.unique(np.stack([place, number], axis=1), axis=0)
+    count = np.bincount(pairs[:, 0], minlength=rows * columns).reshape(rows, columns)
+    covered = (count >= LEAST_PHOTOS).astype(np.uint8)
+    _, parts = cv2.connectedComponents(covered, connectivity=8)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    kept = sizes >= LEAST_PART * sizes.sum()
+    return np.asarray(cv2.dilate((covered & kept[parts]).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+
+def _relief(up: Float64[np.ndarray, " n"]) -> tuple[float, float]:
+    low, high = np.quantile(up, [NOISE, 1.0 - NOISE])
+    margin = max(LEAST_MARGIN_M, MARGIN * (high - low))
+    return float(low - margin), float(high + margin)

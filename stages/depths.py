@@ -1,0 +1,29 @@
+"""depths: a depth map for every photo, where other photos confirm it; what surfaces are made from."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.mvs.depth_maps import find_depth_maps, keep_depth_maps
+from splatpipe.pipeline.mvs.options import DepthsConfig
+from splatpipe.pipeline.photos.dataset import load_views
+
+
+def run(config: DepthsConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `maps/`, in the model's frame; empty where they are not asked for.
+
+    All photos have a map, held-out ones, too: nothing is judged by surfaces that was trained without them.
+
+    Raises:
+        StageError: if the dataset cannot be read.
+    """
+    maps, search = out / "maps", out / "search"
+    shutil.rmtree(maps, ignore_errors=True)
+    if not config.enabled:
+        return keep_depth_maps(maps, [])
+    search.mkdir(exist_ok=True)
+    dataset = inputs["undistort.dataset"]
+    found = find_depth_maps(dataset, load_views(dataset), config.max_megapixels, search, inputs.machine.threads, report)
+    return keep_depth_maps(maps, found)
