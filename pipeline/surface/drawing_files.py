@@ -51,7 +51,7 @@ LAYERS = {
     OUTLINE: (7, 35, "#000000"),
     OPENINGS: (5, 25, "#0040c0"),
     PROJECTIONS: (30, 25, "#c06000"),
-    POINTS: (8, 0, "#a0a0a0"),
+    POINTS: (5, 0, "#3060d0"),
     SURFACE: (7, 35, "#000000"),
     TEXTS: (7, 18, "#000000"),
 }
@@ -166,7 +166,7 @@ def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "
     if drawing.dots is not None:
         paths = "".join(f"M{x:.2f} {y:.2f}h0" for x, y in paper(drawing.dots.places).tolist())
         colour = LAYERS[drawing.dots.layer][2]
-        parts.append(f'<path d="{paths}" stroke="{colour}" stroke-width="0.2" stroke-linecap="round"/>')
+        parts.append(f'<path d="{paths}" stroke="{colour}" stroke-width="0.4" stroke-linecap="round"/>')
     parts += [_svg_path(stroke, paper(stroke.line)) for stroke in drawing.strokes]
     for label in drawing.labels:
         x, y = paper(np.array([label.right_m, label.up_m]))

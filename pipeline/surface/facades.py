@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import numpy as np
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.drawing_files import write_dxf_drawing, write_svg_drawing
-from splatpipe.pipeline.surface.elevation import Photos, Progress, draw_elevation
+from splatpipe.pipeline.surface.elevation import Elevation, Photos, draw_elevation
 from splatpipe.pipeline.surface.elevation_drawing import elevation_drawing
 from splatpipe.pipeline.surface.elevation_files import (
     elevation_facts,
@@ -22,30 +24,50 @@ from splatpipe.pipeline.surface.elevation_files import (
     write_facades,
     write_picture,
 )
+from splatpipe.pipeline.surface.exposures import exposure_gains
 from splatpipe.pipeline.surface.facets import Facets, upright_facets
+from splatpipe.pipeline.surface.grid import DIGITS
 from splatpipe.pipeline.surface.map_crs import MapCrs
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.walls import Wall, find_walls, named, stated_wall
 from splatpipe.pipeline.surface.whole_file import whole_file
 
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
+PLACES = 4000  # that photos' exposures are compared at
 Line = tuple[float, float, float, float]
 
 
-def make_facades(
-    folder: Path, photos: Photos, crs: MapCrs, cell_m: float, lines: Sequence[Line], report: Reporter
-) -> list[dict[str, Any]]:
+@dataclass(frozen=True, eq=False)
+class FacadesTask:
+    """What façades are made from.
+
+    Attributes:
+        photos: With their depths, local metres, always in the same order.
+        area: Walls that stand outside of it are not drawn; None for all.
+        crs: Of corners and lines.
+        pixel_m: Side of a pixel of the elevations; what it becomes has three digits.
+        lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
+            found.
+        threads: Tiles at a time.
+    """
+
+    photos: Sequence[PhotoSource]
+    area: PlanArea | None
+    crs: MapCrs
+    pixel_m: float
+    lines: Sequence[Line]
+    threads: int
+
+
+def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[str, Any]]:
     """Write the files of all façades, and `facades.json` at the end.
 
     A façade whose own JSON is there is not drawn again: its other files were written before.
 
     Args:
-        folder: Where; what an interrupted call left there is gone on from.
-        photos: With their depths.
-        crs: Of corners and lines.
-        cell_m: Side of a pixel, metres.
-        lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
-            found.
+        task: What they are made from.
+        out: Where the files go; what a killed call left there is gone on from.
         report: Told how far it is.
 
     Returns:
@@ -56,22 +78,26 @@ def make_facades(
         MachineError, OSError: if the disk is full or not writable.
     """
     report.progress(0, 1, "looking for walls")
-    known = [source.depths for source in photos.sources if source.depths is not None]
-    facets = upright_facets(known, photos.threads)
-    walls = stated_walls(lines, facets, crs) if lines else find_walls(facets, cell_m)
+    pixel_m = float(f"{task.pixel_m:.{DIGITS}g}")
+    facets = upright_facets([photo.depths for photo in task.photos if photo.depths is not None], task.threads)
+    if task.area is not None:
+        facets = facets.select(task.area.contains(facets.places))
+    walls = stated_walls(task.lines, facets, task.crs) if task.lines else find_walls(facets, pixel_m)
     if not walls:
-        report.warning("No walls were found.", "Photos that look at them are needed, or name them with --facade.")
+        report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
+    places = facets.places[:: max(1, len(facets) // PLACES)]
+    photos = Photos(task.photos, exposure_gains(task.photos, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
     for number, wall in enumerate(walls):
 
         def progress(done: float, total: float, number: int = number) -> None:
             report.progress(number + done / total, len(walls), "façades", "façades")
 
-        own = folder / f"{wall.name}.json"
+        own = out / f"{wall.name}.json"
         if not own.is_file():
-            _write(folder, wall, photos, crs, cell_m, progress)
+            _write(out, draw_elevation(wall, pixel_m, photos, progress), task.crs)
         facts.append(json.loads(own.read_text(encoding="utf-8")))
-    write_facades(folder / LIST, facts, crs)
+    write_facades(out / LIST, facts, task.crs)
     return facts
 
 
@@ -102,14 +128,13 @@ def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wal
     return named(walls)
 
 
-def _write(folder: Path, wall: Wall, photos: Photos, crs: MapCrs, cell_m: float, progress: Progress) -> None:
-    elevation = draw_elevation(wall, cell_m, photos, progress)
-    zero_m = height_zero_m(elevation, crs)
-    files = {kind: wall.name + ending for kind, ending in ENDINGS.items()}
+def _write(folder: Path, elevation: Elevation, crs: MapCrs) -> None:
+    name, zero_m = elevation.wall.name, height_zero_m(elevation, crs)
+    files = {kind: name + ending for kind, ending in ENDINGS.items()}
     drawing = elevation_drawing(elevation, crs, zero_m, files["picture"])
     write_depth(folder / files["depth"], elevation, zero_m)
     write_picture(folder / files["picture"], elevation)
     write_dxf_drawing(folder / files["dxf"], drawing)
-    write_svg_drawing(folder / files["svg"], drawing, elevation.colour, f"Façade {wall.name}")
-    with whole_file(folder / f"{wall.name}.json") as aside:
+    write_svg_drawing(folder / files["svg"], drawing, elevation.colour, f"Façade {name}")
+    with whole_file(folder / f"{name}.json") as aside:
         aside.write_text(json_text(elevation_facts(elevation, crs, files)), encoding="utf-8")
