@@ -22,6 +22,7 @@ LEAST_PHOTOS = 3  # that see a place
 NEAR = 4  # cells: smaller holes are filled from around,
 FAR = 16  # cells: larger ones where photos may see what is filled in
 MARGIN = NEAR + FAR + 1  # cells around a tile that its holes look at
+BEHIND = 8  # photos that see a surface are worth one that looks through it: depths make what is near too wide
 FEW = 2  # photos that agree on a height, which counts where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
 MOST = np.iinfo(np.uint8).max
@@ -154,7 +155,7 @@ def _empty(tile: Tile) -> Heights:
 
 
 def _chosen(capture: Capture, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]) -> Float64[np.ndarray, " c"]:
-    """Of the surfaces in each cell the highest that no more photos look through than see it; nan where none is.
+    """Of the surfaces in each cell the highest that too few photos look through; nan where none is.
 
     Where there are several, one that covers half of the cell at least comes before others.
     """
@@ -177,7 +178,7 @@ def _balance(
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
-    """How many more photos see a surface than look through it."""
+    """How many more photos see a surface than ``BEHIND`` times those that look through it."""
     east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
     balance = np.zeros(heights.shape, np.int64)
     if not asked.size:
@@ -186,5 +187,5 @@ def _balance(
         found = capture.depths(number)
         for layer, height in enumerate(heights):
             view = sight(found, (east, north, height), capture.lattice.cell_m)
-            balance[layer] += view.seen.astype(np.int64) - view.through
+            balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)
     return balance
