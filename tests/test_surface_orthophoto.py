@@ -108,6 +108,13 @@ def test_tiles_and_threads_change_no_bit() -> None:
             assert np.array_equal(getattr(part, name), getattr(made(), name)[cut])
 
 
+def test_what_is_too_much_at_once_is_made_in_parts() -> None:
+    parts = tile_orthophoto(album(), WHOLE, most=1)
+    for name in ("colour", "label", "photos", "known"):
+        assert np.array_equal(getattr(parts, name), getattr(made(), name))
+    assert parts.tile == WHOLE
+
+
 def test_a_cell_that_nobody_sees_is_filled_and_told() -> None:
     whole = album()
     height = whole.surface.height.copy()

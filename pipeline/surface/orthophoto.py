@@ -20,6 +20,8 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells a side
 SPREAD = 24  # cells that colours are spread to where no photo sees; further off there is none
+MOST_OFFERS = 16_000_000  # cells times photos at once: 150 MB of costs and colours, and 50 MB while they are compared
+LEAST_CELLS = 1 << 14  # of a tile that is not made in parts: margins would be the most of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +101,20 @@ def orthophotos(album: Album, tiles: Sequence[Tile], threads: int) -> Iterator[O
     return ordered_map(partial(tile_orthophoto, album), tiles, threads)
 
 
-def tile_orthophoto(album: Album, tile: Tile) -> Orthophoto:
-    """One tile of the orthophoto."""
+def tile_orthophoto(album: Album, tile: Tile, most: int = MOST_OFFERS) -> Orthophoto:
+    """One tile of the orthophoto.
+
+    Args:
+        album: Photos, surface and cells.
+        tile: Which.
+        most: Cells times photos at once; larger ones are made in parts.
+    """
     wide = tile.grown(MARGIN + SPREAD)
+    windows = seen_by([source.camera for source in album.sources], album.lattice, wide, album.relief)
+    if len(windows) * wide.cells > most and tile.cells > LEAST_CELLS:
+        return _joined(tile, [tile_orthophoto(album, half, most) for half in tile.halves()])
     east, north = np.moveaxis(album.lattice.centres(wide), -1, 0)
     points = contiguous((east, north, album.surface.at(east, north)))
-    windows = seen_by([source.camera for source in album.sources], album.lattice, wide, album.relief)
     offers = _Offers.room(len(windows), east.shape)
     numbers: list[int] = []
     for number, _ in windows:
@@ -116,6 +126,13 @@ def tile_orthophoto(album: Album, tile: Tile) -> Orthophoto:
     inner = tuple(slice(MARGIN + SPREAD, MARGIN + SPREAD + size) for size in (tile.height, tile.width))
     label = np.array([*numbers, -1], np.int16)[made.label]
     return Orthophoto(tile, colour[inner], made.seen_by[inner], label[inner], known[inner])
+
+
+def _joined(tile: Tile, halves: Sequence[Orthophoto]) -> Orthophoto:
+    """Of what a tile's halves are."""
+    axis = 0 if halves[0].tile.width == tile.width else 1
+    columns = zip(*((half.colour, half.photos, half.label, half.known) for half in halves), strict=True)
+    return Orthophoto(tile, *(np.concatenate(column, axis=axis) for column in columns))
 
 
 def _offer(album: Album, number: int, points: Points, offers: _Offers, at: int) -> bool:
