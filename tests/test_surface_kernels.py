@@ -11,9 +11,10 @@ import pytest
 
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.mosaic import MARGIN, composed
+from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, rated, sampled
 from splatpipe.pipeline.surface.sight import Points, place_in, sight
+from splatpipe.pipeline.surface.slopes import slopes
 from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, native_camera, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import Votes
@@ -58,7 +59,8 @@ def everything() -> list[np.ndarray]:
     made, points = votes(), places()
     layers = made.layers()
     fit = made.fitted(layers[0].height)
-    found = [part for layer in layers for part in (layer.height, layer.count, layer.cover)]
+    slant = [slopes(depths.depth, depths.camera.fx) for depths in maps()]
+    found = slant + [part for layer in layers for part in (layer.height, layer.count, layer.cover)]
     found += [fit.height, fit.sigma, fit.photos]
     offers = []
     for camera, depths in zip(cameras()[::3], maps(), strict=True):
@@ -68,7 +70,8 @@ def everything() -> list[np.ndarray]:
         offers.append((seen, cost, sampled(source, photo_of(camera, 1), points, seen, 0.1, PLAIN_TONE)))
     stacked = [np.stack(column) for column in zip(*offers, strict=True)]
     mosaic = composed(*(part.copy() for part in stacked), parity=1)
-    return [*found, *stacked, mosaic.label, mosaic.colour, mosaic.seen_by]
+    best = stacked[0].copy()
+    return [*found, mosaic.label, mosaic.colour, keep_best(best, stacked[1]), best, *stacked]
 
 
 @cache
@@ -123,6 +126,22 @@ def test_the_robust_mean_is_tukeys() -> None:
     assert np.isnan(made.fitted(np.full_like(start, np.nan)).height).all()
 
 
+def test_slopes_are_a_planes_and_unknown_without_neighbours() -> None:
+    row, column = np.mgrid[:30, :90]
+    depth = (1.0 / (0.05 + 1e-5 * column - 2e-5 * row)).astype(np.float32)
+    depth[10:20, 40:50] = 0.0
+    depth[14, 44] = 20.0
+    depth[:, 70:] *= 0.7  # a step
+    found = slopes(depth, 100.0)
+    known = (depth > 0.0) & (np.arange(90) < 70)
+    known[14, 44] = False
+    assert np.abs(found[0][known] - 1e-5).max() < 1e-7  # of float32 near 0.05
+    assert np.abs(found[1][known] + 2e-5).max() < 1e-7
+    assert np.isnan(found[:, 14, 44]).all()
+    assert np.isnan(found[:, depth == 0.0]).all()
+    assert np.abs(found[0][:, 70] - 1e-5 / 0.7).max() < 1e-7
+
+
 @pytest.mark.parametrize("number", range(3))
 def test_sight_is_what_its_definition_says(number: int) -> None:
     found, points = maps()[number], places()
@@ -156,7 +175,7 @@ def test_colours_are_opencvs_cubic() -> None:
 
 
 def test_cells_away_from_the_rim_do_not_depend_on_it() -> None:
-    offers = everything_at_best()[-6:-3]
+    offers = everything_at_best()[-3:]
     whole = composed(*(part.copy() for part in offers), parity=0)
     part = composed(*(part[:, 5:, 7:].copy() for part in offers), parity=0)
     inner = np.s_[5 + MARGIN : -MARGIN, 7 + MARGIN : -MARGIN]
@@ -226,6 +245,9 @@ def test_photos_that_do_not_fit_are_refused() -> None:
     size = points[0].shape
     pixels, said, cost = np.zeros((180, 240, 3), np.uint8), np.zeros(size, np.uint8), np.zeros(size, np.uint16)
     depth, colour = np.ones((180, 240), np.float32), np.zeros((*size, 3), np.uint8)
+    for bad in ((depth[:0], 200.0), (depth, 0.0), (depth, np.nan), (depth.astype(np.float64), 200.0)):
+        refused(_native.slopes, *bad, np.empty((2, *bad[0].shape), np.float32))
+    refused(_native.slopes, depth, 200.0, np.empty((2, 180, 239), np.float32))
     refused(_native.look, depth[1:], camera, points, None, 0.0, said)
     refused(_native.look, depth, camera, points, None, 0.0, said[1:])
     refused(_native.look, depth, camera, points, np.zeros(3), 0.0, said)
@@ -245,10 +267,14 @@ def test_photos_that_do_not_fit_are_refused() -> None:
     refused(_native.sample_photo, (pixels, PLAIN_TONE, camera, None), points, np.nan, said, colour)
     seen, many = np.zeros((2, 6, 7), np.uint8), np.zeros((2, 6, 7), np.uint16)
     colours, label, counts = np.zeros((2, 6, 7, 3), np.uint8), np.zeros((6, 7), np.int16), np.zeros((6, 7), np.uint8)
-    refused(_native.compose_mosaic, seen, many[:1], colours, 0, label, colours[0], counts)
-    refused(_native.compose_mosaic, seen, many, colours, 2, label, colours[0], counts)
-    refused(_native.compose_mosaic, seen, many, colours, 0, label[1:], colours[0], counts)
-    refused(_native.compose_mosaic, seen, many, colours, 0, label, colours, counts)
+    refused(_native.keep_best, seen, many[:1], 8, counts)
+    refused(_native.keep_best, seen, many, 8, counts[1:])
+    for most in (0, -1, 17):
+        refused(_native.keep_best, seen, many, most, counts)
+    refused(_native.compose_mosaic, seen, many[:1], colours, 0, label, colours[0])
+    refused(_native.compose_mosaic, seen, many, colours, 2, label, colours[0])
+    refused(_native.compose_mosaic, seen, many, colours, 0, label[1:], colours[0])
+    refused(_native.compose_mosaic, seen, many, colours, 0, label, colours)
 
 
 def test_a_lens_that_leads_beyond_the_photo_ends_at_its_rim() -> None:

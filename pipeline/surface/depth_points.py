@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, dot, look_at
-from splatpipe.pipeline.surface.slopes import SAME_PX, inverse_and_gradient, turned
-from splatpipe.pipeline.surface.sources import PhotoWindow, Relief
+from splatpipe.pipeline.surface.slopes import slopes
+from splatpipe.pipeline.surface.sources import Relief
 from splatpipe.pipeline.surface.tiles import Tile
 
+SAME_PX = 10.0  # depths that differ by more than so many pixels' widths are not one surface
 NORMAL_REACH = 3  # pixels on either side that a normal is taken from: nearer ones say little but noise
 
 
@@ -46,22 +47,32 @@ def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: Relief) 
         relief: Outside of these heights nothing is returned.
     """
     camera = part.camera
-    window = PhotoWindow(0, 0, camera.width, camera.height)
-    inverse, gradient = inverse_and_gradient(part.depth, window, SAME_PX / max(camera.fx, camera.fy))
-    known = np.flatnonzero(np.isfinite(gradient).all(axis=0).ravel() & (inverse.ravel() > 0.0))
+    gradient = slopes(part.depth, max(camera.fx, camera.fy))
+    known = np.flatnonzero(np.isfinite(gradient).all(axis=0).ravel() & (part.depth.ravel() > 0.0))
+    inverse = np.float32(1.0) / part.depth.ravel()[known]
     row, column = np.divmod(known, camera.width)
-    xyz = place_of(camera, row, column, inverse.ravel()[known].astype(np.float64))
+    xyz = place_of(camera, row, column, inverse.astype(np.float64))
     some = np.flatnonzero(
         (lattice.cells(tile, xyz[0], xyz[1]) >= 0) & (xyz[2] >= relief.low_m) & (xyz[2] < relief.high_m)
     )
-    known, row, column = known[some], row[some], column[some]
-    slopes = gradient.reshape(2, -1)[:, known].astype(np.float64)
-    normal = _normal(part, row, column, inverse.ravel()[known].astype(np.float64), slopes)
+    known, row, column, inverse = known[some], row[some], column[some], inverse[some]
+    growth = gradient.reshape(2, -1)[:, known].astype(np.float64)
+    normal = _normal(part, row, column, inverse.astype(np.float64), growth)
     wide, flat = picture_normals(part, row, column)
     pieces = Facing(xyz[:, some], np.where(flat, wide, normal))
     footprint = look_at(camera, pieces).footprint
     seen = np.flatnonzero(np.isfinite(footprint))
     return DepthPoints(part.number, pieces.select(seen), footprint[seen])
+
+
+def turned(
+    turn: Float64[np.ndarray, "3 3"],
+    x: Float64[np.ndarray, " n"],
+    y: Float64[np.ndarray, " n"],
+    z: Float64[np.ndarray, " n"] | float = 1.0,
+) -> list[Float64[np.ndarray, " n"]]:
+    """A matrix times vectors, each by itself: a library's product would depend on how many there are."""
+    return [turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z for i in range(3)]
 
 
 def place_of(
@@ -85,7 +96,7 @@ def picture_normals(
     here = part.depth[row, column].astype(np.float64)
     w = 1.0 / np.where(here > 0.0, here, np.inf)
     near = w * (SAME_PX / max(part.camera.fx, part.camera.fy))
-    flat, slopes = here > 0.0, []
+    flat, growth = here > 0.0, []
     for down, right in ((0, NORMAL_REACH), (NORMAL_REACH, 0)):
         inside = (row >= down) & (row + down < height) & (column >= right) & (column + right < width)
         behind, ahead = (
@@ -95,8 +106,8 @@ def picture_normals(
         there = inside & (behind > 0.0) & (ahead > 0.0)
         behind, ahead = (1.0 / np.where(there, side, 1.0) for side in (behind, ahead))
         flat &= there & (np.abs(ahead + behind - 2.0 * w) < near)
-        slopes.append((ahead - behind) / (2.0 * NORMAL_REACH))
-    return _normal(part, row, column, w, np.stack(slopes)), flat
+        growth.append((ahead - behind) / (2.0 * NORMAL_REACH))
+    return _normal(part, row, column, w, np.stack(growth)), flat
 
 
 def _normal(

@@ -11,6 +11,7 @@
 #include "surface_colours.h"
 #include "surface_mosaic.h"
 #include "surface_sight.h"
+#include "surface_slopes.h"
 
 namespace {
 
@@ -35,6 +36,8 @@ void check_votes(int width, int height) {
         confidence[k] = static_cast<std::uint8_t>(random.below(256));
     }
     const splat::DepthPicture picture{camera_of(width, height, 20.0), depth.data(), confidence.data()};
+    std::vector<float> slopes(2 * size);
+    splat::find_slopes(depth.data(), width, height, picture.camera.fx, slopes.data());
     splat::CellVotes votes({-3.0, 3.0, 0.1, -2, 1, 40, 50, -1.0, 1.0});
     for (int photo = 0; photo < 3; ++photo) votes.add(picture, 0, 0, width, height);
     const std::size_t cells = static_cast<std::size_t>(votes.cells());
@@ -76,8 +79,9 @@ void check_mosaic(int photos, int width, int height) {
         for (std::size_t channel = 0; channel < 3; ++channel)
             colour[3 * k + channel] = static_cast<std::uint8_t>(random.below(256));
     }
+    splat::keep_best(photos, width * height, 3, cost.data(), seen.data(), seen_by.data());
     splat::compose_mosaic({photos, width, height, 1, seen.data(), colour.data(), cost.data()},
-                          {label.data(), blended.data(), seen_by.data()});
+                          {label.data(), blended.data()});
     for (std::size_t cell = 0; cell < cells; ++cell) {
         check(label[cell] >= -1 && label[cell] < photos, "a photo, or none");
         check((label[cell] < 0) == (seen_by[cell] == 0), "none where none sees");
