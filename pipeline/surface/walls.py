@@ -18,12 +18,14 @@ from splatpipe.pipeline.surface.facets import Facets
 from splatpipe.pipeline.survey.boundary import DIRECTIONS
 
 SEED_M, SEED_SECTORS = 1.0, 24  # of plan and of directions: facets in it that walls are looked for from
-SEED_M2 = 4.0  # of facets, of all photos together, that a search starts from at least
+SEED_M2 = 2.0  # of facets, of all photos together, that a search starts from at least
+SEED_HEIGHT_M = 1.2  # of what lies in one plane with a seed, at least; half a wall's
 SAME_WAY = math.cos(math.radians(30.0))  # of a facet's direction and its wall's: three deviations of a facet's noise
 REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # to which a wall grows, its plane taken anew each time
 BAND_M = 0.12  # about a plane: plinths and shutters are in it, and the panes of windows are not
 BAND_GSD = 4.0  # the same of coarse photos
-CLAIM_BANDS = 4.0  # about a wall, in which nothing else is looked for
+CLAIM_BANDS = 4.0  # about a wall, in which nothing else is looked for...
+CLAIM_COSINE = 0.5  # ...that faces nearly as it does: noise turns some of its own facets by more than ``SAME_WAY``
 BIN_M = 0.5  # along a wall
 GAP_M = 3.0  # between pieces of one wall: a tree before it, a gate
 CELL_M = 0.25  # of a wall's face, in which three facets tell that it is there
@@ -147,7 +149,7 @@ def find_walls(facets: Facets, gsd_m: float) -> list[Wall]:
             piece = _piece(facets, line, ends, band_m)
             if piece is not None:
                 pieces.append(piece)
-                free &= ~_around(facets, line, ends, CLAIM_BANDS * band_m)
+                free &= ~_around(facets, line, ends, CLAIM_BANDS * band_m, CLAIM_COSINE)
             else:
                 free &= ~_around(facets, line, ends, band_m)
         free &= ~start
@@ -203,6 +205,8 @@ def _grown(
         if run is None:
             return None
         ends = run
+        if np.ptp(facets.places[rows, 2]) < SEED_HEIGHT_M:
+            return None  # soon, for most seeds are those of low things
         along = facets.places[rows, :2] @ line.along
         found = _fitted(facets.select(rows[(along >= ends[0]) & (along <= ends[1])]), line, band_m)
         if found is None:
@@ -212,13 +216,15 @@ def _grown(
     return line, ends
 
 
-def _near(facets: Facets, line: _Line, band_m: float) -> Bool[np.ndarray, " n"]:
-    return np.asarray((np.abs(line.off(facets)) < band_m) & (facets.facing @ line.facing > SAME_WAY))
+def _near(facets: Facets, line: _Line, band_m: float, cosine: float = SAME_WAY) -> Bool[np.ndarray, " n"]:
+    return np.asarray((np.abs(line.off(facets)) < band_m) & (facets.facing @ line.facing > cosine))
 
 
-def _around(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> Bool[np.ndarray, " n"]:
+def _around(
+    facets: Facets, line: _Line, ends: tuple[float, float], band_m: float, cosine: float = SAME_WAY
+) -> Bool[np.ndarray, " n"]:
     along = facets.places[:, :2] @ line.along
-    return np.asarray(_near(facets, line, band_m) & (along >= ends[0]) & (along <= ends[1]))
+    return np.asarray(_near(facets, line, band_m, cosine) & (along >= ends[0]) & (along <= ends[1]))
 
 
 def _run(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float] | None:
