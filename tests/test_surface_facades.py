@@ -74,7 +74,7 @@ def facets() -> Facets:
 
 @cache
 def walls() -> dict[str, Wall]:
-    return {wall.name: wall for wall in find_walls(facets(), PIXEL_M)}
+    return {wall.name: wall for wall in find_walls(facets())}
 
 
 def drawn(name: str, threads: int = 1) -> Elevation:
@@ -114,11 +114,12 @@ def panel(
     turned = np.stack(
         [facing[0] * np.cos(turn) - facing[1] * np.sin(turn), facing[0] * np.sin(turn) + facing[1] * np.cos(turn)]
     )
-    return Facets(np.column_stack([plan, up]), turned.T, np.full(len(s), 0.04))
+    return Facets(np.column_stack([plan, up]), turned.T, np.full(len(s), 0.04), np.full(len(s), 0.03))
 
 
 def joined(*parts: Facets) -> Facets:
-    return Facets(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("places", "facing", "areas")))
+    fields = ("places", "facing", "areas", "pixels_m")
+    return Facets(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
 
 
 def test_facets_are_upright_and_where_the_walls_are() -> None:
@@ -150,11 +151,11 @@ def test_the_four_walls_are_found_from_corner_to_corner() -> None:
 
 
 def test_pieces_of_one_wall_are_joined_and_others_are_not() -> None:
-    near = find_walls(joined(panel((0, 0), (4, 0), 0, 4), panel((6, 0), (10, 0), 0, 4)), 0.03)
+    near = find_walls(joined(panel((0, 0), (4, 0), 0, 4), panel((6, 0), (10, 0), 0, 4)))
     assert [(wall.name, round(wall.length_m, 1)) for wall in near] == [("south", 10.0)]
-    apart = find_walls(joined(panel((0, 0), (4, 0), 0, 4), panel((9, 0), (14, 0), 0, 4)), 0.03)
+    apart = find_walls(joined(panel((0, 0), (4, 0), 0, 4), panel((9, 0), (14, 0), 0, 4)))
     assert [(wall.name, round(wall.length_m, 1)) for wall in apart] == [("south", 5.0), ("south-2", 4.0)]
-    behind = find_walls(joined(panel((0, 0), (4, 0), 0, 4), panel((4, 1), (9, 1), 0, 4)), 0.03)
+    behind = find_walls(joined(panel((0, 0), (4, 0), 0, 4), panel((4, 1), (9, 1), 0, 4)))
     assert len(behind) == 2
 
 
@@ -165,12 +166,12 @@ def test_fences_cars_and_crowns_are_no_walls() -> None:
     turn = random.uniform(0, 2 * np.pi, 4000)
     round_m = 2.0 + random.normal(0.0, 0.2, 4000)
     places = np.column_stack([20 + round_m * np.cos(turn), round_m * np.sin(turn), random.uniform(1, 6, 4000)])
-    crown = Facets(places, np.column_stack([np.cos(turn), np.sin(turn)]), np.full(4000, 0.04))
+    crown = Facets(places, np.column_stack([np.cos(turn), np.sin(turn)]), np.full(4000, 0.04), np.full(4000, 0.03))
     hedge = panel((0, -9), (12, -9), 0, 3.0, spread=0.4)
-    assert find_walls(joined(fence, van, crown, hedge), 0.03) == []
+    assert find_walls(joined(fence, van, crown, hedge)) == []
     low = joined(panel((0, 9), (4.5, 9), 0.0, LEAST_HEIGHT_M + 0.3), panel((4.5, 9), (4.5, 13), 0.0, 3.0))
-    assert [wall.name for wall in find_walls(low, 0.03)] == ["east", "south"]  # a low one that belongs to a house
-    assert find_walls(fence.select(np.zeros(0, np.int64)), 0.03) == []
+    assert [wall.name for wall in find_walls(low)] == ["east", "south"]  # a low one that belongs to a house
+    assert find_walls(fence.select(np.zeros(0, np.int64))) == []
 
 
 def test_depths_are_of_the_wall_and_pictures_of_its_colour() -> None:
