@@ -176,6 +176,6 @@ def test_the_whole_mesh_or_how_to_get_it(tmp_path: Path) -> None:
     made = (tmp_path / "mesh.glb").read_bytes()
     make_mesh(replace(task, threads=2), tmp_path, {}, Recorder())
     assert (tmp_path / "mesh.glb").read_bytes() == made
-    empty = replace(task, site=replace(house_site(), corner=(500.0, 500.0)))
+    empty = replace(task, site=replace(house_site(), reach=(500.0, 500.0, 510.0, 510.0)))
     with pytest.raises(SplatpipeError, match="no surface"):
         make_mesh(empty, tmp_path, {}, Recorder())

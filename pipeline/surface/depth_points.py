@@ -31,7 +31,7 @@ class DepthPoints:
     pieces: Facing
     footprint: Float64[np.ndarray, " n"]
 
-    def select(self, rows: np.ndarray) -> DepthPoints:
+    def select(self, rows: np.ndarray | slice) -> DepthPoints:
         """Those of them."""
         return DepthPoints(self.number, self.pieces.select(rows), self.footprint[rows])
 

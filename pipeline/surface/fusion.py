@@ -59,21 +59,20 @@ def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: Reli
         tile: Which of them.
         relief: Points outside of these heights are noise.
     """
+    if not parts:
+        return joined([])
     nearest = _by_distance(parts, lattice, tile)
     finest = [_finest(depth_points(part, lattice, tile, relief), nearest) for part in parts]
-    xyz, footprint = (
-        np.concatenate([each.pieces.xyz for each in finest] or [np.zeros((3, 0))], axis=1),
-        np.concatenate([each.footprint for each in finest] or [np.zeros(0)]),
-    )
+    xyz = np.concatenate([each.pieces.xyz for each in finest], axis=1)
+    footprint = np.concatenate([each.footprint for each in finest])
     kept = np.zeros(len(footprint), np.bool_)
     kept[finest_of_cubes(xyz, footprint, lattice, tile)] = True
-    ends = np.cumsum([len(each.footprint) for each in finest], dtype=np.int64)
+    ends = np.cumsum([len(each.footprint) for each in finest])
     found = []
-    for points, some in zip(finest, np.split(kept, ends[:-1]), strict=True) if finest else ():
+    for points, some in zip(finest, np.split(kept, ends[:-1]), strict=True):
         points = points.select(some)
-        for start in range(0, len(points.footprint), BATCH):
-            rows = np.arange(start, min(start + BATCH, len(points.footprint)))
-            found.append(_agreed(points.select(rows), parts))
+        starts = range(0, len(points.footprint), BATCH)
+        found += [_agreed(points.select(np.s_[start : start + BATCH]), parts) for start in starts]
     return joined(found)
 
 
