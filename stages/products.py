@@ -11,6 +11,9 @@ CELL_PIXELS = 2.0  # of the orthophoto along a cell of the surface model, where 
 NEEDS = {"dsm": ("depths",), "ortho": ("depths", "dsm")}
 """Products, and the stages that each needs besides its own."""
 
+NO_PRODUCTS: dict[str, Any] = {stage: {"enabled": False} for stage in ("depths", *NEEDS)}
+PRODUCTS_FROM_BUDGET_S = 3600.0  # of a whole run: a shorter one is for the splat, and products are made afterwards
+
 
 def parse_products(text: str) -> tuple[str, ...]:
     """Names of products, in the line's order, of a list like ``ortho, dsm``.

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, dot, look_at
+from splatpipe.pipeline.surface.slopes import SAME_PX, inverse_and_gradient, turned
 from splatpipe.pipeline.surface.sources import PhotoWindow, Relief
-from splatpipe.pipeline.surface.surfels import SAME_PX, inverse_and_gradient, turned
 from splatpipe.pipeline.surface.tiles import Tile
 
 NORMAL_REACH = 3  # pixels on either side that a normal is taken from: nearer ones say little but noise
@@ -79,7 +79,7 @@ def picture_normals(
 ) -> tuple[Float64[np.ndarray, "3 n"], Bool[np.ndarray, " n"]]:
     """Normals of pixels' surfaces from depths on all four sides, and where these lie in one surface.
 
-    Inverse depth is linear in a plane's pixels, as in ``surfels``.
+    Inverse depth is linear in a plane's pixels, as in ``slopes``.
     """
     height, width = part.depth.shape
     here = part.depth[row, column].astype(np.float64)

@@ -112,10 +112,12 @@ class Look:
     """How a camera looks at pieces of a surface.
 
     Attributes:
+        pieces: They.
         place: Where they lie in it; ``sine`` is of the ray's angle against the surface.
         footprint: How long a pixel is on the surface, metres; infinite where it sees them from behind or not at all.
     """
 
+    pieces: Facing
     place: Place
     footprint: Float64[np.ndarray, " n"]
 
@@ -123,11 +125,12 @@ class Look:
         """Those of them."""
         place = self.place
         parts = (place.column[rows], place.row[rows], place.depth[rows], place.sine[rows], place.inside[rows])
-        return Look(Place(*parts), self.footprint[rows])
+        return Look(self.pieces.select(rows), Place(*parts), self.footprint[rows])
 
     def sight(self, found: DepthMap) -> Sight:
         """What the photo's depths say, in whose grid the look is."""
-        return sight(found, self.place, 0.0)
+        east, north, up = self.pieces.xyz
+        return sight(found, (east, north, up), 0.0, np.ascontiguousarray(self.place.sine))
 
 
 def look_at(camera: Camera, pieces: Facing) -> Look:
@@ -138,7 +141,7 @@ def look_at(camera: Camera, pieces: Facing) -> Look:
     cosine = dot(towards, pieces.normal) / np.maximum(away, 1e-9)
     seen = place.inside & (cosine > 0.0)
     pixel = place.depth / max(camera.fx, camera.fy) / np.maximum(cosine, LEAST_COSINE)
-    return Look(replace(place, sine=cosine), np.where(seen, pixel, np.inf))
+    return Look(pieces, replace(place, sine=cosine), np.where(seen, pixel, np.inf))
 
 
 def dot(a: Float64[np.ndarray, "3 n"], b: Float64[np.ndarray, "3 n"]) -> Float64[np.ndarray, " n"]:

@@ -12,14 +12,13 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.depth_points import place_of
 from splatpipe.pipeline.surface.exposures import exposure_gains
-from splatpipe.pipeline.surface.photo_samples import PhotoSource, halvings, loaded, sampled, tone_curve
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded, sampled, tone_curve
 from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet, look_at
 from splatpipe.pipeline.surface.sight import place_in
 from splatpipe.pipeline.surface.sources import DepthMap, Shelf
 
 COARSE = 4  # power of the footprint that a photo's weight falls with: one half as fine counts a sixteenth
 MIXED = 0.01  # weight where a nearer surface lies in the next pixel of the depths: its colour may be mixed in
-COLUMNS = 256  # of the picture that points are sampled as: OpenCV's are no longer than 32,767
 BATCH = 1 << 17  # points at a time
 COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
 HELD_BYTES = 300 << 20  # of depths in memory
@@ -102,11 +101,9 @@ def _offer(photos: PhotoSet, pieces: Facing, cell_m: float, number: int) -> _Off
         return _Offer(rows, np.zeros((0, 3), np.uint8), weight)
     source = photos.sources[number]
     pixels, tone = loaded(source)[0], tone_curve(photos.gains[number])
-    parts = [
-        _sampled(source, pixels, tone, pieces.xyz[:, rows[start : start + BATCH]], cell_m)
-        for start in range(0, len(rows), BATCH)
-    ]
-    return _Offer(rows, np.concatenate(parts), weight)
+    east, north, up = pieces.xyz[:, rows]
+    colour = sampled(source, pixels, (east, north, up), np.ones(len(rows), np.bool_), cell_m, tone)
+    return _Offer(rows, colour, weight)
 
 
 def _seen(
@@ -126,19 +123,3 @@ def _seen(
     weight = np.where(sight.seen, np.where(sight.mixed, MIXED, 1.0), 0.0) / coarse**COARSE
     kept = weight > 0.0
     return rows[kept], weight[kept].astype(np.float32)
-
-
-def _sampled(
-    source: PhotoSource,
-    pixels: UInt8[np.ndarray, "h w 3"],
-    tone: UInt8[np.ndarray, "256 3"],
-    xyz: Float64[np.ndarray, "3 k"],
-    cell_m: float,
-) -> UInt8[np.ndarray, "k 3"]:
-    """Colours in a photo at places within it."""
-    size = xyz.shape[1]
-    shape = (-(-size // COLUMNS), COLUMNS)
-    east, north, up = np.pad(xyz, ((0, 0), (0, shape[0] * shape[1] - size)), mode="edge").reshape(3, *shape)
-    place = place_in(source.camera, east, north, up)
-    level = halvings(source.camera, place, cell_m)
-    return sampled(pixels, source.in_photo(place), level, tone).reshape(-1, 3)[:size]

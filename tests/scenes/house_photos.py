@@ -16,8 +16,15 @@ SIDE_M = 10.0  # of what is made into clouds and meshes: the house, and lawn aro
 
 def house_site() -> Site:
     """A square about the house."""
-    half = SIDE_M / 2
-    return Site(GSD_M, -1.0, 7.0, (-half, -half, half, half), (-half, -half), SIDE_M, np.ones((1, 1), np.bool_))
+    return Site(
+        GSD_M,
+        -1.0,
+        7.0,
+        (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2),
+        (-SIDE_M / 2, -SIDE_M / 2),
+        SIDE_M,
+        np.ones((1, 1), np.bool_),
+    )
 
 
 def photos(noise_px: float = 0.0, wild: float = 0.0) -> list[PhotoSource]:
