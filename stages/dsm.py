@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
@@ -17,7 +18,7 @@ from splatpipe.pipeline.surface.run_sources import depth_sources, times_finer
 from splatpipe.pipeline.surface.site import save_site, survey_site
 from splatpipe.pipeline.survey.frames import load_frame
 
-CELL_GSD = 2.0  # of the photos: heights are known less finely than colours
+CELL_GSD = 2.0  # of the photos: heights are known less finely than colours; and no more finely than depths
 
 
 def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -37,13 +38,14 @@ def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summa
     area = read_world_area(inputs.parts.get("georef.boundary"))
     photos = load_photo_list(inputs["ingest.photos"]).photos
     placed = place(read_flown(inputs["georef.model"]), photos, math.inf, report) if maps else []
-    site = survey_site(sources, times_finer(maps, placed), area, inputs.machine.threads)
+    finer = times_finer(maps, placed)
+    site = survey_site(sources, finer, area, inputs.machine.threads)
     if site is None:
         save_site(out / "site.json", None)
         if maps:
             report.warning("No place is seen well by three photos, so there is no surface model.")
         return {"cells": 0}
-    cell_m = config.cell_m or CELL_GSD * site.gsd_m
+    cell_m = config.cell_m or max(CELL_GSD, statistics.median(finer)) * site.gsd_m
     save_site(out / "site.json", site, cell_m)
     task = DsmTask(frame, site, sources, area, cell_m, inputs.machine.threads)
     return {**make_dsm(task, out / "sheets", out / "files", report), "gsd_m": round(site.gsd_m, 5)}

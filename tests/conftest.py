@@ -20,6 +20,9 @@ DEMO = (
     "undistort.max_megapixels=0.1",
     "train.iterations=600",
     "flythrough.seconds=4.0",
+    "depths.max_megapixels=0.01",
+    "dsm.cell_m=0.3",
+    "ortho.gsd_m=0.3",
     "split.every=4",
 )
 PATIENCE_MS = 240_000.0  # for what the browser is to show: far more than it takes, of a busy machine

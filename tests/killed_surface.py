@@ -38,10 +38,10 @@ def write_raster(path: Path, grid: Grid, form: RasterForm, halfway: Halfway) -> 
 
 def fill_late(path: Path, grid: Grid, halfway: Halfway) -> None:
     """The disk holds all tiles, but not the file that is made of them, which has overviews, too."""
-    size = int(1.1 * grid.width * grid.height)
+    size = int(1.1 * 4 * grid.width * grid.height)
     with raster_file(path, grid, CONFIDENCE) as file:
         for tile in grid.tiles():
-            file.write(tile, np.random.default_rng(0).integers(0, 255, (tile.height, tile.width), np.uint8))
+            file.write(tile, np.random.default_rng(0).integers(0, 65535, (2, tile.height, tile.width), np.uint16))
         halfway() if halfway is die else fill_the_disk(size)
 
 

@@ -26,6 +26,9 @@ QUICK = (
     "train.iterations=60",
     "split.every=4",
     "flythrough.seconds=0.2",
+    "depths.max_megapixels=0.01",
+    "dsm.cell_m=0.3",
+    "ortho.gsd_m=0.3",
 )
 STAGES = [stage.name for stage in LINE]
 KILLED_RUN = Path(__file__).with_name("killed_run.py")
@@ -94,7 +97,7 @@ def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp
     before = json.loads((copy_of_run / "metrics.json").read_text())
     for file in (fewer, more):
         told = splatpipe("georef", copy_of_run, "--gcp", file)
-        assert ran(told) == ["control", "targets", "georef", "evaluate", "export"]
+        assert ran(told) == ["control", "targets", "georef", "evaluate", "export", "dsm", "ortho"]
     after = json.loads((copy_of_run / "metrics.json").read_text())
     assert before["accuracy"]["splat"] is None and after["psnr"] == before["psnr"]
     tables = after["accuracy"]["tables"]
@@ -103,7 +106,7 @@ def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp
     assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:32633"
     assert ran(splatpipe("georef", copy_of_run)) == []
     told = splatpipe("georef", copy_of_run, *sets("georef.crs=EPSG:31255"))
-    assert "train" not in ran(told) and ran(told)[-1] == "export"
+    assert "train" not in ran(told) and ran(told)[-3:] == ["export", "dsm", "ortho"]
     assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:31255"
 
 
@@ -116,6 +119,11 @@ def test_a_run_leaves_what_is_promised(undisturbed: Path) -> None:
         "sparse.glb",
         "viewer.html",
         "flythrough.webm",
+        "dsm.tif",
+        "dsm_confidence.tif",
+        "contours.dxf",
+        "contours.geojson",
+        "ortho.tif",
         "config.toml",
         "events.jsonl",
         "report.html",

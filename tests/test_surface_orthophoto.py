@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface import mosaic
 from splatpipe.pipeline.surface.exposures import exposure_gains
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.orthophoto import SPREAD, Album, Orthophoto, orthophotos, tile_orthophoto
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, sampled, tone_curve
-from splatpipe.pipeline.surface.sight import Place
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
 from splatpipe.pipeline.surface.tiles import Tile
 
@@ -168,24 +168,40 @@ def test_a_photo_is_seen_through_its_lens() -> None:
 def test_a_finer_photo_is_softened_and_an_equal_one_is_not() -> None:
     board = np.indices((64, 64)).sum(axis=0) % 2 * 255
     pixels = np.repeat(board[..., None], 3, axis=2).astype(np.uint8)
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    down[2, 3] = 100.0
+    source = PhotoSource(Camera("photo", 64, 64, 100.0, 100.0, 32.0, 32.0, down), lambda: pixels, None)  # 1 m a pixel
     row, column = np.mgrid[4:12, 4:12] + 0.5
-    inside, ones = np.ones((8, 8), np.bool_), np.ones((8, 8))
-    same = sampled(pixels, Place(column, row, ones, ones, inside), np.zeros((8, 8), np.int64), PLAIN_TONE)
+    seen = np.ones((8, 8), np.bool_)
+    same = sampled(source, pixels, (column - 32.0, 32.0 - row, np.zeros((8, 8))), seen, 1.0, PLAIN_TONE)
     assert np.array_equal(same[..., 0], board[4:12, 4:12])
-    coarse = Place(column * 4, row * 4, ones, ones, inside)
-    assert np.ptp(sampled(pixels, coarse, np.full((8, 8), 2, np.int64), PLAIN_TONE)) <= 1
+    coarse = (4.0 * column - 32.0, 32.0 - 4.0 * row, np.zeros((8, 8)))
+    assert np.ptp(sampled(source, pixels, coarse, seen, 4.0, PLAIN_TONE)) <= 1
+    seen[2] = False
+    assert not sampled(source, pixels, coarse, seen, 4.0, PLAIN_TONE)[2].any()
 
 
 def test_a_seam_runs_where_two_photos_look_alike() -> None:
-    grey = np.full((2, 40, 60), 100, np.uint8)
-    grey[1, :, 25:29] = 200  # a car that only one of them has
-    cost = np.full((2, 40, 60), 300, np.int32)
-    cost[0] += np.arange(60, dtype=np.int32) * 2  # the first is better on the left, the second on the right
-    cost[1] += (59 - np.arange(60, dtype=np.int32)) * 2
-    label = mosaic.labels(cost, np.ones_like(grey, np.bool_), grey, parity=0)
+    colour = np.full((2, 40, 60, 3), 100, np.uint8)
+    colour[1, :, 25:29] = 200  # a car that only one of them has
+    cost = np.full((2, 40, 60), 300, np.uint16)
+    cost[0] += np.arange(60, dtype=np.uint16) * 2  # the first is better on the left, the second on the right
+    cost[1] += (59 - np.arange(60, dtype=np.uint16)) * 2
+    label = mosaic.composed(np.ones(cost.shape, np.bool_), cost, colour, parity=0).label
     crossings = np.flatnonzero(label[20, 1:] != label[20, :-1])
     assert crossings.size == 1
-    assert grey[0, 20, crossings[0]] == grey[1, 20, crossings[0]]
+    assert (colour[0, 20, crossings[0]] == colour[1, 20, crossings[0]]).all()
+
+
+def test_what_one_photo_of_five_shows_is_not_shown() -> None:
+    colour = np.full((5, 60, 60, 3), 90, np.uint8)
+    colour[3, 20:40, 20:40] = 240  # a car that had driven on; elsewhere this photo is the best
+    cost = np.full((5, 60, 60), 300, np.uint16)
+    cost[3] = 100
+    made = mosaic.composed(np.ones(cost.shape, np.bool_), cost, colour, parity=1)
+    assert (made.colour[22:38, 22:38] == 90).all()  # colours mix around the seam
+    assert (made.label[28:32, 2:4] == 3).all()
+    assert (made.seen_by == 5).all()
 
 
 def test_heights_between_cells_are_straight_on_slopes_and_sharp_at_steps() -> None:

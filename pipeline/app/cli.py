@@ -206,6 +206,34 @@ def georef(
 
 
 @app.command()
+def surface(
+    out: OutArgument,
+    products: Annotated[str, typer.Option(metavar="NAMES", help="What to make: ortho, dsm.")] = "ortho,dsm",
+    gsd: Annotated[
+        str | None,
+        typer.Option(metavar="2cm", help="Side of a pixel on the ground; heights have cells twice as wide."),
+    ] = None,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    wait: WaitOption = False,
+    notify: NotifyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make surface products of a finished run: an orthophoto, a surface model. Those that it has stay."""
+    from splatpipe.pipeline.engine.quantities import parse_length
+    from splatpipe.stages.products import options_for, parse_products
+
+    with Ending(out, as_json) as done:
+        done.notify_by(notify)
+        asked = options_for(parse_products(products), None if gsd is None else parse_length(gsd, "--gsd"))
+        tables = [asked, *overrides(None, assignments, None).tables]
+        with RunSession(existing(out, tables, device, threads), wait) as runner:
+            done.outcome = runner.outcome
+            runner.walk()
+
+
+@app.command()
 def render(
     out: OutArgument,
     path: PathOption = "cameras",

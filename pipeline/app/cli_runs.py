@@ -30,10 +30,14 @@ class Overrides:
     def resolve(self, *below: dict[str, Any]) -> LineConfig:
         from splatpipe.pipeline.engine.config import merge, resolve
         from splatpipe.stages.options import LineConfig
+        from splatpipe.stages.products import NO_PRODUCTS, PRODUCTS_FROM_BUDGET_S
 
         train = merge(self.tables).get("train")
-        if isinstance(train, dict) and train.get("time_budget_s"):
+        budget = train.get("time_budget_s") if isinstance(train, dict) else None
+        if budget:
             below = (*below, {"train": {"max_megapixels": 0.0}})  # a preset's size goes with its own length
+            if isinstance(budget, int | float) and budget < PRODUCTS_FROM_BUDGET_S:
+                below = (*below, NO_PRODUCTS)
         return resolve(LineConfig, [*below, *self.tables])
 
 

@@ -1,4 +1,4 @@
-"""Quantities as people write them on a command line: `1h30m`, `8G`."""
+"""Quantities as people write them on a command line: `1h30m`, `8G`, `2cm`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ _NUMBER = r"[0-9]+(?:\.[0-9]+)?"
 _DURATION = re.compile(rf"(?:({_NUMBER})h)?(?:({_NUMBER})m)?(?:({_NUMBER})s)?")
 _SECONDS = (3600.0, 60.0, 1.0)
 _BYTES = re.compile(rf"({_NUMBER})([MGT])B?")
+_LENGTH = re.compile(rf"({_NUMBER}) ?(mm|cm|m)")
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _UNITS = {"M": 10**6, "G": 10**9, "T": 10**12}
 
 
@@ -55,3 +57,23 @@ def parse_bytes(text: str, option: str) -> int:
             hint=f"Write it with its unit: {option} 512M or 8G.",
         )
     return number
+
+
+def parse_length(text: str, option: str) -> float:
+    """Metres of `2cm`, `25mm` or `0.1m`.
+
+    Args:
+        text: What the user wrote.
+        option: Where, for the message.
+
+    Raises:
+        UsageError: if it is anything else, or no length at all.
+    """
+    match = _LENGTH.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
+    metres = float(match[1]) * _METRES[match[2]] if match else 0.0
+    if not 0.0 < metres < math.inf:
+        raise UsageError(
+            f'Cannot understand {option} "{text[:LONGEST_TEXT]}".',
+            hint=f"Write it with its unit: {option} 2cm, 25mm or 0.1m.",
+        )
+    return round(metres, 9)

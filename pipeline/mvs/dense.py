@@ -14,11 +14,13 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch
+from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch, SearchPlan
 from splatpipe.pipeline.photos.dataset import View
 
 MEGAPIXELS = 0.05  # of a photo: most depths good to half a hundredth
 WIDER = 1.25  # times nearer than its sparse points: thin places have no points yet
+NEIGHBOURS = 8  # that a photo is compared with, and whose depths are asked
+PLAN = SearchPlan(MEGAPIXELS, WIDER, False, NEIGHBOURS, NEIGHBOURS)
 CELLS = 64  # of a photo's width; one with a sparse point in it gets no other
 GROWTH = 2.0 ** (1.0 / 3.0)  # of the voxels, until the points are few enough
 
@@ -77,7 +79,7 @@ def dense_points(
         StageError: if the model or a photo cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="depths-", dir=folder) as kept:
-        search = DepthSearch.begin(dataset, views, Path(kept), MEGAPIXELS, WIDER, plain=False)
+        search = DepthSearch.begin(dataset, views, Path(kept), PLAN)
         search.run(threads, report)
         found = []
         for done, points in enumerate(ordered_map(partial(_agreed, search), range(len(views)), threads), start=1):

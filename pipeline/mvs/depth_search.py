@@ -25,7 +25,6 @@ from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.raster.threads import same_bits
 
-COMPARED = 8  # neighbours a photo is compared with, and whose depths are asked
 AGREEING = 2  # so many have to agree at least
 TOLERANCE = 0.01  # of the depth, within which two photos agree;
 TOLERANCE_PX = 0.5  # far away as much of it as moves the point so far in the other's photo,
@@ -54,6 +53,25 @@ class Agreement:
 
 
 @dataclass(frozen=True)
+class SearchPlan:
+    """How depths are looked for.
+
+    Attributes:
+        megapixels: Of a photo at most.
+        wider: Times nearer than its sparse points that a photo is searched.
+        plain: Whether pixels without texture at hand have depths, too: others have to confirm them.
+        compared: Neighbours that a photo is compared with, 16 at most.
+        asked: Neighbours whose depths are asked whether they agree; no fewer.
+    """
+
+    megapixels: float
+    wider: float
+    plain: bool
+    compared: int
+    asked: int
+
+
+@dataclass(frozen=True)
 class DepthSearch:
     """Photos of one size, who is compared with whom, and where what is found lies.
 
@@ -61,11 +79,9 @@ class DepthSearch:
         views: Photos to use, in name order.
         cameras: Theirs, in the grid that depths are found in.
         tracks: Which saw which sparse point.
-        near: Neighbours of each, the best first.
+        near: Neighbours of each that are asked, the best first.
         folder: Where photos and depths are kept.
-        megapixels: Of that grid at most.
-        wider: Times nearer than its sparse points that a photo is searched.
-        plain: Whether pixels without texture at hand have depths, too: others have to confirm them.
+        plan: How they are looked for.
     """
 
     views: Sequence[View]
@@ -73,30 +89,24 @@ class DepthSearch:
     tracks: Tracks
     near: Sequence[Sequence[int]]
     folder: Path
-    megapixels: float
-    wider: float
-    plain: bool
+    plan: SearchPlan
 
     @classmethod
-    def begin(
-        cls, dataset: Path, views: Sequence[View], folder: Path, megapixels: float, wider: float, plain: bool
-    ) -> DepthSearch:
+    def begin(cls, dataset: Path, views: Sequence[View], folder: Path, plan: SearchPlan) -> DepthSearch:
         """A search that has found nothing yet.
 
         Args:
             dataset: The folder that `undistort` left.
             views: Photos to use, in name order.
             folder: Where there is room meanwhile: 9 bytes a pixel.
-            megapixels: Of a photo at most.
-            wider: As above.
-            plain: As above.
+            plan: How they are looked for.
 
         Raises:
             StageError: if the model cannot be read.
         """
-        cameras = [reduced_camera(view.camera, megapixels) for view in views]
+        cameras = [reduced_camera(view.camera, plan.megapixels) for view in views]
         tracks = load_tracks(dataset, [camera.name for camera in cameras])
-        return cls(views, cameras, tracks, neighbours(tracks, cameras, COMPARED), folder, megapixels, wider, plain)
+        return cls(views, cameras, tracks, neighbours(tracks, cameras, plan.asked), folder, plan)
 
     def run(self, threads: int, report: Reporter) -> None:
         """Find the depths of every photo that has none in the folder yet; the same for any number of threads.
@@ -143,7 +153,7 @@ class DepthSearch:
         """Make one photo small and keep it: its neighbours ask for it, too."""
         if self._photo_path(number).is_file():
             return
-        _, colour, mask = small_view(self.views[number], self.megapixels)
+        _, colour, mask = small_view(self.views[number], self.plan.megapixels)
         counts = np.ones(colour.shape[:2], np.bool_) if mask is None else mask
         _save_whole(self._photo_path(number), colour=colour, counts=counts)
 
@@ -151,12 +161,12 @@ class DepthSearch:
         """Look at one photo and keep what it found."""
         if self._depths_path(number).is_file():
             return
-        bounds = inverse_depths(self.tracks, number, self.cameras[number], self.wider)
-        others = self.near[number]
+        bounds = inverse_depths(self.tracks, number, self.cameras[number], self.plan.wider)
+        others = self.near[number][: self.plan.compared]
         if bounds is None or len(others) < AGREEING:
             return
         pictures = [self._picture(other) for other in others]
-        found = find_depths(self._picture(number), pictures, bounds, number, self.plain)
+        found = find_depths(self._picture(number), pictures, bounds, number, self.plan.plain)
         _save_whole(self._depths_path(number), inverse=found.inverse, cost=found.cost)
 
     def _picture(self, number: int) -> Picture:

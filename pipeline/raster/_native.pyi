@@ -191,3 +191,143 @@ def patch_match(
     Raises:
         ValueError: if sizes do not fit, or the range is empty.
     """
+
+SEEN: int
+"""Bits of what a photo's depths say about a place: the photo sees it,"""
+THROUGH: int
+"""sees something behind it,"""
+MIXED: int
+"""sees it, but a nearer surface lies in the next pixel,"""
+UNKNOWN: int
+"""or looks there, but has no depth."""
+MOSAIC_MARGIN: int
+"""Cells around one that its colour in a mosaic depends on."""
+
+_Camera = tuple[np.ndarray, tuple[int, int], tuple[float, float, float, float]]
+"""cam_from_world (4, 4) float64; width, height; fx, fy, cx, cy in pixels."""
+_Places = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""East, north, up, float64, of one size."""
+
+class CellVotes:
+    """Heights that photos found in the cells of a tile; the same bits in any window, and in any tile.
+
+    Args:
+        lattice: East and north of the first cell's outer corner; side of a cell.
+        tile: First row and column, rows and columns: 2^26 cells at most.
+        relief: Lowest and highest height that counts, 13 km apart at most.
+
+    Raises:
+        ValueError: if there are no cells, or too many.
+    """
+
+    def __init__(
+        self, lattice: tuple[float, float, float], tile: tuple[int, int, int, int], relief: tuple[float, float]
+    ) -> None: ...
+    def add(
+        self, depth: np.ndarray, confidence: np.ndarray, camera: _Camera, window: tuple[int, int, int, int]
+    ) -> None:
+        """A photo's votes.
+
+        Args:
+            depth: Along the camera's z, metres, 0 where none; float32 (h, w).
+            confidence: How many other photos confirm it; uint8 (h, w).
+            camera: In the depths' grid.
+            window: Left, top, right, bottom of the pixels that may lie in the tile.
+
+        Raises:
+            ValueError: if sizes do not fit.
+        """
+
+    def layers(self, height: np.ndarray, count: np.ndarray, cover: np.ndarray) -> None:
+        """Surfaces that enough photos agree on, from the top.
+
+        Args:
+            height: Written: of the middle vote, nan where there is none; float64 (3, cells).
+            count: Written: votes; int32 (3, cells).
+            cover: Written: what share of the cell it covers; float64 (3, cells).
+        """
+
+    def fit(self, start: np.ndarray, height: np.ndarray, sigma: np.ndarray, photos: np.ndarray) -> None:
+        """Robust means of the votes about a start.
+
+        Args:
+            start: Heights; nan where none; float64 (cells,).
+            height: Written: the means, nan where there is none; float64 (cells,).
+            sigma: Written: expected deviations; float64 (cells,).
+            photos: Written: how many agree; int32 (cells,).
+        """
+
+def look(
+    depth: np.ndarray, camera: _Camera, places: _Places, sines: np.ndarray | None, least: float, said: np.ndarray
+) -> None:
+    """What a photo's depths say about places.
+
+    Args:
+        depth: As of ``CellVotes.add``.
+        camera: In the depths' grid.
+        places: nan is nowhere.
+        sines: Of the rays' angles against the surface, float64; None: against the ground.
+        least: Differences up to it are none, metres.
+        said: Written: bits as above; uint8.
+
+    Raises:
+        ValueError: if sizes do not fit.
+    """
+
+def rate(camera: _Camera, places: _Places, cell: float, said: np.ndarray, cost: np.ndarray, seen: np.ndarray) -> int:
+    """What it costs to colour places by a photo, and whether it sees them; returns how many it sees.
+
+    Args:
+        camera: The photo's.
+        places: As above.
+        cell: Side of their cells, metres.
+        said: What its depths say of them.
+        cost: Written: 4000 at most, and where the photo does not look; uint16.
+        seen: Written: 0 or 1; uint8.
+    """
+
+def sample_photo(
+    photo: tuple[np.ndarray, np.ndarray, _Camera, tuple[float, np.ndarray] | None],
+    places: _Places,
+    cell: float,
+    seen: np.ndarray,
+    colour: np.ndarray,
+) -> None:
+    """Colours of places in a photo by a cubic, at a scale that fits.
+
+    Args:
+        photo: Pixels, uint8 (h, w, 3); what becomes of their values, uint8 (256, 3); the camera, a pinhole; and None,
+            or how many of the pinhole's pixels from node to node of the photo's lens, and columns and rows in the
+            photo, float64 (rows, columns, 2).
+        places: As above.
+        cell: Side of their cells, metres.
+        seen: 0 where no colour is wanted; uint8.
+        colour: Written: uint8, three a place; black where none is wanted.
+
+    Raises:
+        ValueError: if sizes do not fit.
+    """
+
+def compose_mosaic(
+    seen: np.ndarray,
+    cost: np.ndarray,
+    colour: np.ndarray,
+    parity: int,
+    label: np.ndarray,
+    blended: np.ndarray,
+    seen_by: np.ndarray,
+) -> None:
+    """Colour cells by photos, with seams where these look alike.
+
+    Args:
+        seen: Where each photo sees the cells, 0 or 1; uint8 (n, h, w), n at most 32,767.
+        cost: Of colouring them by it; uint16 (n, h, w). Changed.
+        colour: Of each photo; uint8 (n, h, w, 3).
+        parity: Of the first cell's row plus column in the whole picture.
+        label: Written: number of the photo, -1 where none; int16 (h, w).
+        blended: Written: uint8 (h, w, 3).
+        seen_by: Written: how many photos see the cell, 255 at most; uint8 (h, w).
+
+    Raises:
+        ValueError: if sizes do not fit.
+    """

@@ -10,18 +10,16 @@ format of 2008, which GDAL and QGIS still read. DXF is in the run's CRS, heights
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ezdxf._options import options
 from ezdxf.filemanagement import new as new_drawing
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.surface.contours import Contours
+from splatpipe.pipeline.surface.drawing_files import the_same_bytes
 from splatpipe.pipeline.surface.grid import Grid
 from splatpipe.pipeline.surface.map_crs import MapCrs, unit_name
 from splatpipe.pipeline.surface.whole_file import whole_file
@@ -78,7 +76,7 @@ def write_dxf(path: Path, contours: Contours, crs: MapCrs) -> None:
         contours: In the CRS.
         crs: It.
     """
-    with _the_same_bytes():
+    with the_same_bytes():
         drawing = new_drawing(DXF_VERSION, units=DXF_UNITS.get(unit_name(crs.unit_m), 0))
         drawing.header["$MEASUREMENT"] = 1
         about = f"every {contours.interval:g}, {crs.described_heights()}; {crs.horizontal.name}"
@@ -109,14 +107,3 @@ def _urn(crs: MapCrs) -> str:
     if authority is None:
         raise SplatpipeError("GeoJSON names a CRS by its code, which this one has not.", "Take the DXF.")
     return f"urn:ogc:def:crs:{authority[0]}::{authority[1]}"
-
-
-@contextmanager
-def _the_same_bytes() -> Iterator[None]:
-    """Let ezdxf write no date and no random number: its own means to that end."""
-    before = options.write_fixed_meta_data_for_testing
-    options.write_fixed_meta_data_for_testing = True
-    try:
-        yield
-    finally:
-        options.write_fixed_meta_data_for_testing = before

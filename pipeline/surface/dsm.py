@@ -84,12 +84,13 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
         for part in surface_heights(capture, tiles, task.threads):
             sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))
             confidence = np.stack([part.photos, np.minimum(sigma, MOST_MILLIMETRES)], axis=-1).astype(np.uint16)
-            yield part.tile, {"height": sheet.heights(part.tile, part.height), "confidence": confidence}
+            over = sheet.heights(part.tile, part.height).astype(np.float32)
+            yield part.tile, {"height": over, "confidence": confidence}
 
     making.run(heights)
     with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
         for part, arrays in making.finished():
-            file.write(part, arrays["height"].astype(np.float32))
+            file.write(part, arrays["height"])
     known, total, sigmas = 0, 0, np.zeros(MOST_MILLIMETRES + 1, np.int64)
     with raster_file(out / "dsm_confidence.tif", grid, CONFIDENCE) as file:
         for part, arrays in making.finished():

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, halvings, linear, loaded, sampled
-from splatpipe.pipeline.surface.sight import place_in, sight
+from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, linear, loaded, sampled
+from splatpipe.pipeline.surface.sight import Points, place_in, sight
 
 MOST_GAIN = 2.0  # and one over it: more is not exposure
 DARKEST, LIGHTEST = 8, 247  # values that are not cut off
@@ -47,19 +46,17 @@ def _light(
 ) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
     """Logarithms of the light in a photo at places, and where it sees them well."""
     unseen = np.zeros((len(places), 3)), np.zeros(len(places), np.bool_)
-    points = tuple(places.T[:, None])
-    place = place_in(source.camera, *points)
-    if source.depths is None or not place.inside.any():
+    points: Points = (places[:, 0], places[:, 1], places[:, 2])
+    inside = place_in(source.camera, *points).inside
+    if source.depths is None or not inside.any():
         return unseen
-    found = source.depths.load()
-    view = sight(found, place_in(found.camera, *points), 0.0)
-    place = replace(place, inside=view.seen & ~view.mixed & place.inside)
-    if not place.inside.any():
+    view = sight(source.depths.load(), points, 0.0)
+    seen = view.seen & ~view.mixed & inside
+    if not seen.any():
         return unseen
     pixels, _ = loaded(source)
-    level = halvings(source.camera, place, cell_m)
-    colour = sampled(pixels, source.in_photo(place), level, PLAIN_TONE)[0]
-    good = place.inside[0] & (colour >= DARKEST).all(axis=1) & (colour <= LIGHTEST).all(axis=1)
+    colour = sampled(source, pixels, points, seen, cell_m, PLAIN_TONE)
+    good = seen & (colour >= DARKEST).all(axis=1) & (colour <= LIGHTEST).all(axis=1)
     return np.log(linear(np.maximum(colour, DARKEST) / 255.0)), good
 
 

@@ -12,10 +12,10 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.holes import REACH, filled
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sight import place_in, sight
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, PhotoWindow, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.sight import sight
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
 from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, fitted, joined, layers, photo_votes, undecided
+from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, undecided
 
 TILE = 256  # cells a side
 LEAST_PHOTOS = 3  # that see a place
@@ -88,13 +88,14 @@ def tile_heights(capture: Capture, tile: Tile) -> Heights:
     """Heights of one tile."""
     wide = tile.grown(MARGIN)
     seen = seen_by([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
-    votes = joined([_votes(capture, wide, number, window) for number, window in seen], capture.relief)
-    cells = wide.height * wide.width
-    found = layers(votes, cells, capture.relief)
+    votes = Votes(capture.lattice, wide, capture.relief)
+    for number, window in seen:
+        votes.add(capture.depths(number), window)
+    found = votes.layers()
     if not found:
         return _empty(tile)
     start = _chosen(capture, wide, found, [number for number, _ in seen])
-    fit = fitted(votes, start)
+    fit = votes.fitted(start)
     enough = fit.photos >= LEAST_PHOTOS
     shape = (wide.height, wide.width)
     height, new = filled(np.where(enough, fit.height, np.nan).reshape(shape), capture.lattice.cell_m)
@@ -113,10 +114,6 @@ def tile_heights(capture: Capture, tile: Tile) -> Heights:
 def _empty(tile: Tile) -> Heights:
     nothing = np.full((tile.height, tile.width), np.nan, np.float32)
     return Heights(tile, nothing, nothing.copy(), np.zeros((tile.height, tile.width), np.uint8))
-
-
-def _votes(capture: Capture, tile: Tile, number: int, window: PhotoWindow) -> Votes:
-    return photo_votes(capture.depths(number), window, capture.lattice, tile, capture.relief)
 
 
 def _chosen(capture: Capture, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]) -> Float64[np.ndarray, " c"]:
@@ -144,12 +141,13 @@ def _balance(
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
     """How many more photos see a surface than look through it."""
-    east, north = capture.lattice.centres(tile).reshape(-1, 2)[asked].T
+    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
     balance = np.zeros(heights.shape, np.int64)
     if not asked.size:
         return balance
     for number in reversed(numbers):  # the last ones are still at hand; whole numbers add up in any order
         found = capture.depths(number)
-        view = sight(found, place_in(found.camera, east, north, heights), capture.lattice.cell_m)
-        balance += view.seen.astype(np.int64) - view.through
+        for layer, height in enumerate(heights):
+            view = sight(found, (east, north, height), capture.lattice.cell_m)
+            balance[layer] += view.seen.astype(np.int64) - view.through
     return balance

@@ -10,7 +10,8 @@ class DsmConfig(StageConfig):
     enabled: bool = True
     """Make the surface model: dsm.tif, its confidence, contours."""
     cell_m: NonNegativeFloat = 0.0
-    """Side of its cells on the ground, metres; 0: two pixels of the photos."""
+    """Side of its cells on the ground, metres; 0: two pixels of the photos, or one of their depths where that is
+    larger."""
 
 
 class OrthoConfig(StageConfig):

@@ -3,40 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, Int16, Int32, UInt8
+from jaxtyping import Bool, Float64, Int16, UInt8, UInt16
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.mosaic import (
-    HIDDEN,
-    MARGIN,
-    blended,
-    labels,
-    likeness_cost,
-    parity_of,
-    scaled_cost,
-    spread,
-)
-from splatpipe.pipeline.surface.photo_samples import PhotoSource, halvings, loader, sampled, tone_curve
-from splatpipe.pipeline.surface.sight import LEAST_SINE, Place, Sight, place_in, sight
+from splatpipe.pipeline.surface.mosaic import MARGIN, composed, spread
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, loader, rated, sampled, tone_curve
+from splatpipe.pipeline.surface.sight import Points, contiguous, sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
 from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells a side
 SPREAD = 24  # cells that colours are spread to where no photo sees; further off there is none
-LEANING = 1.0  # cost of a ray along the ground, against one straight down
-COARSE = 0.5  # cost of a photo half as fine as the cells
-RIM = 0.06  # of a photo's width: nearer to its edge it costs more, for lenses are worst there,
-RIM_COST = 0.5  # up to so much
-MIXED = 0.6  # cost where a nearer surface lies in the next pixel of the depths: colours may be mixed
-UNKNOWN = 0.3  # cost around a cell where the photo has no depth: it colours others beside it none the less
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,20 +65,24 @@ class Album:
 
 
 @dataclass(frozen=True, eq=False)
-class _Offer:
-    """What one photo offers to a tile.
+class _Offers:
+    """What photos offer to a tile; room for so many.
 
     Attributes:
-        number: The photo's.
-        seen: Where it sees the surface.
+        seen: Where each sees the surface.
         cost: Of being coloured by it; told beside, too, for what lies around a cell counts.
         colour: Levelled; black where it does not see the surface.
     """
 
-    number: int
-    seen: Bool[np.ndarray, "h w"]
-    cost: Int32[np.ndarray, "h w"]
-    colour: UInt8[np.ndarray, "h w 3"]
+    seen: Bool[np.ndarray, "n h w"]
+    cost: UInt16[np.ndarray, "n h w"]
+    colour: UInt8[np.ndarray, "n h w 3"]
+
+    @classmethod
+    def room(cls, count: int, shape: tuple[int, ...]) -> _Offers:
+        """For so many photos."""
+        whole = (count, *shape)
+        return cls(np.empty(whole, np.bool_), np.empty(whole, np.uint16), np.empty((*whole, 3), np.uint8))
 
 
 def orthophotos(album: Album, tiles: Sequence[Tile], threads: int) -> Iterator[Orthophoto]:
@@ -116,80 +103,36 @@ def tile_orthophoto(album: Album, tile: Tile) -> Orthophoto:
     """One tile of the orthophoto."""
     wide = tile.grown(MARGIN + SPREAD)
     east, north = np.moveaxis(album.lattice.centres(wide), -1, 0)
-    up = album.surface.at(east, north)
+    points = contiguous((east, north, album.surface.at(east, north)))
     windows = seen_by([source.camera for source in album.sources], album.lattice, wide, album.relief)
-    offers = [_offer(album, number, (east, north, up)) for number, _ in windows]
-    given = [offer for offer in offers if offer is not None]
-    label, colour, photos = _composed(given, parity_of(wide.row, wide.column), up.shape)
-    colour, known = spread(colour, label >= 0, np.isfinite(up), SPREAD)
+    offers = _Offers.room(len(windows), east.shape)
+    numbers: list[int] = []
+    for number, _ in windows:
+        if _offer(album, number, points, offers, len(numbers)):
+            numbers.append(number)
+    given = slice(len(numbers))
+    made = composed(offers.seen[given], offers.cost[given], offers.colour[given], (wide.row + wide.column) % 2)
+    colour, known = spread(made.colour, made.label >= 0, np.isfinite(points[2]), SPREAD)
     inner = tuple(slice(MARGIN + SPREAD, MARGIN + SPREAD + size) for size in (tile.height, tile.width))
-    numbers = np.array([offer.number for offer in given] + [-1], np.int16)
-    return Orthophoto(tile, colour[inner], photos[inner], numbers[label][inner], known[inner])
+    label = np.array([*numbers, -1], np.int16)[made.label]
+    return Orthophoto(tile, colour[inner], made.seen_by[inner], label[inner], known[inner])
 
 
-def _composed(
-    given: Sequence[_Offer], parity: int, shape: tuple[int, ...]
-) -> tuple[np.ndarray, UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    if not given:
-        return np.full(shape, -1), np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
-    seen = np.stack([offer.seen for offer in given])
-    cost = np.stack([offer.cost for offer in given])
-    colour = np.stack([offer.colour for offer in given])
-    grey = np.stack([np.asarray(cv2.cvtColor(part, cv2.COLOR_RGB2GRAY), np.uint8) for part in colour])
-    cost += likeness_cost(grey, cost, seen)
-    label = labels(cost, seen, grey, parity)
-    photos = np.minimum(seen.sum(axis=0), np.iinfo(np.uint8).max).astype(np.uint8)
-    return label, blended(label, colour, seen), photos
-
-
-def view_of(
-    source: DepthSource, shelf: Shelf[DepthMap], number: int, points: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> Sight:
-    """What a photo says about places by its own depths.
-
-    Args:
-        source: The photo's depths.
-        shelf: Where they may be held.
-        number: The photo's.
-        points: East, north, up.
-    """
-    found = shelf.get(number, partial(_loaded, source))
-    return sight(found, place_in(found.camera, *points), 0.0)
+def _offer(album: Album, number: int, points: Points, offers: _Offers, at: int) -> bool:
+    """Write what a photo offers as one of the offers; False where it sees nothing."""
+    source = album.sources[number]
+    if source.depths is None:
+        return False
+    view = sight(album.depths.get(number, partial(_loaded, source.depths)), points, 0.0)
+    cost, seen = rated(source.camera, points, album.lattice.cell_m, view.said)
+    if not seen.any():
+        return False
+    pixels = album.pixels.get(number, loader(source))
+    offers.seen[at], offers.cost[at] = seen, cost
+    offers.colour[at] = sampled(source, pixels, points, seen, album.lattice.cell_m, tone_curve(album.gains[number]))
+    return True
 
 
 def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
     found = source.load()
     return found, found.depth.nbytes + found.confidence.nbytes
-
-
-def _offer(album: Album, number: int, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> _Offer | None:
-    source = album.sources[number]
-    if source.depths is None:
-        return None
-    place = place_in(source.camera, *points)
-    view = view_of(source.depths, album.depths, number, points)
-    seen = view.seen & place.inside
-    if not seen.any():
-        return None
-    cost = _cost(source.camera, place, album.lattice.cell_m) + scaled_cost(MIXED * view.mixed + UNKNOWN * view.unknown)
-    cost = np.where(seen | (view.unknown & place.inside), cost, np.int32(HIDDEN))
-    pixels = album.pixels.get(number, loader(source))
-    place = replace(place, inside=seen)
-    level = halvings(source.camera, place, album.lattice.cell_m)
-    return _Offer(number, seen, cost, sampled(pixels, source.in_photo(place), level, tone_curve(album.gains[number])))
-
-
-def _cost(camera: Camera, place: Place, cell_m: float) -> Int32[np.ndarray, "h w"]:
-    """What it costs to colour cells by a photo: it leans, is coarse, or they lie near its edge."""
-    sine = np.maximum(place.sine, LEAST_SINE)
-    pixel = np.where(place.inside, place.depth, 0.0) / max(camera.fx, camera.fy) / sine
-    edge = np.minimum(
-        np.minimum(place.column, camera.width - place.column), np.minimum(place.row, camera.height - place.row)
-    )
-    rim = np.clip(1.0 - edge / (RIM * camera.width), 0.0, 1.0)
-    total = (
-        LEANING * np.sqrt(1.0 - np.square(np.minimum(sine, 1.0)))
-        + COARSE * np.clip(pixel / cell_m - 1.0, 0.0, 4.0)
-        + RIM_COST * rim
-    )
-    return scaled_cost(np.where(place.inside, total, 0.0))

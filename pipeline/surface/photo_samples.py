@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, UInt8, UInt16
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.sight import Place
-from splatpipe.pipeline.surface.sources import DepthSource
-
-PARTS = 32.0  # of a pixel, to which OpenCV rounds places: done here before a window is cut, so that all windows agree
-MOST_HALVED = 6  # times: a photo 64 times finer than the cells is softened no further
-REACH = 3  # pixels around a place that a cubic may look at, at any scale
-ROUND_UP = 0.4  # a photo is halved where its pixels are finer than a cell by 2 to the power of so many more
+from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.surface.sight import Points, contiguous
+from splatpipe.pipeline.surface.sources import DepthSource, native_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,22 +34,6 @@ class Lens:
     step: float
     nodes: Float64[np.ndarray, "rows columns 2"]
 
-    def pixels(
-        self, column: Float64[np.ndarray, " *n"], row: Float64[np.ndarray, " *n"]
-    ) -> tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"]]:
-        """The photo's columns and rows; of places beyond the pinhole's picture those of its rim's squares."""
-        rows, columns = self.nodes.shape[:2]
-        x, y = (np.nan_to_num(at / self.step) for at in (column, row))
-        left = np.clip(x, 0, columns - 2).astype(np.int64)
-        top = np.clip(y, 0, rows - 2).astype(np.int64)
-        x, y = x - left, y - top
-        flat, first = self.nodes.reshape(-1, 2), top * columns + left
-        found = []
-        for axis in (0, 1):
-            a, b, c, d = (flat[first + at, axis] for at in (0, 1, columns, columns + 1))
-            found.append((a * (1 - x) + b * x) * (1 - y) + (c * (1 - x) + d * x) * y)
-        return found[0], found[1]
-
 
 @dataclass(frozen=True, eq=False)
 class PhotoSource:
@@ -73,73 +52,59 @@ class PhotoSource:
     depths: DepthSource | None
     lens: Lens | None = None
 
-    def in_photo(self, place: Place) -> Place:
-        """Places of the pinhole's in the photo's own grid."""
-        if self.lens is None:
-            return place
-        column, row = self.lens.pixels(place.column, place.row)
-        inside = place.inside & (column >= 0.0) & (column < self.lens.width) & (row >= 0.0) & (row < self.lens.height)
-        return replace(place, column=column, row=row, inside=inside)
-
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the photo's own grid."""
         return (self.camera.width, self.camera.height) if self.lens is None else (self.lens.width, self.lens.height)
 
 
-def halvings(camera: Camera, place: Place, cell_m: float) -> Int64[np.ndarray, " *n"]:
-    """How often a photo is halved at each place before it is sampled."""
-    finer = cell_m * max(camera.fx, camera.fy) / np.where(place.inside, place.depth, 1.0)
-    level = np.floor(np.log2(np.maximum(finer, 1.0)) + ROUND_UP)
-    return np.minimum(level, MOST_HALVED).astype(np.int64)
+def rated(
+    camera: Camera, points: Points, cell_m: float, said: UInt8[np.ndarray, " *n"]
+) -> tuple[UInt16[np.ndarray, " *n"], Bool[np.ndarray, " *n"]]:
+    """What it costs to colour points by a photo, in thousandths, and whether it sees them.
+
+    It leans, is coarser than the cells, they lie near its edge, or its depths are not sure of them.
+
+    Args:
+        camera: The photo's pinhole.
+        points: East, north, up; nan is nowhere.
+        cell_m: Side of the points' cells.
+        said: What its depths say, as of ``sight``.
+    """
+    cost, seen = np.empty(said.shape, np.uint16), np.empty(said.shape, np.bool_)
+    _native.rate(native_camera(camera), contiguous(points), cell_m, said, cost, seen.view(np.uint8))
+    return cost, seen
 
 
 def sampled(
-    pixels: UInt8[np.ndarray, "h w 3"], place: Place, level: Int64[np.ndarray, "a b"], tone: UInt8[np.ndarray, "256 3"]
-) -> UInt8[np.ndarray, "a b 3"]:
-    """Colours at places by a cubic, black outside of the photo; the same bits however places are tiled.
+    source: PhotoSource,
+    pixels: UInt8[np.ndarray, "h w 3"],
+    points: Points,
+    seen: Bool[np.ndarray, " *n"],
+    cell_m: float,
+    tone: UInt8[np.ndarray, "256 3"],
+) -> UInt8[np.ndarray, " *n 3"]:
+    """Colours of points in a photo by a cubic, black where it does not see them.
+
+    Where its pixels are finer than the cells it is halved before, as often as fits. The same bits whatever points are
+    asked for at once.
 
     Args:
-        pixels: The whole photo; only what lies around the places is read.
-        place: Where they are.
-        level: How often the photo is halved there.
+        source: The photo.
+        pixels: All of it; only what lies around the points is read.
+        points: East, north, up.
+        seen: Whether it sees them; what lies beyond its edges has the edge's colour.
+        cell_m: Side of the points' cells.
         tone: What becomes of each value in each channel.
+
+    Raises:
+        ValueError: if the pixels are not of the photo's size.
     """
-    result = np.zeros((*place.column.shape, 3), np.uint8)
-    if not place.inside.any():
-        return result
-    for halved in np.unique(level[place.inside]):
-        here = place.inside & (level == halved)
-        side = 1 << int(halved)
-        left, top, window = _window(pixels, place, here, side)
-        window = np.asarray(cv2.LUT(window, tone.reshape(1, 256, 3)))
-        for _ in range(int(halved)):
-            window = np.asarray(
-                cv2.resize(window, (window.shape[1] // 2, window.shape[0] // 2), interpolation=cv2.INTER_AREA)
-            )
-        column, row = (
-            np.where(here, np.round((at / side - 0.5) * PARTS) / PARTS - first // side, 0.0).astype(np.float32)
-            for at, first in ((place.column, left), (place.row, top))
-        )
-        found = cv2.remap(window, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        result[here] = found[here]
-    return result
-
-
-def _window(
-    pixels: UInt8[np.ndarray, "h w 3"], place: Place, here: np.ndarray, side: int
-) -> tuple[int, int, UInt8[np.ndarray, "a b 3"]]:
-    """The part of a photo around places, from and to whole multiples of ``side``; its rim goes on beyond the photo."""
-    height, width = pixels.shape[:2]
-    spans = []
-    for at, length in ((place.row[here], height), (place.column[here], width)):
-        first = max(0, (int(at.min()) // side - REACH) * side)
-        last = min(-(-length // side) * side, (int(at.max()) // side + REACH + 1) * side)
-        spans.append((first, last))
-    (top, bottom), (left, right) = spans
-    part = np.asarray(pixels[top:bottom, left:right])
-    beyond = ((0, bottom - top - part.shape[0]), (0, right - left - part.shape[1]), (0, 0))
-    return left, top, np.ascontiguousarray(np.pad(part, beyond, mode="edge"))
+    colour = np.zeros((*seen.shape, 3), np.uint8)
+    lens = None if source.lens is None else (source.lens.step, source.lens.nodes)
+    photo = (pixels, tone, native_camera(source.camera), lens)
+    _native.sample_photo(photo, contiguous(points), cell_m, seen.view(np.uint8), colour)
+    return colour
 
 
 def loaded(source: PhotoSource) -> tuple[UInt8[np.ndarray, "h w 3"], int]:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.sources import DepthMap
+from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.surface.sources import DepthMap, native_camera
 
-TOLERANCE_PX = 3.0  # depths this many pixels' widths apart are the same, at a right angle to the surface;
-LEAST_SINE = 0.2  # more where the ray is flat, up to this one
+Points = tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"]]  # east, north, up
 
 
 @dataclass(frozen=True)
@@ -52,60 +51,55 @@ def place_in(
     return Place(column, row, depth, sine, inside)
 
 
-def tolerance(camera: Camera, place: Place) -> Float64[np.ndarray, " *n"]:
-    """How far two depths of the ground may be apart and be the same, metres along the view axis."""
-    flat = np.maximum(place.sine, LEAST_SINE)
-    return np.asarray(TOLERANCE_PX * place.depth / max(camera.fx, camera.fy) / flat)
-
-
 @dataclass(frozen=True)
 class Sight:
     """What a photo says about points.
 
     Attributes:
-        seen: It sees them.
-        through: It sees something behind them.
-        mixed: It sees them, but a nearer surface lies in the next pixel.
-        unknown: It looks there, but has no depth: it may see them.
+        said: Bits for each, as kernels take them.
     """
 
-    seen: Bool[np.ndarray, " *n"]
-    through: Bool[np.ndarray, " *n"]
-    mixed: Bool[np.ndarray, " *n"]
-    unknown: Bool[np.ndarray, " *n"]
+    said: UInt8[np.ndarray, " *n"]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, " *n"]:
+        """It sees them."""
+        return np.asarray(self.said & _native.SEEN != 0)
+
+    @property
+    def through(self) -> Bool[np.ndarray, " *n"]:
+        """It sees something behind them."""
+        return np.asarray(self.said & _native.THROUGH != 0)
+
+    @property
+    def mixed(self) -> Bool[np.ndarray, " *n"]:
+        """It sees them, but a nearer surface lies in the next pixel."""
+        return np.asarray(self.said & _native.MIXED != 0)
+
+    @property
+    def unknown(self) -> Bool[np.ndarray, " *n"]:
+        """It looks there, but has no depth: it may see them."""
+        return np.asarray(self.said & _native.UNKNOWN != 0)
 
 
-def sight(found: DepthMap, place: Place, least_m: float) -> Sight:
-    """Compare points with a photo's depths.
+def sight(found: DepthMap, points: Points, least_m: float, sines: Float64[np.ndarray, " *n"] | None = None) -> Sight:
+    """Compare points with a photo's depths: they are the same within some pixels' widths, more where the ray is flat.
 
     Args:
-        found: Its depths.
-        place: Of the points in the depths' own grid.
-        least_m: Differences up to it are none.
+        found: The depths.
+        points: East, north, up; nan is nowhere.
+        least_m: Differences along the view axis up to it are none.
+        sines: Of the rays' angles against the surface there; None: against the ground.
+
+    Raises:
+        ValueError: if the depths do not fit their camera.
     """
-    column = np.clip(np.where(place.inside, place.column, 0.0), 0, found.camera.width - 1).astype(np.int64)
-    row = np.clip(np.where(place.inside, place.row, 0.0), 0, found.camera.height - 1).astype(np.int64)
-    near, least = _nearest_and_least(found, row, column)
-    limit = np.maximum(tolerance(found.camera, place), least_m)
-    seen = place.inside & (near > 0.0) & (np.abs(near - place.depth) <= limit)
-    through = place.inside & (least > 0.0) & (least - place.depth > limit) & ~seen
-    mixed = seen & (least > 0.0) & (least < place.depth - limit)
-    return Sight(seen, through, mixed, place.inside & (near <= 0.0))
+    said = np.empty(points[2].shape, np.uint8)
+    _native.look(found.depth, native_camera(found.camera), contiguous(points), sines, least_m, said)
+    return Sight(said)
 
 
-def _nearest_and_least(
-    found: DepthMap, row: Int64[np.ndarray, " *n"], column: Int64[np.ndarray, " *n"]
-) -> tuple[Float32[np.ndarray, " *n"], Float32[np.ndarray, " *n"]]:
-    """A pixel's depth, and the least of it and those around it; 0 where one of them has none.
-
-    A point at an edge lies in a pixel that may show what is behind: only where all pixels around do, too, is it in
-    the way of the photo's rays.
-    """
-    if not row.size:
-        empty = np.zeros(row.shape, np.float32)
-        return empty, empty
-    top, bottom = max(0, int(row.min()) - 1), min(found.camera.height, int(row.max()) + 2)
-    left, right = max(0, int(column.min()) - 1), min(found.camera.width, int(column.max()) + 2)
-    part = np.ascontiguousarray(found.depth[top:bottom, left:right])
-    least = np.asarray(cv2.erode(part, np.ones((3, 3), np.uint8)))
-    return part[row - top, column - left], least[row - top, column - left]
+def contiguous(points: Points) -> Points:
+    """Points as kernels take them."""
+    east, north, up = (np.ascontiguousarray(part, np.float64) for part in points)
+    return east, north, up

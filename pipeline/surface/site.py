@@ -38,17 +38,19 @@ class Site:
     """What a run's photos show.
 
     Attributes:
-        gsd_m: Of the photos as flown, on the ground, the median.
+        gsd_m: Of the photos as flown: a pixel's side at what it shows, across the ray; the mean of the photos' medians.
         low_m: No height lies lower; local metres.
         high_m: Nor higher.
+        reach: Least east and north, largest east and north of what is seen, local metres.
         corner: East and north of the plan's first cell's outer corner (its least ones), local metres.
         cell_m: Of the plan.
-        covered: Which cells of the plan enough photos see, rows to the north.
+        covered: Which cells of the plan enough photos see, and their neighbours, rows to the north.
     """
 
     gsd_m: float
     low_m: float
     high_m: float
+    reach: tuple[float, float, float, float]
     corner: tuple[float, float]
     cell_m: float
     covered: Bool[np.ndarray, "rows columns"]
@@ -56,10 +58,8 @@ class Site:
     @property
     def box(self) -> Float64[np.ndarray, "2 3"]:
         """Least and largest east, north, up."""
-        rows, columns = self.covered.shape
-        east, north = self.corner
-        far = (east + columns * self.cell_m, north + rows * self.cell_m)
-        return np.array([[east, north, self.low_m], [*far, self.high_m]])
+        west, south, east, north = self.reach
+        return np.array([[west, south, self.low_m], [east, north, self.high_m]])
 
     def sees(self, box: Float64[np.ndarray, "2 2"]) -> bool:
         """Whether any of it lies in a rectangle: least and largest east and north."""
@@ -83,9 +83,9 @@ def save_site(path: Path, site: Site | None, dsm_cell_m: float = 0.0) -> None:
         write_json(path, None)
         return
     rows, columns = site.covered.shape
-    facts = {"gsd_m": site.gsd_m, "low_m": site.low_m, "high_m": site.high_m, "corner": list(site.corner)}
+    facts = {"gsd_m": site.gsd_m, "low_m": site.low_m, "high_m": site.high_m, "reach": list(site.reach)}
     packed = np.packbits(site.covered).tobytes().hex()
-    plan = {"cell_m": site.cell_m, "rows": rows, "columns": columns, "covered": packed}
+    plan = {"corner": list(site.corner), "cell_m": site.cell_m, "rows": rows, "columns": columns, "covered": packed}
     write_json(path, {**facts, **plan, "dsm_cell_m": dsm_cell_m})
 
 
@@ -101,18 +101,13 @@ def load_site(path: Path) -> tuple[Site, float] | None:
             return None
         shape = int(told["rows"]), int(told["columns"])
         bits = np.unpackbits(np.frombuffer(bytes.fromhex(told["covered"]), np.uint8), count=shape[0] * shape[1])
-        gsd, low, high, east, north, cell, dsm_cell = (
-            float(each)
-            for each in (
-                told["gsd_m"],
-                told["low_m"],
-                told["high_m"],
-                *told["corner"],
-                told["cell_m"],
-                told["dsm_cell_m"],
-            )
+        gsd, low, high, cell, dsm_cell = (
+            float(told[name]) for name in ("gsd_m", "low_m", "high_m", "cell_m", "dsm_cell_m")
         )
-        return Site(gsd, low, high, (east, north), cell, bits.reshape(shape).astype(np.bool_)), dsm_cell
+        west, south, east, north = (float(each) for each in told["reach"])
+        corner_east, corner_north = (float(each) for each in told["corner"])
+        covered, corner = bits.reshape(shape).astype(np.bool_), (corner_east, corner_north)
+        return Site(gsd, low, high, (west, south, east, north), corner, cell, covered), dsm_cell
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError(f"The site {path.name} cannot be read: {error}", "Run again with --rerun dsm.") from error
 
@@ -133,7 +128,7 @@ def survey_site(
     seen = [look for look in looks if len(look)]
     if not seen:
         return None
-    gsd = float(np.median([np.median(look[:, 3]) for look in seen]))
+    gsd = float(np.mean([np.median(look[:, 4]) for look in seen]))
     number = np.repeat(np.arange(len(looks)), [len(look) for look in looks])
     every = np.concatenate(looks)
     near = every[:, 3] <= FARTHEST * gsd
@@ -144,18 +139,20 @@ def survey_site(
         return None
     cell = CELL_GSD * gsd
     corner = np.floor(every[:, :2].min(axis=0) / cell) * cell
-    covered = _covered(np.floor((every[:, :2] - corner) / cell).astype(np.int64), number)
-    if not covered.any():
+    place = np.floor((every[:, :2] - corner) / cell).astype(np.int64)
+    covered = _covered(place, number)
+    inside = covered[place[:, 1], place[:, 0]]
+    if not inside.any():
         return None
-    low, high = _relief(every[:, 2])
-    rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
-    first = corner + np.array([columns[0], rows[0]]) * cell
-    part = covered[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return Site(gsd, low, high, (float(first[0]), float(first[1])), cell, part)
+    low, high = _relief(every[inside, 2])
+    (west, south), (east, north) = every[inside, :2].min(axis=0), every[inside, :2].max(axis=0)
+    reach = float(west), float(south), float(east), float(north)
+    wider = cv2.dilate(covered.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return Site(gsd, low, high, reach, (float(corner[0]), float(corner[1])), cell, wider)
 
 
-def _look(sources: Sequence[DepthSource], sizes: Sequence[float], number: int) -> Float64[np.ndarray, "n 4"]:
-    """East, north, up of some depths, and how large a pixel of the photo is on the ground there."""
+def _look(sources: Sequence[DepthSource], sizes: Sequence[float], number: int) -> Float64[np.ndarray, "n 5"]:
+    """East, north, up of some depths, and a pixel's side there: on the ground, and across the ray."""
     found: DepthMap = sources[number].load()
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
@@ -166,12 +163,12 @@ def _look(sources: Sequence[DepthSource], sizes: Sequence[float], number: int) -
     points = camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), depth)
     away = np.linalg.norm(points - camera.centre(), axis=1)
     sine = (camera.centre()[2] - points[:, 2]) / np.maximum(away, 1e-9)
-    pixel = depth / max(camera.fx, camera.fy) / sizes[number] / np.maximum(sine, 1e-3)
-    return np.column_stack([points, pixel])
+    pixel = depth / max(camera.fx, camera.fy) / sizes[number]
+    return np.column_stack([points, pixel / np.maximum(sine, 1e-3), pixel])
 
 
 def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "rows columns"]:
-    """Cells that enough photos see and that are not off by themselves, and their neighbours."""
+    """Cells that enough photos see and that are not off by themselves."""
     columns, rows = cell.max(axis=0) + 1
     if rows * columns > 1 << 28:
         raise SplatpipeError("The photos' depths reach too far for a surface.", "Set a --boundary.")
@@ -183,7 +180,7 @@ def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) ->
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     kept = sizes >= LEAST_PART * sizes.sum()
-    return np.asarray(cv2.dilate((covered & kept[parts]).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    return np.asarray((covered > 0) & kept[parts])
 
 
 def _relief(up: Float64[np.ndarray, " n"]) -> tuple[float, float]:

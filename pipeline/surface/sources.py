@@ -38,6 +38,15 @@ class DepthMap(Protocol):
     def confidence(self) -> UInt8[np.ndarray, "h w"]: ...
 
 
+NativeCamera = tuple[Float64[np.ndarray, "4 4"], tuple[int, int], tuple[float, float, float, float]]
+
+
+def native_camera(camera: Camera) -> NativeCamera:
+    """A camera as native kernels take it: pose, size, and focal lengths and principal point in pixels."""
+    pose = np.ascontiguousarray(camera.cam_from_world, np.float64)
+    return pose, (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
+
+
 @dataclass(frozen=True, eq=False)
 class DepthSource:
     """Where a photo's depths come from.
@@ -141,12 +150,12 @@ def window_of(camera: Camera, lattice: Lattice, tile: Tile, relief: Relief) -> P
 
 
 def _corners(lattice: Lattice, tile: Tile, relief: Relief) -> Float64[np.ndarray, "8 3"]:
-    """Of the box that the tile's cells lie in."""
-    ends = lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
-    middle = ends.mean(axis=0)
-    wider = middle + (ends - middle) * (1.0 + 2.0 / min(tile.width, tile.height))  # out to the cells' edges, and over
-    wider += np.sign(ends - middle) * lattice.cell_m
-    return np.array([[e, n, up] for up in (relief.low_m, relief.high_m) for e, n in wider])
+    """Of the box that the tile's cells lie in, and one more around."""
+    columns = tile.column - 1, tile.column + tile.width + 1
+    rows = tile.row - 1, tile.row + tile.height + 1
+    easts = [lattice.east_m + column * lattice.cell_m for column in columns]
+    norths = [lattice.north_m - row * lattice.cell_m for row in rows]
+    return np.array([[e, n, up] for up in (relief.low_m, relief.high_m) for n in norths for e in easts])
 
 
 def seen_by(cameras: Sequence[Camera], lattice: Lattice, tile: Tile, relief: Relief) -> list[tuple[int, PhotoWindow]]:

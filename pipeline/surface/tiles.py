@@ -22,6 +22,11 @@ class Tile:
     height: int
     width: int
 
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns, to cut it out of a raster that it lies in."""
+        return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
+
     def grown(self, cells: int) -> Tile:
         """The same with so many more cells on every side."""
         return Tile(self.row - cells, self.column - cells, self.height + 2 * cells, self.width + 2 * cells)

@@ -63,4 +63,5 @@ void test_loss();
 void test_colour();
 void test_sky();
 void test_patch_match();
+void test_surface();
 void test_adam();

@@ -53,6 +53,7 @@ int main() {
     test_colour();
     test_sky();
     test_patch_match();
+    test_surface();
     test_adam();
     std::printf("%d passed, %d failed\n", passed, failed);
     return failed ? 1 : 0;

@@ -36,6 +36,15 @@ iterations = 60
 
 [flythrough]
 seconds = 0.4
+
+[depths]
+max_megapixels = 0.01
+
+[dsm]
+cell_m = 0.3
+
+[ortho]
+gsd_m = 0.3
 """
 
 

@@ -14,6 +14,7 @@ from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.learning import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.making import files_chapter, making_chapter, said_chapter
 from splatpipe.pipeline.app.report.placing import placing_chapter
+from splatpipe.pipeline.app.report.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -50,6 +51,7 @@ def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, 
         "placing": _guarded(lambda: placing_chapter(holdings, geometry)),
         "training": _guarded(lambda: training_chapter(holdings, drawn=drawn)),
         "views": _guarded(lambda: views_chapter(holdings, drawn=drawn)),
+        "surfaces": _guarded(lambda: surfaces_chapter(holdings, drawn=drawn)),
         "making": _guarded(lambda: making_chapter(holdings, drawn=drawn)),
         "files": _guarded(lambda: files_chapter(holdings)),
         "said": _guarded(lambda: said_chapter(holdings)),

@@ -16,6 +16,7 @@ void bind_raster(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_patch_match(nb::module_& m);
 void bind_sky(nb::module_& m);
+void bind_surface(nb::module_& m);
 
 namespace {
 
@@ -34,7 +35,7 @@ void set_isa(const std::string& name) {
 
 NB_MODULE(_native, m) {
     nb::set_leak_warnings(false);  // a graph that somebody still holds at exit is no leak
-    m.doc() = "Native kernels: rasterizer, loss, optimiser, depths.";
+    m.doc() = "Native kernels: rasterizer, loss, optimiser, depths, surfaces.";
     m.def("set_threads", &splat::set_threads, "threads"_a, "Threads of the one pool that all kernels share.");
     m.def("threads", &splat::thread_count);
     m.def("isa", [] { return std::string(splat::isa_name(splat::active_isa())); }, "The instruction set in use.");
@@ -45,4 +46,5 @@ NB_MODULE(_native, m) {
     bind_loss(m);
     bind_patch_match(m);
     bind_sky(m);
+    bind_surface(m);
 }

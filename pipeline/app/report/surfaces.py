@@ -1,0 +1,64 @@
+"""The report's chapter of what was made besides the splat: pictures, sizes, and how good heights are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.wording import count, length
+
+PICTURE_SIDE = 960  # pixels
+QUALITY = 85
+
+Chapter = dict[str, Any]
+
+
+def surfaces_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
+    """The surface model and the orthophoto; None where none was made.
+
+    Args:
+        holdings: What there is.
+        drawn: With pictures.
+    """
+    dsm, ortho = holdings.summary("dsm"), holdings.summary("ortho")
+    if not dsm.get("cells"):
+        return None
+    facts = [
+        ("cell of the surface model", length(dsm["cell_m"])),
+        ("area with heights", f"{count(round(dsm['area_m2']))} m²"),
+        ("expected deviation of a height", f"{length(dsm['expected_deviation_m'])}, the middle one"),
+        ("ground sample distance of the photos", length(dsm["gsd_m"])),
+        ("heights", str(dsm["heights"])),
+        ("CRS", str(dsm["crs"])),
+    ]
+    if ortho.get("pixels"):
+        facts.insert(0, ("pixel of the orthophoto", length(ortho["pixel_m"])))
+        facts.append(("exposures levelled over", f"{ortho['exposures_stops']:.1f} stops"))
+    return {"facts": facts, "pictures": _pictures(holdings) if drawn else []}
+
+
+def _pictures(holdings: Holdings) -> list[dict[str, Any]]:
+    from splatpipe.pipeline.app.report.pictures import jpeg
+    from splatpipe.pipeline.surface.pictures import ortho_picture, relief_picture
+
+    found = []
+    path = _file(holdings, "ortho.files", "ortho.tif")
+    if path is not None:
+        pixels = ortho_picture(path, PICTURE_SIDE)
+        found.append(("orthophoto", "ortho.tif: true, so walls do not lean; white where nobody saw enough", pixels))
+    path = _file(holdings, "dsm.files", "dsm.tif")
+    relief = None if path is None else relief_picture(path, PICTURE_SIDE)
+    if relief is not None:
+        told = f"dsm.tif: from {relief.low:.1f} (violet) to {relief.high:.1f} (yellow), lit from the north-west"
+        found.append(("surface model", told, relief.pixels))
+    return [
+        {"name": name, "text": text, "source": jpeg(pixels[..., ::-1].copy(), QUALITY)}
+        | {"width": pixels.shape[1], "height": pixels.shape[0]}
+        for name, text, pixels in found
+    ]
+
+
+def _file(holdings: Holdings, part: str, name: str) -> Path | None:
+    folder = holdings.part(part)
+    return folder / name if folder is not None and (folder / name).is_file() else None

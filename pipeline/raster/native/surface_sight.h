@@ -1,0 +1,38 @@
+// What a photo says about places: whether it sees them, and what it costs to colour them by it.
+#pragma once
+
+#include <cstdint>
+
+#include "isa.h"
+#include "surface.h"
+
+namespace splat {
+
+// Places in the world; NaN is nowhere.
+struct Places {
+    std::int64_t count;
+    const double *east, *north, *up;
+};
+
+// Bits of what a photo says about a place.
+constexpr std::uint8_t kSeen = 1;     // it sees the place
+constexpr std::uint8_t kThrough = 2;  // it sees something behind it
+constexpr std::uint8_t kMixed = 4;    // it sees it, but a nearer surface lies in the next pixel
+constexpr std::uint8_t kUnknown = 8;  // it looks there, but has no depth: it may see it
+
+constexpr std::uint16_t kHidden = 4000;  // cost of a photo that does not see a place; and no cost is higher
+
+struct SightKernels {
+    // What the depths say; differences of up to `least` metres are none. `sines` are of the rays' angles against the
+    // surface; null: against the ground.
+    void (*look)(const DepthPicture& picture, const Places& places, const double* sines, double least,
+                 std::uint8_t* said);
+    // What it costs to colour cells by a photo of which `said` is said, and whether it sees them (0 or 1); returns how
+    // many it sees.
+    std::int64_t (*rate)(const SurfaceCamera& camera, const Places& places, double cell, const std::uint8_t* said,
+                         std::uint16_t* cost, std::uint8_t* seen);
+};
+
+}  // namespace splat
+
+SPLAT_DECLARE_KERNELS(SightKernels, sight_kernels)

@@ -1,0 +1,99 @@
+// Compiled once per ISA: internal linkage, no std templates.
+#include "surface_project.h"
+
+namespace splat {
+namespace SPLAT_ISA_NAMESPACE {
+namespace {
+
+constexpr double kTolerancePixels =
+    3.0;                            // depths so many pixels' widths apart, at a right angle to the surface, are one
+constexpr double kLeaning = 1.0;    // cost of a ray along the ground, against one straight down
+constexpr double kCoarse = 0.5;     // cost of a photo half as fine as the cells,
+constexpr double kCoarsest = 4.0;   // and at most of so many times as much
+constexpr double kRim = 0.06;       // of a photo's width: nearer to its edge it costs more, for lenses are worst there,
+constexpr double kRimCost = 0.5;    // up to so much
+constexpr double kMixedCost = 0.6;  // colours may be mixed there
+constexpr double kUnknownCost = 0.3;  // it colours others beside it none the less
+constexpr double kCostUnit = 1000.0;  // costs are whole numbers of its parts
+
+SPLAT_INLINE double greater(double a, double b) { return a > b ? a : b; }
+SPLAT_INLINE double smaller(double a, double b) { return a < b ? a : b; }
+SPLAT_INLINE double focal(const SurfaceCamera& camera) { return greater(camera.fx, camera.fy); }
+
+// The least of a pixel's depth and those around it; 0 where one of them has none. A point at an edge lies in a pixel
+// that may show what is behind: only where all pixels around do, too, is it in the way of the photo's rays.
+SPLAT_INLINE float least_around(const DepthPicture& picture, int row, int column) {
+    const int width = picture.camera.width, height = picture.camera.height;
+    const int left = column > 0 ? column - 1 : 0, right = column + 1 < width ? column + 1 : column;
+    const int top = row > 0 ? row - 1 : 0, bottom = row + 1 < height ? row + 1 : row;
+    float least = picture.depth[static_cast<int64_t>(row) * width + column];
+    for (int y = top; y <= bottom; ++y) {
+        const float* depths = picture.depth + static_cast<int64_t>(y) * width;
+        for (int x = left; x <= right; ++x) least = depths[x] < least ? depths[x] : least;
+    }
+    return least;
+}
+
+SPLAT_INLINE uint8_t said_of(const DepthPicture& picture, double y, double x, double depth, double limit) {
+    const int row = static_cast<int>(y), column = static_cast<int>(x);
+    const float near = picture.depth[static_cast<int64_t>(row) * picture.camera.width + column];
+    if (!(near > 0.0f)) return kUnknown;
+    const double behind = static_cast<double>(near) - depth;
+    if (behind < -limit) return 0;
+    const float least = least_around(picture, row, column);
+    const double least_behind = static_cast<double>(least) - depth;
+    if (behind <= limit) return static_cast<uint8_t>(kSeen | (least > 0.0f && least_behind < -limit ? kMixed : 0));
+    return least > 0.0f && least_behind > limit ? kThrough : 0;
+}
+
+void look(const DepthPicture& picture, const Places& places, const double* sines, double least_m, uint8_t* said) {
+    const SurfaceCamera& camera = picture.camera;
+    const double pixel = kTolerancePixels / focal(camera);
+    InPhoto at;
+    double limits[kPlaces];
+    for (int64_t first = 0; first < places.count; first += kPlaces) {
+        project(camera, places, first, &at);
+        const double* flat = sines ? sines + first : at.sine;
+        for (int k = 0; k < at.count; ++k)
+            limits[k] = greater(pixel * at.depth[k] / greater(flat[k], kFlattest), least_m);
+        for (int k = 0; k < at.count; ++k)
+            said[first + k] = at.is_in[k] ? said_of(picture, at.row[k], at.column[k], at.depth[k], limits[k]) : 0;
+    }
+}
+
+int64_t rate(const SurfaceCamera& camera, const Places& places, double cell, const uint8_t* said, uint16_t* cost,
+             uint8_t* seen) {
+    const double per_rim = 1.0 / (kRim * camera.width), width = camera.width, height = camera.height;
+    const double per_cell = 1.0 / (focal(camera) * cell);
+    int64_t count = 0;
+    InPhoto at;
+    double totals[kPlaces];
+    for (int64_t first = 0; first < places.count; first += kPlaces) {
+        project(camera, places, first, &at);
+        for (int k = 0; k < at.count; ++k) {
+            const double sine = greater(at.sine[k], kFlattest), straight = smaller(sine, 1.0);
+            const double coarse = smaller(greater(at.depth[k] * per_cell / sine - 1.0, 0.0), kCoarsest);
+            const double edge =
+                smaller(smaller(at.column[k], width - at.column[k]), smaller(at.row[k], height - at.row[k]));
+            totals[k] = kLeaning * __builtin_sqrt(1.0 - straight * straight) + kCoarse * coarse +
+                        kRimCost * greater(1.0 - edge * per_rim, 0.0);
+        }
+        for (int k = 0; k < at.count; ++k) {
+            const uint8_t is = said[first + k];
+            const bool is_seen = at.is_in[k] && (is & kSeen);
+            seen[first + k] = is_seen, cost[first + k] = kHidden, count += is_seen;
+            if (!at.is_in[k] || !(is & (kSeen | kUnknown))) continue;
+            const double whole =
+                kCostUnit * (totals[k] + (is & kMixed ? kMixedCost : 0.0) + (is & kUnknown ? kUnknownCost : 0.0)) + 0.5;
+            cost[first + k] = static_cast<uint16_t>(static_cast<int>(smaller(whole, kHidden)));
+        }
+    }
+    return count;
+}
+
+}  // namespace
+
+extern const SightKernels sight_kernels = {look, rate};
+
+}  // namespace SPLAT_ISA_NAMESPACE
+}  // namespace splat

@@ -1,0 +1,128 @@
+"""Which blocks of voxels a surface lies in, so that no others are held; and voxels so large that memory suffices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.surface.depth_points import place_of
+from splatpipe.pipeline.surface.photo_set import PhotoSet
+from splatpipe.pipeline.surface.sources import DepthMap
+
+SIDE = 8  # voxels of a block: a surface fills smaller blocks better than open3d's usual 16
+BAND = 3.0  # voxels on either side of a surface that know how far off it is
+LEAST_PHOTOS = 3  # that have to see a surface in a block
+LEAST_CONFIDENCE = 2  # other photos that confirm a depth
+EVERY = 3  # pixels, of which one is looked at: blocks are wider
+LEAST_GROWTH = 1.05  # of voxels that were too small
+BITS = 21  # of a block's number along an axis: two million
+
+Keys = Int64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """What part of the world a mesh is made of.
+
+    Attributes:
+        low: Least east, north, up, metres.
+        high: Most.
+    """
+
+    low: Float64[np.ndarray, " 3"]
+    high: Float64[np.ndarray, " 3"]
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.low, self.high]).all() and (self.low < self.high).all()):
+            raise ValueError(f"a box from {self.low} to {self.high}")
+
+
+def depths_in(box: Box, found: DepthMap) -> Float32[np.ndarray, "h w"]:
+    """Depths of a photo that others confirm and that lie in a box; 0 elsewhere."""
+    sure = (found.confidence >= LEAST_CONFIDENCE) & (found.depth > 0.0)
+    row, column = np.nonzero(sure)
+    xyz = _places(found, row, column)
+    inside = ((xyz >= box.low[:, None]) & (xyz < box.high[:, None])).all(axis=0)
+    depth = np.zeros_like(found.depth)
+    depth[row[inside], column[inside]] = found.depth[row[inside], column[inside]]
+    return depth
+
+
+def _places(found: DepthMap, row: np.ndarray, column: np.ndarray) -> Float64[np.ndarray, "3 n"]:
+    return place_of(found.camera, row, column, 1.0 / found.depth[row, column].astype(np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Cubes of voxels near a surface.
+
+    Attributes:
+        low: East, north, up that they are counted from, metres.
+        voxel_m: Side of a voxel.
+        places: Of the blocks, in blocks from there: (3, n).
+    """
+
+    low: Float64[np.ndarray, " 3"]
+    voxel_m: float
+    places: Int64[np.ndarray, "3 n"]
+
+    def centres(self) -> Float64[np.ndarray, "3 n"]:
+        """East, north, up of their middles."""
+        return np.asarray(self.low[:, None] + (self.places + 0.5) * (SIDE * self.voxel_m))
+
+
+def surface_blocks(photos: PhotoSet, box: Box, voxel_m: float, most: int, threads: int) -> Blocks:
+    """Blocks that enough photos see a surface in, the same for any number of threads.
+
+    Args:
+        photos: With their depths.
+        box: What of the world counts.
+        voxel_m: Side of a voxel; they are larger where there would be too many blocks.
+        most: Blocks at most.
+        threads: Photos at a time.
+    """
+    while True:
+        keys, seen = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        look = partial(_seen_keys, photos, box, voxel_m)
+        for found in ordered_map(look, photos.with_depths(), threads):
+            every = np.concatenate([keys, found])
+            count = np.concatenate([seen, np.ones(len(found), np.int64)])
+            keys, place = np.unique(every, return_inverse=True)
+            seen = np.bincount(place, count, len(keys)).astype(np.int64)
+        kept = keys[seen >= LEAST_PHOTOS]
+        if len(kept) <= most:
+            return Blocks(box.low, voxel_m, blocks_of(kept))
+        voxel_m *= max(LEAST_GROWTH, float(np.sqrt(len(kept) / most)))  # blocks of a surface go with its area
+
+
+def _seen_keys(photos: PhotoSet, box: Box, voxel_m: float, number: int) -> Keys:
+    return seen_blocks(box, voxel_m, photos.depth_map(number))
+
+
+def seen_blocks(box: Box, voxel_m: float, found: DepthMap) -> Keys:
+    """Keys of the blocks in which a photo sees a surface, or the band around it, in order."""
+    depth = depths_in(box, found)
+    row, column = np.nonzero(depth[::EVERY, ::EVERY])
+    xyz = (_places(found, row * EVERY, column * EVERY) - box.low[:, None]) / voxel_m
+    corners = [
+        keys_of(np.floor((xyz + BAND * np.array(signs)[:, None]) / SIDE).astype(np.int64))
+        for signs in product((-1.0, 1.0), repeat=3)
+    ]
+    return np.asarray(np.unique(np.concatenate(corners)))
+
+
+def keys_of(blocks: Int64[np.ndarray, "3 n"]) -> Keys:
+    """A whole number for each block."""
+    x, y, z = blocks + (1 << (BITS - 1))
+    return np.asarray((x << (2 * BITS)) | (y << BITS) | z)
+
+
+def blocks_of(keys: Keys) -> Int64[np.ndarray, "3 n"]:
+    """What ``keys_of`` undoes."""
+    mask = (1 << BITS) - 1
+    return np.stack([keys >> (2 * BITS), (keys >> BITS) & mask, keys & mask]) - (1 << (BITS - 1))

@@ -1,0 +1,128 @@
+"""The dense cloud of a capture as a file, `cloud.laz`: tile by tile of the plan fused, thinned, coloured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.fusion import FusedPoints, finest_of_cubes, fused, joined
+from splatpipe.pipeline.surface.grid import make_grid
+from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.photo_set import PhotoSet
+from splatpipe.pipeline.surface.point_cloud import UNDATED, CloudChunk, write_cloud
+from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
+from splatpipe.pipeline.surface.site import Site
+from splatpipe.pipeline.surface.sources import Relief
+from splatpipe.pipeline.surface.tiles import Tile, tiled
+from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.survey.frames import Frame
+
+SIDE = 2048  # cells of a part of the plan, in which each photo is read once: some 6 million points, 0.4 GB
+TILE = 256  # cells of a tile, in which depths are compared
+MARGIN = 3  # cells around a tile from which points may move into it
+
+
+@dataclass(frozen=True, eq=False)
+class CloudTask:
+    """What a cloud is made from.
+
+    Attributes:
+        frame: The run's.
+        site: What its photos show.
+        photos: Local metres, with their depths.
+        area: Nothing outside of it is shown; None for all.
+        spacing_m: A cube of that side holds one point at most; the photos' GSD.
+        threads: Tiles or photos at a time.
+    """
+
+    frame: Frame
+    site: Site
+    photos: Sequence[PhotoSource]
+    area: PlanArea | None
+    spacing_m: float
+    threads: int
+
+
+def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
+    """Write the cloud; a killed one goes on from the last finished part of the plan.
+
+    Args:
+        task: What it is made from.
+        work: Folder of what is kept meanwhile.
+        out: Where the file goes.
+        report: Told of progress.
+
+    Returns:
+        Figures for people: points, their spacing.
+
+    Raises:
+        SplatpipeError: if the site is absurdly large.
+        ValueError: if depths or pixels do not fit their camera.
+        MachineError: if the disk is full.
+    """
+    grid = make_grid(task.frame, task.site.box, task.spacing_m)
+    lattice, relief = _lattice(task), Relief(task.site.low_m, task.site.high_m)
+    work.mkdir(exist_ok=True)
+    parts = [part for part in tiled(lattice.height, lattice.width, SIDE) if _tiles(task, lattice, part)]
+    photos = None
+    for done, part in enumerate(parts):
+        path = work / f"{done:06d}.npz"
+        if not path.is_file():
+            photos = photos or photo_set(task.photos, task.spacing_m, task.threads)
+            chunk = _part(task, photos, (lattice, relief), part)
+            with whole_file(path) as aside, aside.open("wb") as file:
+                np.savez(file, **vars(chunk))
+        report.progress(done + 1, len(parts), "dense cloud", "parts")
+    count = write_cloud(out / "cloud.laz", _kept(work, len(parts)), grid, UNDATED)
+    return {"points": count, "spacing_m": task.spacing_m, "crs": grid.crs.horizontal.name}
+
+
+def _lattice(task: CloudTask) -> Lattice:
+    (west, south, _), (east, north, _) = task.site.box
+    columns, rows = (max(1, int(np.ceil(size / task.spacing_m))) for size in (east - west, north - south))
+    return Lattice(float(west), float(north), task.spacing_m, columns, rows)
+
+
+def _tiles(task: CloudTask, lattice: Lattice, part: Tile) -> list[Tile]:
+    """Tiles of a part in which the site is."""
+    found = []
+    for tile in tiled(part.height, part.width, TILE):
+        moved = Tile(part.row + tile.row, part.column + tile.column, tile.height, tile.width)
+        corners = lattice.centres(moved)[[0, -1], [0, -1]]
+        if task.site.sees(np.stack([corners.min(axis=0), corners.max(axis=0)])):
+            found.append(moved)
+    return found
+
+
+def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, Relief], part: Tile) -> CloudChunk:
+    """The cloud of a part of the plan."""
+    tiles = _tiles(task, space[0], part)
+    points = joined(list(ordered_map(partial(tile_cloud, photos, *space), tiles, task.threads)))
+    if task.area is not None:
+        points = points.select(task.area.contains(points.pieces.xyz.T))
+    colours, known = point_colours(photos, points.pieces, task.spacing_m, task.threads)
+    points = points.select(known)  # one that moved to where no photo sees it is none
+    positions, normals = (np.ascontiguousarray(each.T) for each in (points.pieces.xyz, points.pieces.normal))
+    return CloudChunk(positions, colours[known], normals.astype(np.float32), points.confidence)
+
+
+def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: Relief, tile: Tile) -> FusedPoints:
+    """The points of one tile, by cell and height: one for each cube of a cell's side at most."""
+    wide = tile.grown(MARGIN)
+    points = fused(photos.parts_in(lattice, wide, relief), lattice, wide, relief)
+    return points.select(finest_of_cubes(points.pieces.xyz, points.footprint, lattice, tile))
+
+
+def _kept(work: Path, count: int) -> Iterator[CloudChunk]:
+    for number in range(count):
+        with np.load(work / f"{number:06d}.npz", allow_pickle=False) as kept:
+            yield CloudChunk(**kept)

@@ -1,0 +1,175 @@
+"""A drawing in metres at true size: lines, texts, a picture, a scale bar; what DXF and SVG are written from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+PAPER_MM = (380.0, 240.0)  # of an A3 sheet, what a drawing may fill
+SCALES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000)  # of plans, as offices use them
+BAR_MM = 60.0  # of a scale bar on paper, at most
+BAR_LENGTHS_M = tuple(base * 10.0**power for power in range(-1, 5) for base in (1.0, 2.0, 5.0))
+BAR_PARTS = 4
+TEXT_MM, TITLE_MM = 2.5, 5.0  # ISO 3098's heights of letters
+GAP_MM = 6.0  # between what is drawn and what is written about it
+
+EXTENT, OUTLINE, OPENINGS, PROJECTIONS, SURFACE, POINTS, GRID, TEXTS, PICTURE = (
+    "EXTENT",
+    "OUTLINE",
+    "OPENINGS",
+    "PROJECTIONS",
+    "SURFACE",
+    "POINTS",
+    "GRID",
+    "TEXT",
+    "PICTURE",
+)
+Line2 = Float64[np.ndarray, "_ 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Stroke:
+    """A polyline.
+
+    Attributes:
+        layer: Of the constants.
+        line: Metres to the right and up.
+        closed: Whether its end meets its start.
+        filled: Whether what it encloses is filled: of four corners.
+    """
+
+    layer: str
+    line: Line2
+    closed: bool = False
+    filled: bool = False
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text.
+
+    Attributes:
+        text: One line.
+        right_m: Where it stands.
+        up_m: Of its baseline.
+        size_mm: Of its letters on paper.
+        anchor: Which part of it stands there: ``start``, ``middle`` or ``end``.
+    """
+
+    text: str
+    right_m: float
+    up_m: float
+    size_mm: float = TEXT_MM
+    anchor: str = "start"
+
+
+@dataclass(frozen=True)
+class Dots:
+    """Points of one layer.
+
+    Attributes:
+        layer: Of the constants.
+        places: Metres to the right and up.
+    """
+
+    layer: str
+    places: Line2
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A picture at true size.
+
+    Attributes:
+        file: Its name, beside the drawing.
+        left_m: Of its lower left corner.
+        bottom_m: Likewise.
+        width_m: Of the whole.
+        height_m: Of the whole.
+        pixels: Width and height.
+    """
+
+    file: str
+    left_m: float
+    bottom_m: float
+    width_m: float
+    height_m: float
+    pixels: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What is drawn, in metres at true size.
+
+    Attributes:
+        scale: It is to be plotted at 1 to so many.
+        strokes: In the order in which they lie on each other.
+        labels: Texts.
+        picture: Below all; None without one.
+        dots: Points.
+    """
+
+    scale: int
+    strokes: Sequence[Stroke]
+    labels: Sequence[Label]
+    picture: Placed | None = None
+    dots: Dots | None = None
+
+    def box(self) -> tuple[Line2, Line2]:
+        """Lower left and upper right of all lines and the picture; texts reach a little beyond."""
+        parts = [stroke.line for stroke in self.strokes]
+        if self.picture is not None:
+            left, bottom = self.picture.left_m, self.picture.bottom_m
+            parts.append(rectangle(left, bottom, left + self.picture.width_m, bottom + self.picture.height_m))
+        every = np.concatenate(parts)
+        return every.min(axis=0), every.max(axis=0)
+
+
+def plot_scale(width_m: float, height_m: float) -> int:
+    """The largest usual scale at which something goes onto an A3 sheet; the smallest where none does."""
+    for scale in SCALES:
+        if width_m * 1000.0 / scale <= PAPER_MM[0] and height_m * 1000.0 / scale <= PAPER_MM[1]:
+            return scale
+    return SCALES[-1]
+
+
+def rectangle(left_m: float, bottom_m: float, right_m: float, top_m: float) -> Line2:
+    """Its corners, to be closed."""
+    return np.array([[left_m, bottom_m], [right_m, bottom_m], [right_m, top_m], [left_m, top_m]])
+
+
+def caption(title: str, about: Sequence[str], left_m: float, bottom_m: float, scale: int) -> list[Label]:
+    """A title and lines about it, below a drawing whose lower left corner is told."""
+    mm = scale / 1000.0
+    labels = [Label(title, left_m, bottom_m - (GAP_MM + TITLE_MM) * mm, TITLE_MM)]
+    for number, text in enumerate(about, 1):
+        labels.append(Label(text, left_m, bottom_m - (GAP_MM + TITLE_MM + 2.0 * TEXT_MM * number) * mm))
+    return labels
+
+
+def scale_bar(right_m: float, bottom_m: float, scale: int) -> tuple[list[Stroke], list[Label]]:
+    """A bar that ends at the right below a drawing, its parts filled in turn, with lengths.
+
+    Args:
+        right_m: Of the drawing's lower right corner.
+        bottom_m: Likewise.
+        scale: Of the plot.
+    """
+    mm = scale / 1000.0
+    length = max((metres for metres in BAR_LENGTHS_M if metres <= BAR_MM * mm), default=BAR_LENGTHS_M[0])
+    left, top = right_m - length, bottom_m - GAP_MM * mm
+    bottom = top - TEXT_MM / 2.0 * mm
+    edges = left + np.arange(BAR_PARTS + 1) * (length / BAR_PARTS)
+    strokes = [
+        Stroke(TEXTS, rectangle(a, bottom, b, top), closed=True, filled=number % 2 == 0)
+        for number, (a, b) in enumerate(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    ]
+    below = bottom - 2.0 * TEXT_MM * mm
+    labels = [
+        Label(text, at, below, anchor="middle")
+        for text, at in (("0", left), (f"{length / 2.0:g}", left + length / 2.0), (f"{length:g} m", right_m))
+    ]
+    return strokes, labels

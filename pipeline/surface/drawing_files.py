@@ -1,0 +1,197 @@
+"""Drawings as DXF, for CAD, and as SVG, for everybody.
+
+DXF is of AutoCAD 2000 in metres at true size, a picture attached as a reference to the file beside it. SVG is of the
+paper's size, in millimetres, with the picture inside: programs that show an SVG as a picture load nothing from beside
+it.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from ezdxf._options import options
+from ezdxf.document import Drawing as DxfDocument
+from ezdxf.enums import TextEntityAlignment
+from ezdxf.filemanagement import new as new_drawing
+from jaxtyping import UInt8
+from PIL import Image
+
+from splatpipe.pipeline.surface.drawing import (
+    EXTENT,
+    GRID,
+    OPENINGS,
+    OUTLINE,
+    PICTURE,
+    POINTS,
+    PROJECTIONS,
+    SURFACE,
+    TEXTS,
+    Drawing,
+    Stroke,
+)
+from splatpipe.pipeline.surface.whole_file import whole_file
+
+DXF_VERSION = "R2000"  # the oldest with a drawing's unit and pictures, and so read by the most programs
+METRES = 6  # of $INSUNITS
+DIGITS = 4  # of coordinates in metres: a tenth of a millimetre
+MARGIN_MM = 10.0  # around an SVG, and room for texts that reach beyond lines
+MOST_EMBEDDED = 4096  # pixels a side of a picture in an SVG; larger ones are made smaller
+JPEG_QUALITY = 92
+# AutoCAD's colour, hundredths of a millimetre, and the SVG's colour of each layer.
+LAYERS = {
+    PICTURE: (7, 0, "none"),
+    GRID: (8, 9, "#b0b0b0"),
+    EXTENT: (8, 13, "#808080"),
+    OUTLINE: (7, 35, "#000000"),
+    OPENINGS: (5, 25, "#0040c0"),
+    PROJECTIONS: (30, 25, "#c06000"),
+    POINTS: (5, 0, "#3060d0"),
+    SURFACE: (7, 35, "#000000"),
+    TEXTS: (7, 18, "#000000"),
+}
+ANCHORS = {
+    "start": TextEntityAlignment.LEFT,
+    "middle": TextEntityAlignment.CENTER,
+    "end": TextEntityAlignment.RIGHT,
+}
+
+
+def write_dxf_drawing(path: Path, drawing: Drawing) -> None:
+    """Write a drawing as DXF; its picture is to lie beside it.
+
+    Raises:
+        OSError: if the disk is full or not writable.
+    """
+    mm = drawing.scale / 1000.0
+    with the_same_bytes():
+        document = new_drawing(DXF_VERSION, units=METRES)
+        document.header["$MEASUREMENT"] = 1
+        for name in sorted(_layers_of(drawing)):
+            colour, weight, _ = LAYERS[name]
+            document.layers.add(name, color=colour, lineweight=weight)
+        model = document.modelspace()
+        _attach_picture(document, drawing)
+        for stroke in drawing.strokes:
+            line = np.round(stroke.line, DIGITS).tolist()
+            model.add_lwpolyline(line, close=stroke.closed, dxfattribs={"layer": stroke.layer})
+            if stroke.filled:
+                a, b, c, d = line
+                model.add_solid([a, b, d, c], dxfattribs={"layer": stroke.layer})
+        if drawing.dots is not None:
+            for place in np.round(drawing.dots.places, DIGITS).tolist():
+                model.add_point(place, dxfattribs={"layer": drawing.dots.layer})
+        for label in drawing.labels:
+            text = model.add_text(label.text, height=label.size_mm * mm, dxfattribs={"layer": TEXTS})
+            text.set_placement((label.right_m, label.up_m), align=ANCHORS[label.anchor])
+        low, high = drawing.box()
+        model.reset_extents((*low.tolist(), 0.0), (*high.tolist(), 0.0))
+        with whole_file(path) as aside:
+            document.saveas(aside)
+
+
+def _layers_of(drawing: Drawing) -> set[str]:
+    dots = set() if drawing.dots is None else {drawing.dots.layer}
+    picture = set() if drawing.picture is None else {PICTURE}
+    return {stroke.layer for stroke in drawing.strokes} | dots | picture | {TEXTS}
+
+
+def _attach_picture(document: DxfDocument, drawing: Drawing) -> None:
+    placed = drawing.picture
+    if placed is None:
+        return
+    definition = document.add_image_def(placed.file, placed.pixels)
+    image = document.modelspace().add_image(
+        definition,
+        insert=(placed.left_m, placed.bottom_m),
+        size_in_units=(placed.width_m, placed.height_m),
+        dxfattribs={"layer": PICTURE},
+    )
+    image.transparency = 0.0
+    document.set_raster_variables(frame=0, quality=1, units="m")
+
+
+@contextmanager
+def the_same_bytes() -> Iterator[None]:
+    """Let ezdxf write no date and no random number: its own means to that end."""
+    before = options.write_fixed_meta_data_for_testing
+    options.write_fixed_meta_data_for_testing = True
+    try:
+        yield
+    finally:
+        options.write_fixed_meta_data_for_testing = before
+
+
+def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "h w 4"] | None, title: str) -> None:
+    """Write a drawing as SVG, in millimetres of paper.
+
+    Args:
+        path: Where.
+        drawing: What.
+        colours: The picture that it places; None without one.
+        title: For readers of the file.
+
+    Raises:
+        OSError: if the disk is full or not writable.
+    """
+    mm = drawing.scale / 1000.0
+    low, high = drawing.box()
+    bottom = min(low[1], *(label.up_m - label.size_mm * mm for label in drawing.labels))
+    top = max(high[1], *(label.up_m + label.size_mm * mm for label in drawing.labels))
+    corner = np.array([low[0] - MARGIN_MM * mm, top + MARGIN_MM * mm])
+    width = (high[0] - low[0]) / mm + 2.0 * MARGIN_MM
+    height = (top - bottom) / mm + 2.0 * MARGIN_MM
+
+    def paper(places: np.ndarray) -> np.ndarray:
+        return np.asarray((places - corner) * [1.0, -1.0] / mm)
+
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.2f}mm" height="{height:.2f}mm"'
+        f' viewBox="0 0 {width:.2f} {height:.2f}">',
+        f"<title>{escape(title)}</title>",
+        '<rect width="100%" height="100%" fill="#ffffff"/>',
+    ]
+    placed = drawing.picture
+    if placed is not None and colours is not None:
+        x, y = paper(np.array([placed.left_m, placed.bottom_m + placed.height_m]))
+        parts.append(
+            f'<image x="{x:.3f}" y="{y:.3f}" width="{placed.width_m / mm:.3f}" height="{placed.height_m / mm:.3f}"'
+            f' preserveAspectRatio="none" href="{_embedded(colours)}"/>'
+        )
+    if drawing.dots is not None:
+        paths = "".join(f"M{x:.2f} {y:.2f}h0" for x, y in paper(drawing.dots.places).tolist())
+        colour = LAYERS[drawing.dots.layer][2]
+        parts.append(f'<path d="{paths}" stroke="{colour}" stroke-width="0.4" stroke-linecap="round"/>')
+    parts += [_svg_path(stroke, paper(stroke.line)) for stroke in drawing.strokes]
+    for label in drawing.labels:
+        x, y = paper(np.array([label.right_m, label.up_m]))
+        parts.append(
+            f'<text x="{x:.2f}" y="{y:.2f}" font-family="sans-serif" font-size="{label.size_mm * 1.4:.2f}"'
+            f' text-anchor="{label.anchor}">{escape(label.text)}</text>'
+        )
+    with whole_file(path) as aside:
+        aside.write_text("\n".join([*parts, "</svg>\n"]), encoding="utf-8")
+
+
+def _svg_path(stroke: Stroke, line: np.ndarray) -> str:
+    _, weight, colour = LAYERS[stroke.layer]
+    points = "L".join(f"{x:.3f} {y:.3f}" for x, y in line.tolist())
+    fill = colour if stroke.filled else "none"
+    end = "Z" if stroke.closed else ""
+    return f'<path d="M{points}{end}" fill="{fill}" stroke="{colour}" stroke-width="{weight / 100.0}"/>'
+
+
+def _embedded(colours: UInt8[np.ndarray, "h w 4"]) -> str:
+    """A picture as a data URL: JPEG on white, which is a fifth of a PNG."""
+    picture = Image.fromarray(colours)
+    white = Image.new("RGBA", picture.size, (255, 255, 255, 255))
+    flat = Image.alpha_composite(white, picture).convert("RGB")
+    flat.thumbnail((MOST_EMBEDDED, MOST_EMBEDDED))
+    kept = io.BytesIO()
+    flat.save(kept, "JPEG", quality=JPEG_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(kept.getvalue()).decode("ascii")

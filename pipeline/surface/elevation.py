@@ -1,0 +1,150 @@
+"""Elevations of walls: what is seen of a wall by parallel rays, and how far each place lies before or behind its plane.
+
+A wall is a sheet that stands. The surface model over it, with the nearest to the viewer as the topmost, tells the
+depths, the orthophoto the colours. What hangs before the wall beyond the relief is left out, and never smeared over it:
+a place that is hidden from photos by it is coloured by those that see past it, or by none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.surface.height_field import HeightField
+from splatpipe.pipeline.surface.heights import TILE as HEIGHTS_TILE
+from splatpipe.pipeline.surface.heights import Capture, surface_heights
+from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.sheet import Sheet
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf
+from splatpipe.pipeline.surface.walls import Wall
+
+BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sills and cornices; balconies do not
+MOST_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
+SHELF_BYTES = 256 << 20  # of photos, and as many of depths
+
+Progress = Callable[[float, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Elevation:
+    """A wall seen from before it; its rasters lie on the sheet's lattice.
+
+    Attributes:
+        wall: Which.
+        sheet: Its frame: x from the wall's left end, y up as heights of the local frame, z towards the viewer, metres.
+        depth: Metres before the plane, nan where not known.
+        sigma: Expected deviation of each, metres.
+        photos: How many photos agree on each depth.
+        colour: Red, green, blue, alpha: 0 where there is no colour.
+    """
+
+    wall: Wall
+    sheet: Sheet
+    depth: Float32[np.ndarray, "h w"]
+    sigma: Float32[np.ndarray, "h w"]
+    photos: UInt8[np.ndarray, "h w"]
+    colour: UInt8[np.ndarray, "h w 4"]
+
+    def corners(self) -> Float64[np.ndarray, "4 3"]:
+        """Upper left, upper right, lower right, lower left of the raster, in the plane; local metres."""
+        lattice = self.sheet.lattice
+        left, top = lattice.east_m, lattice.north_m
+        right, bottom = left + lattice.width * lattice.cell_m, top - lattice.height * lattice.cell_m
+        return self.sheet.local(np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]]))
+
+
+def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
+    """The sheet of a wall: whole cells from end to end and from top to foot, what they are too long by on both sides.
+
+    Args:
+        wall: Which.
+        cell_m: Side of a cell.
+
+    Raises:
+        SplatpipeError: if there would be too many cells.
+    """
+    width = max(1, math.ceil(wall.length_m / cell_m))
+    height = max(1, math.ceil((wall.high_m - wall.low_m) / cell_m))
+    if width * height > MOST_CELLS:
+        raise SplatpipeError(
+            f"The façade {wall.name} of {width:,} × {height:,} pixels of {cell_m:g} m is too large.",
+            "Choose larger ones with --gsd.",
+        )
+    from_local = np.eye(4)
+    from_local[:3, :3] = [[*wall.along, 0.0], [0.0, 0.0, 1.0], [*wall.facing, 0.0]]
+    from_local[:3, 3] = [-wall.along @ wall.left, 0.0, -wall.facing @ wall.left]
+    over = width * cell_m - wall.length_m, height * cell_m - (wall.high_m - wall.low_m)
+    lattice = Lattice(-over[0] / 2.0, wall.high_m + over[1] / 2.0, cell_m, width, height)
+    return Sheet(from_local, lattice, Relief(-BEHIND_M, BEFORE_M))
+
+
+@dataclass(frozen=True, eq=False)
+class Photos:
+    """What elevations are drawn from.
+
+    Attributes:
+        sources: The photos with their depths, local metres, always in the same order.
+        gains: By how much each photo's light is multiplied, a channel each.
+        threads: Tiles at a time.
+    """
+
+    sources: Sequence[PhotoSource]
+    gains: Float64[np.ndarray, "n 3"]
+    threads: int
+
+
+def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress) -> Elevation:
+    """Draw a wall; the same bits for any number of threads.
+
+    Args:
+        wall: Which.
+        cell_m: Side of a pixel.
+        photos: All of them; those behind the wall are not asked.
+        progress: Told how many tiles are done, of how many.
+
+    Raises:
+        SplatpipeError: as ``wall_sheet``.
+    """
+    sheet = wall_sheet(wall, cell_m)
+    depths_tiles, colour_tiles = (list(sheet.lattice.tiles(side)) for side in (HEIGHTS_TILE, TILE))
+    total = len(depths_tiles) + len(colour_tiles)
+    sources, gains = _before(sheet, photos)
+    shape = sheet.lattice.height, sheet.lattice.width
+    depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
+    agreeing, colour = np.zeros(shape, np.uint8), np.zeros((*shape, 4), np.uint8)
+    shelf: Shelf[DepthMap] = Shelf(SHELF_BYTES)
+    known = [source.depths for source in sources if source.depths is not None]
+    capture = Capture(known, sheet.lattice, sheet.relief, shelf)
+    for done, part in enumerate(surface_heights(capture, depths_tiles, photos.threads), 1):
+        cut = part.tile.slices
+        depth[cut], sigma[cut], agreeing[cut] = part.height, part.sigma, part.photos
+        progress(done, total)
+    surface = HeightField(sheet.lattice, depth)
+    album = Album(sources, surface, sheet.lattice, sheet.relief, gains, Shelf(SHELF_BYTES), Shelf(SHELF_BYTES))
+    for done, drawn in enumerate(orthophotos(album, colour_tiles, photos.threads), len(depths_tiles) + 1):
+        cut = drawn.tile.slices
+        colour[(*cut, slice(0, 3))] = drawn.colour
+        colour[(*cut, 3)] = np.where(drawn.known, np.uint8(255), np.uint8(0))
+        progress(done, total)
+    return Elevation(wall, sheet, depth, sigma, agreeing, colour)
+
+
+def _before(sheet: Sheet, photos: Photos) -> tuple[list[PhotoSource], Float64[np.ndarray, "n 3"]]:
+    """Photos that stand before a wall, in its sheet's frame, with their gains."""
+    rows = [
+        row for row, source in enumerate(photos.sources) if sheet.place(source.camera.centre())[2] > sheet.relief.high_m
+    ]
+    moved = [_moved(sheet, photos.sources[row]) for row in rows]
+    return moved, photos.gains[rows]
+
+
+def _moved(sheet: Sheet, source: PhotoSource) -> PhotoSource:
+    depths: DepthSource | None = None if source.depths is None else sheet.depths([source.depths])[0]
+    return replace(source, camera=sheet.moved(source.camera), depths=depths)

@@ -1,0 +1,140 @@
+"""The façades of a run: every wall that is found, or those that somebody states, drawn and written into a folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.drawing_files import write_dxf_drawing, write_svg_drawing
+from splatpipe.pipeline.surface.elevation import Elevation, Photos, draw_elevation
+from splatpipe.pipeline.surface.elevation_drawing import elevation_drawing
+from splatpipe.pipeline.surface.elevation_files import (
+    elevation_facts,
+    height_zero_m,
+    write_depth,
+    write_facades,
+    write_picture,
+)
+from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.facets import Facets, upright_facets
+from splatpipe.pipeline.surface.grid import DIGITS
+from splatpipe.pipeline.surface.map_crs import MapCrs
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.walls import Wall, find_walls, named, stated_wall
+from splatpipe.pipeline.surface.whole_file import whole_file
+
+LIST = "facades.json"
+ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
+PLACES = 4000  # that photos' exposures are compared at
+Line = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class FacadesTask:
+    """What façades are made from.
+
+    Attributes:
+        photos: With their depths, local metres, always in the same order.
+        area: Walls that stand outside of it are not drawn; None for all.
+        crs: Of corners and lines.
+        pixel_m: Side of a pixel of the elevations; what it becomes has three digits.
+        lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
+            found.
+        threads: Tiles at a time.
+    """
+
+    photos: Sequence[PhotoSource]
+    area: PlanArea | None
+    crs: MapCrs
+    pixel_m: float
+    lines: Sequence[Line]
+    threads: int
+
+
+def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[str, Any]]:
+    """Write the files of all façades, and `facades.json` at the end.
+
+    A façade whose own JSON is there is not drawn again: its other files were written before.
+
+    Args:
+        task: What they are made from.
+        out: Where the files go; what a killed call left there is gone on from.
+        report: Told how far it is.
+
+    Returns:
+        What `facades.json` tells of each.
+
+    Raises:
+        SplatpipeError: if nothing stands along a stated line, or a wall has too many pixels.
+        MachineError, OSError: if the disk is full or not writable.
+    """
+    report.progress(0, 1, "looking for walls")
+    pixel_m = float(f"{task.pixel_m:.{DIGITS}g}")
+    facets = upright_facets([photo.depths for photo in task.photos if photo.depths is not None], task.threads)
+    if task.area is not None:
+        facets = facets.select(task.area.contains(facets.places))
+    walls = stated_walls(task.lines, facets, task.crs) if task.lines else find_walls(facets, pixel_m)
+    if not walls:
+        report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
+    places = facets.places[:: max(1, len(facets) // PLACES)]
+    photos = Photos(task.photos, exposure_gains(task.photos, places, 2.0 * pixel_m, task.threads), task.threads)
+    facts = []
+    for number, wall in enumerate(walls):
+
+        def progress(done: float, total: float, number: int = number) -> None:
+            report.progress(number + done / total, len(walls), "façades", "façades")
+
+        own = out / f"{wall.name}.json"
+        if not own.is_file():
+            _write(out, draw_elevation(wall, pixel_m, photos, progress), task.crs)
+        facts.append(json.loads(own.read_text(encoding="utf-8")))
+    write_facades(out / LIST, facts, task.crs)
+    return facts
+
+
+def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wall]:
+    """Walls along lines in plan.
+
+    Args:
+        lines: The CRS's coordinates: left and right end, seen from before the wall.
+        facets: What stands there.
+        crs: The lines'.
+
+    Raises:
+        SplatpipeError: if nothing stands along one of them.
+    """
+    middle = np.median(facets.places, axis=0) if len(facets) else np.zeros(3)
+    height = float(crs.crs_from_local(middle[None])[0, 2])
+    walls = []
+    for x1, y1, x2, y2 in lines:
+        ends = crs.local_from_crs(np.array([[x1, y1, height], [x2, y2, height]]))[:, :2]
+        apart = float(np.linalg.norm(ends[1] - ends[0]))
+        wall = stated_wall(ends[0], ends[1], facets) if np.isfinite(ends).all() and apart > 0.0 else None
+        if wall is None:
+            raise SplatpipeError(
+                f"No wall that photos see stands along {x1:.10g},{y1:.10g},{x2:.10g},{y2:.10g}.",
+                "Name its left end first, as seen from before it, in the run's CRS.",
+            )
+        walls.append(wall)
+    return named(walls)
+
+
+def _write(folder: Path, elevation: Elevation, crs: MapCrs) -> None:
+    name, zero_m = elevation.wall.name, height_zero_m(elevation, crs)
+    files = {kind: name + ending for kind, ending in ENDINGS.items()}
+    drawing = elevation_drawing(elevation, crs, zero_m, files["picture"])
+    write_depth(folder / files["depth"], elevation, zero_m)
+    write_picture(folder / files["picture"], elevation)
+    write_dxf_drawing(folder / files["dxf"], drawing)
+    write_svg_drawing(folder / files["svg"], drawing, elevation.colour, f"Façade {name}")
+    with whole_file(folder / f"{name}.json") as aside:
+        aside.write_text(json_text(elevation_facts(elevation, crs, files)), encoding="utf-8")

@@ -1,0 +1,144 @@
+"""Upright facets: small planes of photos' depths that stand, from which walls are found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+
+BLOCKS_A_PHOTO = 20_000  # of pixels, that a plane is laid through each: 20 cm of a wall in photos of a GSD of 3 cm
+LEAST_BLOCK = 6  # pixels a side: a smaller one's slope is noise
+LEAST_CONFIRMED = 2  # other photos, of a pixel that counts
+LEAST_SHARE = 0.6  # of a block's pixels that count
+ROUGH_PX = 3.0  # pixels' widths that a block's depths may scatter by about its plane: more are two surfaces
+UPRIGHT = 0.35  # upward part of a normal, at most: 20°, three deviations of a small block's
+STRIP_PIXELS = 1 << 20  # fitted at a time: some 100 MB
+MOST_FACETS = 1_000_000  # of all photos; of more, some are left out evenly
+
+
+@dataclass(frozen=True)
+class Facets:
+    """Small upright planes.
+
+    Attributes:
+        places: Their middles, local metres.
+        facing: Unit vectors in plan that they face.
+        areas: Square metres.
+    """
+
+    places: Float64[np.ndarray, "n 3"]
+    facing: Float64[np.ndarray, "n 2"]
+    areas: Float64[np.ndarray, " n"]
+
+    def select(self, rows: Bool[np.ndarray, " n"] | Int64[np.ndarray, " k"]) -> Facets:
+        """Those of it."""
+        return Facets(self.places[rows], self.facing[rows], self.areas[rows])
+
+    def __len__(self) -> int:
+        return len(self.areas)
+
+
+def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
+    """Upright facets of all photos; the same bits for any number of threads.
+
+    Args:
+        sources: Depths of photos, always in the same order.
+        threads: Photos at a time.
+    """
+    share = max(1, math.ceil(len(sources) * BLOCKS_A_PHOTO / 4 / MOST_FACETS))  # a quarter stands, at most
+
+    def thinned(source: DepthSource) -> Facets:
+        found = facets_of(source.load())
+        return found.select(np.arange(0, len(found), share))
+
+    return _joined(list(ordered_map(thinned, sources, threads)))
+
+
+def facets_of(found: DepthMap) -> Facets:
+    """Upright facets of one photo: least squares through its inverse depths, block by block.
+
+    Inverse depth is linear in a plane's pixels: w = n · (x, y, 1) for the plane n · X = 1.
+    """
+    camera = found.camera
+    side = max(LEAST_BLOCK, round(math.sqrt(camera.width * camera.height / BLOCKS_A_PHOTO)))
+    strip = max(1, STRIP_PIXELS // (side * camera.width)) * side
+    parts = [_strip_facets(found, top, strip, side) for top in range(0, camera.height - side + 1, strip)]
+    return _joined(parts)
+
+
+def _strip_facets(found: DepthMap, top: int, rows: int, side: int) -> Facets:
+    """Those of some rows of the photo."""
+    camera, strip = found.camera, np.s_[top : top + rows]
+    depth = found.depth[strip].astype(np.float64)
+    inverse = _blocks(np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0.0), side)
+    sure = _blocks(np.where(depth > 0.0, found.confidence[strip], 0), side) >= LEAST_CONFIRMED
+    row, column = np.nonzero(sure.mean(axis=(2, 3)) >= LEAST_SHARE)
+    weight, values = (part[row, column].reshape(len(row), side * side) for part in (sure.astype(float), inverse))
+    off = np.arange(side) + 0.5
+    x = np.tile(off, side) + (column * side)[:, None]
+    y = np.repeat(off, side) + (top + row * side)[:, None]
+    terms = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
+    normal = _planes(terms, values, weight)
+    misfit = np.square(np.einsum("bpk,bk->bp", terms, normal) - values)
+    total = weight.sum(axis=1)
+    middle = (weight[..., None] * terms).sum(axis=1) / total[:, None]
+    w = (middle * normal).sum(axis=1)
+    rough = np.sqrt((weight * misfit).sum(axis=1) / total)
+    good = (w > 0.0) & (rough * camera.fx <= ROUGH_PX * w)
+    return _standing(camera, middle[good], normal[good], side * side / w[good] ** 2 / (camera.fx * camera.fy))
+
+
+def _joined(parts: Sequence[Facets]) -> Facets:
+    every = [Facets(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)), *parts]
+    return Facets(*(np.concatenate([getattr(part, name) for part in every]) for name in ("places", "facing", "areas")))
+
+
+def _blocks(values: np.ndarray, side: int) -> np.ndarray:
+    """(rows, columns, side, side) of whole blocks; pixels beyond them at the right and below count nowhere."""
+    rows, columns = values.shape[0] // side, values.shape[1] // side
+    return values[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
+
+
+def _planes(
+    terms: Float64[np.ndarray, "b p 3"], values: Float64[np.ndarray, "b p"], weight: Float64[np.ndarray, "b p"]
+) -> Float64[np.ndarray, "b 3"]:
+    """Least squares of each block about its middle, which keeps the equations apart."""
+    total = weight.sum(axis=1)
+    middle = np.einsum("bp,bpk->bk", weight, terms) / total[:, None]
+    mean = (weight * values).sum(axis=1) / total
+    off = (terms - middle[:, None])[..., :2]
+    matrix = np.einsum("bp,bpi,bpj->bij", weight, off, off)
+    slope = np.linalg.solve(matrix, np.einsum("bp,bpi,bp->bi", weight, off, values - mean[:, None])[..., None])[..., 0]
+    return np.column_stack([slope, mean - (slope * middle[:, :2]).sum(axis=1)])
+
+
+def _standing(
+    camera: Camera,
+    rays: Float64[np.ndarray, "n 3"],
+    normals: Float64[np.ndarray, "n 3"],
+    flat_m2: Float64[np.ndarray, " n"],
+) -> Facets:
+    """Those whose normals are level, towards the camera.
+
+    Args:
+        camera: The photo's.
+        rays: To their middles, (x, y, 1) in the camera.
+        normals: n of n · X = 1, in the camera: away from it.
+        flat_m2: Their areas if they faced the camera.
+    """
+    length = np.linalg.norm(normals, axis=1)
+    w = (rays * normals).sum(axis=1)
+    turn = camera.cam_from_world[:3, :3]
+    places = (rays / w[:, None]) @ turn + camera.centre()
+    towards = -(normals / length[:, None]) @ turn
+    areas = flat_m2 * length / w  # over the cosine against the view axis, as pixels are counted
+    plan = np.linalg.norm(towards[:, :2], axis=1)
+    kept = np.abs(towards[:, 2]) <= UPRIGHT
+    return Facets(places[kept], towards[kept, :2] / plan[kept, None], areas[kept])

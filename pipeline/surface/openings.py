@@ -1,0 +1,102 @@
+"""Outlines of what lies before or behind a wall's plane: its openings, what juts out, and the wall itself."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from splatpipe.pipeline.surface.sheet import Sheet
+
+RECESS_M, JUT_M = 0.05, 0.12  # behind the plane: frames of windows; before it: canopies, not shutters and plinths
+STEP_GSD = 2.0  # and at least so many pixels: depths of coarse photos scatter more
+LEAST_M2 = 0.15  # of an opening; smaller ones are vents and noise
+SOFT_M = 0.06  # of a mask: notches and spots that are narrower go
+BRIDGED_M = 1.2  # of the wall's outline: bushes before it that are narrower make no notch
+STRAIGHT_CELLS = 1.5  # that an outline's corners may be off by
+ENCLOSED, RIM_CELLS = 0.5, 3  # share of the cells around an opening that are the wall: of a roof behind it a few are
+SQUARE = 0.88  # share of its level rectangle that an opening fills to be drawn as one
+Ring = Float64[np.ndarray, "_ 2"]
+
+
+def recesses(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
+    """Openings: what lies behind the plane with the wall's face around it, as outlines on the sheet, metres."""
+    limit = max(RECESS_M, STEP_GSD * sheet.lattice.cell_m)
+    face = np.isfinite(depth) & (np.nan_to_num(depth, nan=-np.inf) >= -limit)
+    return _rings(np.nan_to_num(depth, nan=0.0) < -limit, sheet, face)
+
+
+def projections(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
+    """What juts out of the plane, likewise."""
+    limit = max(JUT_M, STEP_GSD * sheet.lattice.cell_m)
+    return _rings(np.nan_to_num(depth, nan=0.0) > limit, sheet, None)
+
+
+def outlines(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
+    """The wall as far as it is known, small holes and notches bridged."""
+    known = np.isfinite(depth).astype(np.uint8)
+    reach = round(BRIDGED_M / sheet.lattice.cell_m)
+    wide = cv2.copyMakeBorder(known, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
+    closed = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(reach)))
+    height, width = known.shape
+    return _rings(closed[reach : reach + height, reach : reach + width] > 0, sheet, None)
+
+
+def _disc(reach: int) -> UInt8[np.ndarray, "k k"]:
+    return np.ones((reach + 1, reach + 1), np.uint8)
+
+
+def _rings(there: Bool[np.ndarray, "h w"], sheet: Sheet, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
+    """Outlines of connected parts, along the cells' borders, from the largest.
+
+    Args:
+        there: What is outlined.
+        sheet: Its cells.
+        face: What has to lie around openings, which are level rectangles where they nearly are; None where these are
+            none.
+    """
+    cell = sheet.lattice.cell_m
+    kernel = _disc(max(1, round(SOFT_M / cell)))
+    mask = np.asarray(cv2.morphologyEx(there.astype(np.uint8), cv2.MORPH_OPEN, kernel))
+    mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    sizes = stats[:, cv2.CC_STAT_AREA]
+    rings = []
+    for part in sorted(range(1, count), key=lambda part: (-int(sizes[part]), part)):
+        if sizes[part] * cell**2 < LEAST_M2:
+            break
+        left, top, width, height = (int(stats[part, k]) for k in range(4))
+        own = parts[top : top + height, left : left + width] == part
+        if face is not None and _enclosed(own, left, top, face) < ENCLOSED:
+            continue
+        ring = _level_rectangle(own) if face is not None and own.mean() >= SQUARE else _traced(own)
+        columns, rows = (ring + np.array([left, top])).T
+        rings.append(np.column_stack([sheet.lattice.east_m + columns * cell, sheet.lattice.north_m - rows * cell]))
+    return rings
+
+
+def _enclosed(own: Bool[np.ndarray, "a b"], left: int, top: int, face: Bool[np.ndarray, "h w"]) -> float:
+    """The share of cells around a part that are the wall's face."""
+    reach = RIM_CELLS
+    wide = np.pad(own, reach).astype(np.uint8)
+    around = np.asarray(cv2.dilate(wide, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))) > wide
+    there = np.pad(face, reach)[top : top + wide.shape[0], left : left + wide.shape[1]]
+    return float(there[around].mean())
+
+
+def _level_rectangle(own: Bool[np.ndarray, "h w"]) -> Ring:
+    """The rectangle whose sides are the medians of a part's ends in each row and column."""
+    height, width = own.shape
+    rows, columns = own[own.any(axis=1)], own.T[own.any(axis=0)]
+    left, right = np.median(rows.argmax(axis=1)), width - np.median(rows[:, ::-1].argmax(axis=1))
+    top, bottom = np.median(columns.argmax(axis=1)), height - np.median(columns[:, ::-1].argmax(axis=1))
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+
+
+def _traced(own: Bool[np.ndarray, "h w"]) -> Ring:
+    """The outline of a part, few corners; cells are doubled, so that it lies on their borders, not their centres."""
+    fine = np.pad(np.kron(own, np.ones((2, 2), np.uint8)), 1).astype(np.uint8)
+    found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    longest = max(found, key=len)
+    corners = np.asarray(cv2.approxPolyDP(longest, 2.0 * STRAIGHT_CELLS, True)).reshape(-1, 2)
+    return (corners - 0.5) / 2.0

@@ -1,0 +1,81 @@
+"""Small pictures of large rasters, for pages: from their overviews, so that size costs nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import rasterio
+from jaxtyping import Float64, UInt8
+from rasterio.enums import Resampling
+
+from splatpipe.pipeline.surface.geotiff import gdal
+
+EMPTY = 255  # grey of what has no data
+LIGHT_FROM = np.array([-0.5, 0.5, np.sqrt(0.5)])  # east, north, up: from the north-west, half way up, as on maps
+DARKEST, LIGHTEST = 0.25, 1.4  # of slopes away from the light and towards it; level ground has 1
+SPREAD = 0.01  # of the heights at either end, that all have the end's colour
+
+
+@dataclass(frozen=True, eq=False)
+class ReliefPicture:
+    """Heights as colours, lit from the north-west.
+
+    Attributes:
+        pixels: RGB.
+        low: Height of the first colour, in the file's unit.
+        high: Of the last.
+    """
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    low: float
+    high: float
+
+
+def ortho_picture(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
+    """`ortho.tif`, RGB, white where it has nothing.
+
+    Args:
+        path: The file.
+        side: Pixels of the longer side at most.
+    """
+    with gdal(path.parent), rasterio.open(path) as raster:
+        bands = raster.read(out_shape=(raster.count, *_shape(raster, side)), resampling=Resampling.average)
+    return np.asarray(np.where(bands[3:] > 0, bands[:3], EMPTY).transpose(1, 2, 0), np.uint8)
+
+
+def relief_picture(path: Path, side: int) -> ReliefPicture | None:
+    """`dsm.tif`; None where it has no height.
+
+    Args:
+        path: The file.
+        side: Pixels of the longer side at most.
+    """
+    with gdal(path.parent), rasterio.open(path) as raster:
+        shape = _shape(raster, side)
+        found = raster.read(1, out_shape=shape, masked=True, resampling=Resampling.average)
+        step = raster.transform.a * raster.width / shape[1]
+    height = found.astype(np.float64).filled(np.nan)
+    known = np.isfinite(height)
+    if not known.any() or min(shape) < 2:
+        return None
+    low, high = (float(each) for each in np.quantile(height[known], [SPREAD, 1.0 - SPREAD]))
+    shade = np.clip((height - low) / max(high - low, 1e-9), 0.0, 1.0)
+    colours = matplotlib.colormaps["viridis"](np.nan_to_num(shade))[..., :3] * _light(height, step)[..., None]
+    pixels = np.where(known[..., None], np.clip(colours * 255.0, 0.0, 255.0), EMPTY)
+    return ReliefPicture(pixels.astype(np.uint8), low, high)
+
+
+def _light(height: Float64[np.ndarray, "h w"], step: float) -> Float64[np.ndarray, "h w"]:
+    """How much light falls on a surface; as on level ground where its slope is not known."""
+    down, right = np.gradient(height, step)
+    normal = np.stack([-right, down, np.ones_like(height)], axis=-1)
+    lit = (normal @ LIGHT_FROM) / np.linalg.norm(normal, axis=-1) / LIGHT_FROM[2]
+    return np.asarray(np.clip(np.nan_to_num(lit, nan=1.0), DARKEST, LIGHTEST))
+
+
+def _shape(raster: rasterio.DatasetReader, side: int) -> tuple[int, int]:
+    scale = min(1.0, side / max(raster.height, raster.width))
+    return max(1, round(raster.height * scale)), max(1, round(raster.width * scale))

@@ -1,0 +1,125 @@
+"""Colours of points from all photos that see them, the finest ones before all; each photo is read once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.surface.depth_points import place_of
+from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded, sampled, tone_curve
+from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet, look_at
+from splatpipe.pipeline.surface.sight import place_in
+from splatpipe.pipeline.surface.sources import DepthMap, Shelf
+
+COARSE = 4  # power of the footprint that a photo's weight falls with: one half as fine counts a sixteenth
+MIXED = 0.01  # weight where a nearer surface lies in the next pixel of the depths: its colour may be mixed in
+BATCH = 1 << 17  # points at a time
+COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
+HELD_BYTES = 300 << 20  # of depths in memory
+
+
+def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> PhotoSet:
+    """Photos with their exposures levelled.
+
+    Args:
+        sources: Local metres, always in the same order.
+        cell_m: How fine they are to colour something.
+        threads: Photos at a time.
+    """
+    photos = PhotoSet(sources, np.ones((len(sources), 3)), Shelf(HELD_BYTES))
+    numbers = photos.with_depths()
+    most = -(-COMPARED_AT // max(len(numbers), 1))
+    places = [_some_places(photos.depth_map(number), most) for number in numbers]
+    every = np.concatenate([np.zeros((0, 3)), *places])
+    return replace(photos, gains=exposure_gains(sources, every, 2.0 * cell_m, threads))
+
+
+def _some_places(found: DepthMap, most: int) -> Float64[np.ndarray, "n 3"]:
+    """Some of what a photo shows, evenly."""
+    height, width = found.depth.shape
+    step = max(1, int((height * width / most) ** 0.5))
+    row, column = (grid.ravel() for grid in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+    depth = found.depth[row, column].astype(np.float64)
+    known = depth > 0.0
+    return np.ascontiguousarray(place_of(found.camera, row[known], column[known], 1.0 / depth[known]).T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Offer:
+    """What one photo offers.
+
+    Attributes:
+        rows: Of the points that it sees.
+        colour: Theirs in it.
+        weight: How much they count.
+    """
+
+    rows: Int64[np.ndarray, " k"]
+    colour: UInt8[np.ndarray, "k 3"]
+    weight: Float32[np.ndarray, " k"]
+
+
+def point_colours(
+    photos: PhotoSet, pieces: Facing, cell_m: float, threads: int
+) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """The mean colour of points in the photos that see them, and which are seen at all; black where not.
+
+    Args:
+        photos: With their depths.
+        pieces: The points.
+        cell_m: Side of the area whose colour a point has.
+        threads: Photos at a time.
+
+    Raises:
+        ValueError: if depths or pixels do not fit their camera.
+    """
+    size = pieces.xyz.shape[1]
+    total, weights = np.zeros((size, 3), np.float32), np.zeros(size, np.float32)
+    for offer in ordered_map(partial(_offer, photos, pieces, cell_m), photos.with_depths(), threads):
+        total[offer.rows] += offer.weight[:, None] * offer.colour
+        weights[offer.rows] += offer.weight
+    known = weights > 0.0
+    mean = total / np.where(known, weights, np.float32(1.0))[:, None]
+    return np.clip(np.round(mean), 0, 255).astype(np.uint8), known
+
+
+def _offer(photos: PhotoSet, pieces: Facing, cell_m: float, number: int) -> _Offer:
+    seen = [
+        (start + rows, weight)
+        for start in range(0, pieces.xyz.shape[1], BATCH)
+        for rows, weight in [_seen(photos, number, pieces.select(np.s_[start : start + BATCH]), cell_m)]
+    ]
+    rows = np.concatenate([np.zeros(0, np.int64), *(each for each, _ in seen)])
+    weight = np.concatenate([np.zeros(0, np.float32), *(each for _, each in seen)])
+    if not rows.size:
+        return _Offer(rows, np.zeros((0, 3), np.uint8), weight)
+    source = photos.sources[number]
+    pixels, tone = loaded(source)[0], tone_curve(photos.gains[number])
+    east, north, up = pieces.xyz[:, rows]
+    colour = sampled(source, pixels, (east, north, up), np.ones(len(rows), np.bool_), cell_m, tone)
+    return _Offer(rows, colour, weight)
+
+
+def _seen(
+    photos: PhotoSet, number: int, pieces: Facing, cell_m: float
+) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+    """Rows of the points that a photo sees, and how much its colours count."""
+    camera = photos.sources[number].camera
+    rows = np.flatnonzero(place_in(camera, *pieces.xyz).inside)
+    if not rows.size:
+        return rows, np.zeros(0, np.float32)
+    found = photos.depth_map(number)
+    look = look_at(found.camera, pieces.select(rows))
+    facing = np.isfinite(look.footprint)
+    rows, look = rows[facing], look.select(facing)
+    sight = look.sight(found)
+    coarse = np.maximum(look.footprint / cell_m, 0.1)  # finer ones are no better, and powers stay finite
+    weight = np.where(sight.seen, np.where(sight.mixed, MIXED, 1.0), 0.0) / coarse**COARSE
+    kept = weight > 0.0
+    return rows[kept], weight[kept].astype(np.float32)

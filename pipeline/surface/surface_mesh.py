@@ -1,0 +1,140 @@
+"""The mesh of a capture: joined from depths, cleaned, decimated to a budget, coloured from the photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+from scipy.spatial import cKDTree
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.blocks import Box, surface_blocks
+from splatpipe.pipeline.surface.mesh_files import write_mesh
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet
+from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
+from splatpipe.pipeline.surface.site import Site
+from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, without_crumbs
+from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
+from splatpipe.pipeline.survey.frames import Frame
+
+MOST_BLOCKS = 120_000  # of voxels: 0.5 GB, and about 5 million triangles before decimation; beyond it voxels are larger
+CRUMB_VOXELS = 200.0  # faces of voxels: a piece of a smaller area hangs in the air, or is nobody's interest
+GREY = 128  # of what no photo shows, where nothing near has a colour
+
+
+@dataclass(frozen=True, eq=False)
+class MeshTask:
+    """What a mesh is made from.
+
+    Attributes:
+        frame: The run's.
+        site: What its photos show.
+        photos: Local metres, with their depths.
+        area: A boundary: triangles all of whose corners lie inside are kept; None for all.
+        voxel_m: Side of the voxels, 2 GSD; larger where the site is.
+        most_triangles: In the end.
+        threads: Photos at a time.
+    """
+
+    frame: Frame
+    site: Site
+    photos: Sequence[PhotoSource]
+    area: PlanArea | None
+    voxel_m: float
+    most_triangles: int
+    threads: int
+
+
+def make_mesh(task: MeshTask, out: Path, facts: Mapping[str, Any], report: Reporter) -> dict[str, Any]:
+    """Write `mesh.glb`, `mesh.ply` and `georef.json`; the same bits for any number of threads.
+
+    Args:
+        task: What it is made from.
+        out: Where the files go.
+        facts: What `georef.json` says besides: the uncertainty, a boundary.
+        report: Told of progress.
+
+    Returns:
+        Figures for people: triangles, vertices, the area, the voxels' side.
+
+    Raises:
+        MachineError: if open3d is not there, or the disk is full.
+        SplatpipeError: if there is no surface that enough photos see.
+        ValueError: if depths or pixels do not fit their camera.
+    """
+    open3d()
+    photos = photo_set(task.photos, task.voxel_m, task.threads)
+    mesh, voxel_m = fine_mesh(task, photos, report)
+    report.progress(0, 1, "decimating the mesh", "meshes")
+    mesh = decimated(mesh, task.most_triangles)
+    report.progress(1, 1, "decimating the mesh", "meshes")
+    write_mesh(out, ColouredMesh(mesh, vertex_colours(photos, mesh, task.threads)), task.frame, facts)
+    return {
+        "triangles": len(mesh.triangles),
+        "vertices": len(mesh.vertices),
+        "area_m2": round(float(mesh.areas().sum()), 1),
+        "voxel_m": round(voxel_m, 6),
+    }
+
+
+def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[TriangleMesh, float]:
+    """The mesh before it is decimated, and the side of its voxels, metres."""
+    box = Box(*task.site.box)
+    blocks = surface_blocks(photos, box, task.voxel_m, MOST_BLOCKS, task.threads)
+    if blocks.voxel_m > task.voxel_m:
+        report.note(f"The mesh has voxels of {blocks.voxel_m:.3g} m, not {task.voxel_m:.3g} m: the site is large.")
+    mesh = tsdf_mesh(photos, box, blocks, task.threads, report)
+    if task.area is not None:
+        mesh = mesh.select(task.area.contains(mesh.vertices)[mesh.triangles].all(axis=1))
+    mesh = without_crumbs(mesh, CRUMB_VOXELS * blocks.voxel_m**2)
+    if not len(mesh.triangles):
+        raise SplatpipeError(
+            "There is no surface for a mesh that three photos see.", "Add overlap, or make it with a wider boundary."
+        )
+    return mesh, blocks.voxel_m
+
+
+def decimated(mesh: TriangleMesh, most: int) -> TriangleMesh:
+    """The mesh with so many triangles at most, fewer where it is flat (quadric errors; Garland and Heckbert 1997).
+
+    Args:
+        mesh: In order.
+        most: Triangles.
+    """
+    size = len(mesh.triangles)
+    if size <= most:
+        return mesh
+    o3d = open3d()
+    low = mesh.vertices.min(axis=0)  # float32 is finer near zero
+    vertices, triangles = (mesh.vertices - low).astype(np.float32), mesh.triangles.astype(np.int32)
+    fine = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
+    coarse = fine.simplify_quadric_decimation(1.0 - most / size)
+    found = coarse.vertex.positions.numpy().astype(np.float64) + low
+    whole = TriangleMesh(found, coarse.triangle.indices.numpy().astype(np.int64))
+    return whole.select(whole.areas() > 0.0)
+
+
+def vertex_colours(photos: PhotoSet, mesh: TriangleMesh, threads: int) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of a mesh's vertices from the photos; of what none sees, those of the nearest vertex that one does."""
+    pieces = Facing(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.normals().T))
+    spacing_m = float(np.sqrt(mesh.areas().sum() / len(mesh.vertices)))
+    colours, known = point_colours(photos, pieces, spacing_m, threads)
+    return _spread(mesh, colours, known)
+
+
+def _spread(
+    mesh: TriangleMesh, colours: UInt8[np.ndarray, "n 3"], known: Bool[np.ndarray, " n"]
+) -> UInt8[np.ndarray, "n 3"]:
+    if not known.any():
+        return np.full_like(colours, GREY)
+    nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])[1]
+    colours = colours.copy()
+    colours[~known] = colours[known][nearest]
+    return colours

@@ -1,0 +1,114 @@
+"""A surface from depths by a truncated signed distance function (Curless and Levoy, SIGGRAPH 1996), by open3d.
+
+Every voxel near the surface has the mean of how far before it or behind it photos see the surface, along their view
+axes. A photo that looks through a voxel counts, too: so what one photo imagines, others clear away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.surface.blocks import BAND, LEAST_PHOTOS, SIDE, Blocks, Box, depths_in
+from splatpipe.pipeline.surface.photo_set import PhotoSet
+from splatpipe.pipeline.surface.triangles import TriangleMesh, in_order
+
+FARTHEST_M = 1e4  # open3d asks for a limit of depths
+
+
+def open3d() -> Any:
+    """The module.
+
+    Raises:
+        MachineError: if it is not installed, or a system's library that it needs is not.
+    """
+    try:
+        import open3d as module
+    except ModuleNotFoundError as error:
+        raise MachineError(
+            "The mesh is made by open3d, which is not installed.", hint="Install it: pip install 'splatpipe[mesh]'."
+        ) from error
+    except (ImportError, OSError) as error:
+        raise MachineError(
+            f"The mesh is made by open3d, which cannot be loaded: {error}.",
+            hint="On Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1.",
+        ) from error
+    return module
+
+
+def tsdf_mesh(photos: PhotoSet, box: Box, blocks: Blocks, threads: int, report: Reporter) -> TriangleMesh:
+    """The surface that photos see, in one order whatever the number of threads.
+
+    Args:
+        photos: With their depths.
+        box: What of the world counts.
+        blocks: Where the surface is.
+        threads: Photos at a time where depths are read, and open3d's.
+        report: Told of progress.
+
+    Raises:
+        MachineError: if open3d is not there.
+    """
+    o3d = open3d()
+    size = blocks.places.shape[1]
+    if not size:
+        return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    core = o3d.core
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (core.float32, core.float32), ((1), (1)), blocks.voxel_m, SIDE, size, core.Device("CPU:0")
+    )
+    places = np.ascontiguousarray(blocks.places.T.astype(np.int32))
+    grid.hashmap().activate(core.Tensor(places))
+    numbers = photos.with_depths()
+    for done, (camera, depth) in enumerate(_depths(photos, box, numbers, threads), start=1):
+        near = np.flatnonzero(_in_view(camera, blocks))
+        if near.size:
+            intrinsic, extrinsic = core.Tensor(camera.k()), core.Tensor(_pose(camera, blocks))
+            image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
+            grid.integrate(core.Tensor(places[near]), image, intrinsic, extrinsic, 1.0, FARTHEST_M, BAND)
+        report.progress(done, len(numbers), "joining depths to a surface", "photos")
+    found = grid.extract_triangle_mesh(float(LEAST_PHOTOS))
+    vertices = found.vertex.positions.numpy().astype(np.float64) + blocks.low
+    return in_order(TriangleMesh(vertices, found.triangle.indices.numpy().astype(np.int64)))
+
+
+def _depths(
+    photos: PhotoSet, box: Box, numbers: list[int], threads: int
+) -> Iterator[tuple[Camera, Float32[np.ndarray, "h w"]]]:
+    return ordered_map(partial(_depths_of, photos, box), numbers, threads)
+
+
+def _depths_of(photos: PhotoSet, box: Box, number: int) -> tuple[Camera, Float32[np.ndarray, "h w"]]:
+    found = photos.depth_map(number)
+    return found.camera, depths_in(box, found)
+
+
+def _pose(camera: Camera, blocks: Blocks) -> np.ndarray:
+    """Camera from the blocks' own metres: near zero, where float32 is fine enough."""
+    pose = camera.cam_from_world.copy()
+    pose[:3, 3] += pose[:3, :3] @ blocks.low
+    return pose
+
+
+def _in_view(camera: Camera, blocks: Blocks) -> Int64[np.ndarray, " n"]:
+    """Blocks of which a part may lie in a camera's picture."""
+    reach = SIDE * blocks.voxel_m * np.sqrt(3.0) / 2.0
+    pose = camera.cam_from_world
+    x, y, depth = pose[:3, :3] @ blocks.centres() + pose[:3, 3:]
+    inside = depth > -reach
+    for along, focal, centre, size in (
+        (x, camera.fx, camera.cx, camera.width),
+        (y, camera.fy, camera.cy, camera.height),
+    ):
+        for edge, sign in ((0.0, 1.0), (float(size), -1.0)):  # the sides of the view are planes through the camera
+            slope = (edge - centre) / focal
+            inside &= sign * (along - slope * depth) > -reach * np.hypot(1.0, slope)
+    return np.asarray(inside)

@@ -1,0 +1,76 @@
+"""`volumes.json`: what lies above and below a base inside each polygon of a boundary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.surface.map_crs import MapCrs
+from splatpipe.pipeline.surface.surface_file import SurfaceFile
+from splatpipe.pipeline.surface.volumes import Amount, Kind, Volume, measure_volume
+from splatpipe.pipeline.surface.whole_file import whole_file
+
+FORMAT = 1
+DIGITS = 4
+HOW = (
+    "One standard deviation: the cells' expected deviations, shared by some 13 neighbours each; the base's, by the "
+    "misfit of the rim to it; for a stated height the datum's. Volumes are of the part that has heights, and nothing "
+    "is filled in. Lengths are on the ground. Noise about the base makes cut and fill larger alike, and not the net."
+)
+
+
+def write_volumes(
+    path: Path, surface: SurfaceFile, area: PlanArea, crs: MapCrs, base: Kind | float, datum_sigma_m: float = 0.0
+) -> list[dict[str, Any]]:
+    """Measure the volume in each polygon, and write them.
+
+    Args:
+        path: Where.
+        surface: The model.
+        area: The polygons, local metres; each by itself.
+        crs: The model's.
+        base: ``rim``, ``lowest``, or a height in the CRS's unit.
+        datum_sigma_m: As ``measure_volume`` takes it.
+
+    Returns:
+        What the file tells of each.
+
+    Raises:
+        SplatpipeError: as ``measure_volume``.
+        OSError: if the disk is full or not writable.
+    """
+    facts = []
+    for number, polygon in enumerate(area.polygons, 1):
+        volume = measure_volume(surface, PlanArea(area.axes, (polygon,)), crs, base, datum_sigma_m)
+        facts.append({"polygon": number, **volume_facts(volume)})
+    value = {"format": FORMAT, "crs": crs.horizontal.name, "heights": crs.described_heights(), "uncertainty": HOW}
+    with whole_file(path) as aside:
+        aside.write_text(json_text({**value, "volumes": facts}), encoding="utf-8")
+    return facts
+
+
+def volume_facts(volume: Volume) -> dict[str, Any]:
+    """A volume as JSON; the base's height is told in metres of the CRS's datum, at a place in the CRS's unit."""
+    base = volume.base
+    kinds = {"cut": volume.cut, "fill": volume.fill, "net": volume.net}
+    return {
+        **{key: number for kind, amount in kinds.items() for key, number in _numbers(kind, amount).items()},
+        "area_m2": round(volume.area_m2, DIGITS),
+        "area_without_height_m2": round(volume.area_m2 - volume.known_m2, DIGITS),
+        "share_without_height": round(1.0 - volume.known_m2 / volume.area_m2, DIGITS),
+        "base": {
+            "kind": base.kind,
+            "place": [round(float(number), DIGITS) for number in base.middle],
+            "height_m": round(float(base.terms[0]), DIGITS),
+            "height_sigma_m": round(float(base.covariance[0, 0]) ** 0.5, DIGITS),
+            "rise_to_east_percent": round(100.0 * float(base.terms[1]), DIGITS),
+            "rise_to_north_percent": round(100.0 * float(base.terms[2]), DIGITS),
+            "rim_misfit_m": None if base.misfit_m is None else round(base.misfit_m, DIGITS),
+        },
+    }
+
+
+def _numbers(kind: str, amount: Amount) -> dict[str, float]:
+    return {f"{kind}_m3": round(amount.m3, DIGITS), f"{kind}_sigma_m3": round(amount.sigma_m3, DIGITS)}

@@ -1,0 +1,307 @@
+"""Volumes between a surface model and a base inside a polygon, with how far they may be off.
+
+The uncertainty has three parts, which are taken for independent. A cell's noise: neighbours share it, as depths of
+neighbouring pixels do, so a sum's variance is the cells' own times the number of cells that one counts for. The base's:
+a plane through the rim is as uncertain as its fit, whose residuals, shared along the rim likewise, hold the rim's noise
+and its roughness both. And where heights are stated, what the whole surface may be too high or too low by; a rim that
+is too high as well takes that out again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring
+from splatpipe.pipeline.surface.ground_scale import ground_metres
+from splatpipe.pipeline.surface.map_crs import MapCrs
+from splatpipe.pipeline.surface.surface_file import SurfaceFile
+from splatpipe.pipeline.surface.tiles import Tile, tiled
+
+WINDOW = 1024  # cells a side
+PARTS = 5  # of a cell's side: how much of a cell that the outline crosses lies inside
+SHARED_CELLS = 1.0  # two cells' noise goes together by exp(-d² / 4 s²), d their distance and s this: 3.5 along a line
+SHARED_ALONG = 2.0 * math.sqrt(math.pi) * SHARED_CELLS  # that sum over a line of cells,
+SHARED_AROUND = 4.0 * math.pi * SHARED_CELLS**2  # and over an area
+RIM_CELLS = 1.0  # between places on the rim
+LEAST_RIM = 12  # places with heights that a plane is laid through
+LEAST_RIM_SHARE = 0.5  # of the rim that has heights: of less, nobody knows how the base goes on
+LOWEST_OF = 5  # neighbouring places whose median is one height: a single cell may be a hole's
+UNTOLD_SIGMA_CELLS = 0.5  # expected deviation where none is told, in cells
+ROUNDS, HUBER = 5, 1.5  # of the plane's robust fit, and deviations beyond which a place counts less
+
+Kind = Literal["rim", "lowest", "stated"]
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """A plane: height = terms · (1, east, north), metres on the ground from a place in the middle.
+
+    Attributes:
+        kind: ``rim``: through the outline's heights. ``lowest``: level, at the lowest of them. ``stated``: level.
+        middle: Easting and northing that it counts from, the CRS's unit.
+        terms: Height in the middle, rise towards east, rise towards north.
+        covariance: Of the terms.
+        misfit_m: Root mean square of the rim about it; None of a level one.
+    """
+
+    kind: Kind
+    middle: Float64[np.ndarray, " 2"]
+    terms: Float64[np.ndarray, " 3"]
+    covariance: Float64[np.ndarray, "3 3"]
+    misfit_m: float | None
+
+
+@dataclass(frozen=True)
+class Amount:
+    """A volume.
+
+    Attributes:
+        m3: Cubic metres.
+        sigma_m3: Its expected deviation.
+    """
+
+    m3: float
+    sigma_m3: float
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """What lies above and below a base.
+
+    Attributes:
+        base: The plane.
+        area_m2: Of the polygon, on the ground.
+        known_m2: Of it, where there are heights: volumes are of that alone.
+        cut: Above the base: what would be taken away.
+        fill: Below it: what would be brought.
+        net: Cut less fill.
+    """
+
+    base: Base
+    area_m2: float
+    known_m2: float
+    cut: Amount
+    fill: Amount
+    net: Amount
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """A surface inside an outline, metres in plan and height.
+
+    Attributes:
+        surface: The model, in the CRS's units.
+        area: The outline in the CRS's unit.
+        plan_m: Metres on the ground in a unit of the plan.
+        height_m: Metres in a unit of heights.
+    """
+
+    surface: SurfaceFile
+    area: PlanArea
+    plan_m: float
+    height_m: float
+
+    @property
+    def cell_m(self) -> float:
+        return self.surface.cell * self.plan_m
+
+    def rings(self) -> list[Ring]:
+        return [ring for polygon in self.area.polygons for ring in polygon]
+
+
+def measure_volume(
+    surface: SurfaceFile, area: PlanArea, crs: MapCrs, base: Kind | float, datum_sigma_m: float = 0.0
+) -> Volume:
+    """The volume between a surface model and a base.
+
+    Args:
+        surface: The model.
+        area: East and north, local metres.
+        crs: The model's.
+        base: ``rim``, ``lowest``, or a height in the CRS's unit.
+        datum_sigma_m: Expected deviation of all heights together: counts where a height is stated.
+
+    Raises:
+        SplatpipeError: if the outline lies outside of the surface, or too little of it has heights for its base.
+    """
+    rings = [tuple(_in_crs(ring, crs) for ring in polygon) for polygon in area.polygons]
+    ground = _Ground(surface, PlanArea.seen_from_above(rings), ground_metres(crs), crs.height_unit_m)
+    plane = _base(ground, base, datum_sigma_m)
+    sums = _Sums.zero()
+    for part in _windows(ground):
+        sums = sums.plus(_part(ground, plane, part))
+    whole_m2 = ground.area.size() * ground.plan_m**2
+    if sums.known_m2 == 0.0:
+        raise SplatpipeError("The surface model has no heights inside the polygon.", "Check its place and its CRS.")
+    cut, fill = (_amount(sums, plane, side) for side in (0, 1))
+    net = Amount(cut.m3 - fill.m3, _sigma(float(sums.noise.sum()), sums.lever[0] + sums.lever[1], plane))
+    return Volume(plane, whole_m2, min(sums.known_m2, whole_m2), cut, fill, net)
+
+
+def _in_crs(ring: Ring, crs: MapCrs) -> Ring:
+    return np.asarray(crs.crs_from_local(np.column_stack([ring, np.zeros(len(ring))]))[:, :2])
+
+
+def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
+    vertices = np.concatenate(ground.rings())
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    if not isinstance(stated, str):
+        height = float(stated) * ground.height_m
+        return Base("stated", middle, np.array([height, 0.0, 0.0]), np.diag([datum_sigma_m**2, 0.0, 0.0]), None)
+    places = [_along(ring, ground.surface.cell * RIM_CELLS) for ring in ground.rings()]
+    heights = [ground.surface.along(place) for place in places]
+    up = np.concatenate([height for height, _ in heights]) * ground.height_m
+    sigma = _told(np.concatenate([sigma for _, sigma in heights]), ground.cell_m)
+    known = np.isfinite(up)
+    if known.sum() < LEAST_RIM or known.mean() < LEAST_RIM_SHARE:
+        raise SplatpipeError(
+            f"Only {100.0 * known.mean():.0f} % of the polygon's outline has heights, too little for a base.",
+            "Draw it where the surface is known, or state the base's height.",
+        )
+    if stated == "lowest":
+        return _lowest(middle, up[known], sigma[known])
+    east, north = ((np.concatenate(places) - middle)[known] * ground.plan_m).T
+    return _fitted(middle, np.stack([np.ones(len(east)), east, north], axis=1), up[known], sigma[known])
+
+
+def _along(ring: Ring, step: float) -> Float64[np.ndarray, "n 2"]:
+    """Places on a closed outline, evenly."""
+    closed = np.concatenate([ring, ring[:1]])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    at = np.arange(max(LEAST_RIM, round(way[-1] / step))) / max(LEAST_RIM, round(way[-1] / step)) * way[-1]
+    return np.stack([np.interp(at, way, closed[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _told(sigma: Float64[np.ndarray, " *n"], cell_m: float) -> Float64[np.ndarray, " *n"]:
+    return np.where(np.isfinite(sigma), sigma, UNTOLD_SIGMA_CELLS * cell_m)
+
+
+def _lowest(middle: Float64[np.ndarray, " 2"], up: Float64[np.ndarray, " n"], sigma: Float64[np.ndarray, " n"]) -> Base:
+    wide = np.concatenate([up[-(LOWEST_OF // 2) :], up, up[: LOWEST_OF // 2]])
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(wide, LOWEST_OF), axis=1)
+    least = int(np.argmin(smooth))
+    variance = float(sigma[least] ** 2)
+    return Base("lowest", middle, np.array([smooth[least], 0.0, 0.0]), np.diag([variance, 0.0, 0.0]), None)
+
+
+def _fitted(
+    middle: Float64[np.ndarray, " 2"],
+    design: Float64[np.ndarray, "n 3"],
+    up: Float64[np.ndarray, " n"],
+    sigma: Float64[np.ndarray, " n"],
+) -> Base:
+    """The plane through the rim, robust (Huber's weights), with the covariance of shared noise."""
+    weight = np.ones(len(up))
+    terms = np.zeros(3)
+    spread = 0.0
+    for _ in range(ROUNDS):
+        normal = design.T @ (weight[:, None] * design)
+        if np.linalg.cond(normal) > 1e12:
+            raise SplatpipeError("The polygon's outline is no area to lay a plane through.", "Draw another one.")
+        terms = np.linalg.solve(normal, design.T @ (weight * up))
+        off = up - design @ terms
+        spread = max(1.4826 * float(np.median(np.abs(off))), 1e-6)
+        weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(off), 1e-9))
+    off = up - design @ terms
+    variance = max(float(np.average(np.square(off), weights=weight)), float(np.mean(np.square(sigma))))
+    covariance = np.linalg.inv(design.T @ (weight[:, None] * design)) * variance * SHARED_ALONG / RIM_CELLS
+    return Base("rim", middle, terms, covariance, float(np.sqrt(np.mean(np.square(off)))))
+
+
+def _windows(ground: _Ground) -> Iterator[Tile]:
+    """Parts of the raster that the outline lies in."""
+    vertices = np.concatenate(ground.rings())
+    column, row = ground.surface.lattice.places(vertices[:, 0], vertices[:, 1])
+    lattice = ground.surface.lattice
+    left, right = np.clip([math.floor(column.min()), math.ceil(column.max())], 0, lattice.width).tolist()
+    top, bottom = np.clip([math.floor(row.min()), math.ceil(row.max())], 0, lattice.height).tolist()
+    for part in tiled(bottom - top, right - left, WINDOW):
+        yield Tile(part.row + top, part.column + left, part.height, part.width)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums over cells, of cut and fill each.
+
+    Attributes:
+        known_m2: Area with heights.
+        m3: Volumes.
+        noise: Variance by the cells' own noise.
+        lever: By how much cut falls and fill grows with the base's terms: so the net falls by their sum.
+    """
+
+    known_m2: float
+    m3: Float64[np.ndarray, " 2"]
+    noise: Float64[np.ndarray, " 2"]
+    lever: Float64[np.ndarray, "2 3"]
+
+    @staticmethod
+    def zero() -> _Sums:
+        return _Sums(0.0, np.zeros(2), np.zeros(2), np.zeros((2, 3)))
+
+    def plus(self, other: _Sums) -> _Sums:
+        return _Sums(
+            self.known_m2 + other.known_m2, self.m3 + other.m3, self.noise + other.noise, self.lever + other.lever
+        )
+
+
+def _part(ground: _Ground, base: Base, part: Tile) -> _Sums:
+    share = _shares(ground, part)
+    height = ground.surface.heights(part) * ground.height_m
+    known = (share > 0.0) & np.isfinite(height)
+    if not known.any():
+        return _Sums.zero()
+    places = (ground.surface.lattice.centres(part)[known] - base.middle) * ground.plan_m
+    terms = np.column_stack([np.ones(len(places)), places])
+    over = height[known] - terms @ base.terms
+    cells_m2 = share[known] * ground.cell_m**2
+    noise = np.square(cells_m2 * _told(ground.surface.sigmas_m(part)[known], ground.cell_m)) * SHARED_AROUND
+    above = over > 0.0
+    sides = [cells_m2 * above, cells_m2 * ~above]
+    return _Sums(
+        float(cells_m2.sum()),
+        np.array([(side * np.abs(over)).sum() for side in sides]),
+        np.array([(noise * (side > 0.0)).sum() for side in sides]),
+        np.stack([side @ terms for side in sides]),
+    )
+
+
+def _shares(ground: _Ground, part: Tile) -> Float64[np.ndarray, "h w"]:
+    """How much of each cell lies inside."""
+    lattice = ground.surface.lattice
+    centres = lattice.centres(part)
+    shape = centres.shape[:2]
+    share = ground.area.contains(_flat(centres.reshape(-1, 2))).astype(np.float64).reshape(shape)
+    crossed = np.zeros(shape, np.bool_)
+    for ring in ground.rings():
+        column, row = lattice.places(*_along(ring, lattice.cell_m / PARTS).T)
+        for down in (-1, 0, 1):  # a sample's neighbours: an outline may cut a corner between two samples
+            for right in (-1, 0, 1):
+                j = np.floor(column).astype(np.int64) - part.column + right
+                i = np.floor(row).astype(np.int64) - part.row + down
+                inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1])
+                crossed[i[inside], j[inside]] = True
+    off = ((np.arange(PARTS) + 0.5) / PARTS - 0.5) * lattice.cell_m
+    finer = centres[crossed][:, None] + np.stack(np.meshgrid(off, off), axis=-1).reshape(1, -1, 2)
+    within = ground.area.contains(_flat(finer.reshape(-1, 2))).reshape(-1, PARTS * PARTS)
+    share[crossed] = within.mean(axis=1)
+    return share
+
+
+def _flat(plan: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+    return np.column_stack([plan, np.zeros(len(plan))])
+
+
+def _amount(sums: _Sums, base: Base, side: int) -> Amount:
+    return Amount(float(sums.m3[side]), _sigma(float(sums.noise[side]), sums.lever[side], base))
+
+
+def _sigma(noise: float, lever: Float64[np.ndarray, " 3"], base: Base) -> float:
+    return math.sqrt(noise + float(lever @ base.covariance @ lever))

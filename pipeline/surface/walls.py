@@ -1,0 +1,333 @@
+"""Walls of buildings, as upright planes from corner to corner and from the ground to the eaves.
+
+They are found where upright facets lie in one plane, from the strongest place outwards, and end where they meet the
+plane of another wall; low, short and crooked ones are dropped: fences, cars, hedges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from splatpipe.pipeline.surface.facets import Facets
+from splatpipe.pipeline.survey.boundary import DIRECTIONS
+
+SEED_M, SEED_SECTORS = 1.0, 24  # of plan and of directions: facets in it that walls are looked for from
+SEED_M2 = 4.0  # of facets, of all photos together, that a search starts from at least
+SAME_WAY = math.cos(math.radians(30.0))  # of a facet's direction and its wall's: three deviations of a facet's noise
+REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # to which a wall grows, its plane taken anew each time
+BAND_M = 0.12  # about a plane: plinths and shutters are in it, and the panes of windows are not
+BAND_GSD = 4.0  # the same of coarse photos
+CLAIM_BANDS = 4.0  # about a wall, in which nothing else is looked for
+BIN_M = 0.5  # along a wall
+GAP_M = 3.0  # between pieces of one wall: a tree before it, a gate
+CELL_M = 0.25  # of a wall's face, in which three facets tell that it is there
+CELL_FACETS = 3
+CLOSED_CELLS = 5  # over which openings are bridged
+LEAST_HEIGHT_M, LEAST_LENGTH_M, LEAST_M2 = 2.4, 2.0, 6.0  # of a wall; fences, cars and garden walls are lower
+FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
+LEAST_FLAT = 0.6  # of the facets before and behind a wall, those within its band: in hedges and trees they scatter
+CORNER_M = 0.4  # from where a wall's facets end to the plane of the next one, at most: two facets
+CORNER_COSINE = math.cos(math.radians(30.0))  # planes that meet at less than this angle make no corner
+TOP_M = 0.3  # above the last facets, which end a facet or two below the eaves
+ROUNDS = 5  # of a plane's robust fit
+
+Plan = Float64[np.ndarray, " 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """An upright plane with its extent, in local metres.
+
+    Attributes:
+        name: The direction it faces, numbered from the second on: ``south``, ``south-2``.
+        left: East and north of its left end, seen by who looks at it.
+        right: Of its right end.
+        low_m: Height of its foot.
+        high_m: Of its top.
+    """
+
+    name: str
+    left: Plan
+    right: Plan
+    low_m: float
+    high_m: float
+
+    @property
+    def length_m(self) -> float:
+        """From end to end."""
+        return float(np.linalg.norm(self.right - self.left))
+
+    @property
+    def along(self) -> Plan:
+        """Unit vector from left to right, in plan."""
+        return np.asarray((self.right - self.left) / self.length_m)
+
+    @property
+    def facing(self) -> Plan:
+        """Unit vector towards the viewer, in plan."""
+        along = self.along
+        return np.array([along[1], -along[0]])
+
+    @property
+    def area_m2(self) -> float:
+        """Of its rectangle."""
+        return self.length_m * (self.high_m - self.low_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A plane seen from above: places p with ``facing @ p == offset``."""
+
+    facing: Plan
+    offset: float
+
+    @property
+    def along(self) -> Plan:
+        return np.array([-self.facing[1], self.facing[0]])
+
+    def off(self, facets: Facets) -> Float64[np.ndarray, " n"]:
+        return np.asarray(facets.places[:, :2] @ self.facing - self.offset)
+
+    def at(self, along_m: float) -> Plan:
+        return np.asarray(self.along * along_m + self.facing * self.offset)
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """A plane and from where to where along it, and between which heights, there is a wall."""
+
+    line: _Line
+    ends: tuple[float, float]
+    heights: tuple[float, float]
+
+    def crossing(self, other: _Piece) -> float | None:
+        """Where along this one the other's plane crosses it, if the other comes near to there; else None."""
+        if abs(float(self.line.facing @ other.line.facing)) > CORNER_COSINE:
+            return None
+        if self.heights[1] < other.heights[0] or other.heights[1] < self.heights[0]:
+            return None
+        matrix = np.stack([self.line.facing, other.line.facing])
+        place = np.linalg.solve(matrix, np.array([self.line.offset, other.line.offset]))
+        theirs = float(other.line.along @ place)
+        if not other.ends[0] - CORNER_M <= theirs <= other.ends[1] + CORNER_M:
+            return None
+        return float(self.line.along @ place)
+
+
+def find_walls(facets: Facets, gsd_m: float) -> list[Wall]:
+    """The walls that facets show, by size within each direction.
+
+    Args:
+        facets: Of all photos.
+        gsd_m: Of the photos at the walls, metres: coarse ones scatter more.
+    """
+    band_m = max(BAND_M, BAND_GSD * gsd_m)
+    cells = np.floor(facets.places[:, :2] / SEED_M).astype(np.int64)
+    turn = np.arctan2(facets.facing[:, 1], facets.facing[:, 0]) / (2.0 * math.pi) * SEED_SECTORS
+    sectors = np.floor(turn).astype(np.int64) % SEED_SECTORS
+    _, seeds = np.unique(np.column_stack([cells, sectors]), axis=0, return_inverse=True)
+    seeds = seeds.reshape(-1)
+    free = np.ones(len(facets), np.bool_)
+    pieces = []
+    while len(facets):
+        weights = np.bincount(seeds[free], facets.areas[free], seeds.max() + 1)
+        strongest = int(np.argmax(weights))
+        if weights[strongest] < SEED_M2:
+            break
+        start = free & (seeds == strongest)
+        grown = _grown(facets, free, start, band_m)
+        if grown is not None:
+            line, ends = grown
+            piece = _piece(facets, line, ends, band_m)
+            if piece is not None:
+                pieces.append(piece)
+                free &= ~_around(facets, line, ends, CLAIM_BANDS * band_m)
+            else:
+                free &= ~_around(facets, line, ends, band_m)
+        free &= ~start
+    return named([_wall(piece) for piece in _cornered(pieces)])
+
+
+def named(walls: Sequence[Wall]) -> list[Wall]:
+    """Walls by the direction that they face, numbered by size: of two that face one way the larger comes first."""
+    counts: dict[str, int] = {}
+    result = []
+    for wall in sorted(walls, key=lambda wall: -wall.area_m2):
+        turn = math.atan2(wall.facing[1], wall.facing[0]) / (math.pi / 4.0)
+        direction = DIRECTIONS[round(turn) % 8]
+        counts[direction] = counts.get(direction, 0) + 1
+        number = counts[direction]
+        result.append(replace(wall, name=direction if number == 1 else f"{direction}-{number}"))
+    return result
+
+
+def stated_wall(left: Plan, right: Plan, facets: Facets) -> Wall | None:
+    """A wall in the plane that somebody states, with the heights of the facets near it; None where there are none.
+
+    Args:
+        left: East and north of its left end, seen by who looks at it.
+        right: Of its right end; another place.
+        facets: Of all photos.
+    """
+    wall = Wall("", left, right, 0.0, 0.0)
+    line = _Line(wall.facing, float(wall.facing @ left))
+    face = _face(facets, line, (float(line.along @ left), float(line.along @ right)), CLAIM_BANDS * BAND_M)
+    if face is None:
+        return None
+    low, high = _reached(face.heights)
+    return replace(wall, low_m=low, high_m=high)
+
+
+def _grown(
+    facets: Facets, free: Bool[np.ndarray, " n"], start: Bool[np.ndarray, " n"], band_m: float
+) -> tuple[_Line, tuple[float, float]] | None:
+    """The plane through facets, and how far it goes on both sides."""
+    rows = np.flatnonzero(start)
+    line = _fitted(facets.select(rows), None, 2.0 * band_m)
+    if line is None:
+        return None
+    middle = float(np.average(facets.places[rows, :2] @ line.along, weights=facets.areas[rows]))
+    ends = (middle, middle)
+    for reach in REACHES_M:
+        rows = np.flatnonzero(free)
+        near = _near(facets.select(rows), line, band_m)
+        along = facets.places[rows, :2] @ line.along
+        rows = rows[near & (np.abs(along - middle) < reach)]
+        run = _run(facets.places[rows, :2] @ line.along, middle)
+        if run is None:
+            return None
+        ends = run
+        along = facets.places[rows, :2] @ line.along
+        found = _fitted(facets.select(rows[(along >= ends[0]) & (along <= ends[1])]), line, band_m)
+        if found is None:
+            return None
+        line = found
+        middle = float(np.clip(middle, *ends))
+    return line, ends
+
+
+def _near(facets: Facets, line: _Line, band_m: float) -> Bool[np.ndarray, " n"]:
+    return np.asarray((np.abs(line.off(facets)) < band_m) & (facets.facing @ line.facing > SAME_WAY))
+
+
+def _around(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> Bool[np.ndarray, " n"]:
+    along = facets.places[:, :2] @ line.along
+    return np.asarray(_near(facets, line, band_m) & (along >= ends[0]) & (along <= ends[1]))
+
+
+def _run(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float] | None:
+    """From where to where places lie without a gap, of those about a place."""
+    if not len(along):
+        return None
+    there = np.unique(np.floor(along / BIN_M).astype(np.int64))
+    runs = np.split(there, np.flatnonzero(np.diff(there) > 1 + GAP_M / BIN_M) + 1)
+    nearest = min(runs, key=lambda run: max(run[0] - middle / BIN_M, middle / BIN_M - run[-1] - 1, 0.0))
+    return float(nearest[0] * BIN_M), float((nearest[-1] + 1) * BIN_M)
+
+
+def _fitted(facets: Facets, start: _Line | None, band_m: float) -> _Line | None:
+    """The upright plane through facets: robust least squares in plan (Tukey's biweight); None through a few.
+
+    Args:
+        facets: Near it.
+        start: What it lies near; the facets' own mean direction without.
+        band_m: Distance at which a facet counts nothing.
+    """
+    if len(facets) < CELL_FACETS:
+        return None
+    facing = np.average(facets.facing, axis=0, weights=facets.areas) if start is None else start.facing
+    facing = facing / max(float(np.linalg.norm(facing)), 1e-9)
+    line = start or _Line(facing, float(np.median(facets.places[:, :2] @ facing)))
+    plan = facets.places[:, :2]
+    for _ in range(ROUNDS):
+        weight = facets.areas * np.square(np.maximum(1.0 - np.square(line.off(facets) / band_m), 0.0))
+        if not weight.sum() > 0.0:
+            return None
+        middle = np.average(plan, axis=0, weights=weight)
+        _, axes = np.linalg.eigh((weight[:, None] * (plan - middle)).T @ (plan - middle))
+        facing = axes[:, 0] * (1.0 if axes[:, 0] @ line.facing >= 0.0 else -1.0)
+        line = _Line(facing, float(facing @ middle))
+    return line
+
+
+@dataclass(frozen=True)
+class _Face:
+    """Where on a plane there are facets: from end to end, from foot to top, and how many square metres."""
+
+    ends: tuple[float, float]
+    heights: tuple[float, float]
+    area_m2: float
+
+
+def _face(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> _Face | None:
+    """The largest connected part of a plane that facets cover."""
+    some = facets.select(_around(facets, line, ends, band_m))
+    if not len(some):
+        return None
+    along, up = some.places[:, :2] @ line.along, some.places[:, 2]
+    column = np.floor((along - ends[0]) / CELL_M).astype(np.int64)
+    row = np.floor((up - up.min()) / CELL_M).astype(np.int64)
+    count = np.zeros((row.max() + 1, column.max() + 1), np.int64)
+    np.add.at(count, (row, column), 1)
+    parts = _connected(count >= CELL_FACETS)
+    inner = parts[row, column]
+    sizes = np.bincount(parts[(count >= CELL_FACETS) & (parts > 0)], minlength=2)
+    best = int(np.argmax(sizes))
+    if sizes[best] == 0:
+        return None
+    kept = (inner == best) & (count[row, column] >= CELL_FACETS)
+    half = np.sqrt(some.areas[kept]) / 2.0
+    reached = (float((along[kept] - half).min()), float((along[kept] + half).max()))
+    heights = (float((up[kept] - half).min()), float((up[kept] + half).max()))
+    return _Face(reached, heights, float(sizes[best]) * CELL_M**2)
+
+
+def _connected(there: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
+    """Numbers of parts that hang together, openings and gaps bridged; 0 where there is nothing."""
+    across = 2 * round(GAP_M / CELL_M / 2.0) + 1
+    wide = np.pad(there.astype(np.uint8), ((CLOSED_CELLS, CLOSED_CELLS), (across, across)))
+    wide = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((CLOSED_CELLS, across), np.uint8)))
+    parts = np.asarray(cv2.connectedComponents(wide, connectivity=8)[1])
+    return parts[CLOSED_CELLS : len(parts) - CLOSED_CELLS, across:-across].astype(np.int64)
+
+
+def _piece(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> _Piece | None:
+    """What of a plane is a wall; None where it is too low, too short, too small or too crooked for one."""
+    face = _face(facets, line, ends, band_m)
+    if face is None or face.area_m2 < LEAST_M2:
+        return None
+    if face.heights[1] - face.heights[0] < LEAST_HEIGHT_M or face.ends[1] - face.ends[0] < LEAST_LENGTH_M:
+        return None
+    around = facets.areas[_around(facets, line, face.ends, CLAIM_BANDS * band_m)].sum()
+    flat = facets.areas[_around(facets, line, face.ends, band_m)].sum()
+    return _Piece(line, face.ends, face.heights) if flat >= LEAST_FLAT * around else None
+
+
+def _cornered(pieces: Sequence[_Piece]) -> list[_Piece]:
+    """The same, each of its ends in the plane of another wall that it meets there, without low ones that meet none."""
+    result = []
+    for piece in pieces:
+        met = [place for other in pieces if other is not piece and (place := piece.crossing(other)) is not None]
+        ends = []
+        for end in piece.ends:
+            near = min(((abs(place - end), place) for place in met), default=(math.inf, end))
+            ends.append(near[1] if near[0] <= CORNER_M else end)
+        if (ends[0], ends[1]) != piece.ends or piece.heights[1] - piece.heights[0] >= FREE_HEIGHT_M:
+            result.append(replace(piece, ends=(ends[0], ends[1])))
+    return result
+
+
+def _wall(piece: _Piece) -> Wall:
+    left, right = (piece.line.at(end) for end in piece.ends)
+    return Wall("", left, right, *_reached(piece.heights))
+
+
+def _reached(heights: tuple[float, float]) -> tuple[float, float]:
+    """To where a wall goes whose facets lie between some heights."""
+    return heights[0], heights[1] + TOP_M

@@ -1,0 +1,203 @@
+"""Surface products as files, of a scene whose heights and colours are known, in a frame of local metres."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
+from splatpipe.pipeline.surface.grid import make_grid
+from splatpipe.pipeline.surface.heights import Capture, tile_heights
+from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.sheet import grid_sheets
+from splatpipe.pipeline.surface.site import Site, load_site, save_site, survey_site
+from splatpipe.pipeline.surface.sources import DepthSource, Shelf
+from splatpipe.pipeline.surface.tiles import Tile
+from splatpipe.pipeline.survey.frames import Frame, Origin
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from house_site import cameras, depths_of, edge_distance, photo_of, true_height, true_orthophoto
+
+FRAME = Frame("arbitrary", Similarity.identity(), metres=True)
+IN_UTM = Frame("enu", Similarity.identity(), Origin(50.1, 14.2, 300.0), "ellipsoidal", crs="EPSG:32633")
+CELL_M = 0.2
+HOUSE = PlanArea.seen_from_above([(np.array([[-5.45, -4.45], [5.45, -4.45], [5.45, 4.45], [-5.45, 4.45]]),)])
+
+
+@dataclass
+class Told:
+    """A reporter that may interrupt.
+
+    Attributes:
+        stop_after: Calls of ``progress`` after which it does.
+    """
+
+    stop_after: int = 1 << 30
+    calls: int = 0
+
+    def progress(self, *_told: object) -> None:
+        self.calls += 1
+        if self.calls > self.stop_after:
+            raise KeyboardInterrupt
+
+    def metric(self, *_told: object) -> None: ...
+    def note(self, *_told: object) -> None: ...
+    def warning(self, *_told: object) -> None: ...
+
+
+@cache
+def sources() -> tuple[DepthSource, ...]:
+    found = [depths_of(camera) for camera in cameras()]
+    return tuple(DepthSource(each.camera, lambda each=each: each) for each in found)
+
+
+@cache
+def site() -> Site:
+    found = survey_site(sources(), [1.0] * len(sources()), None, 1)
+    assert found is not None
+    return found
+
+
+def dsm(folder: Path, area: PlanArea | None = HOUSE, report: Any = None) -> dict[str, Any]:
+    task = DsmTask(FRAME, site(), sources(), area, CELL_M, 1)
+    return make_dsm(task, folder / "work", folder, report or Told())
+
+
+def ortho(folder: Path, report: Any = None) -> dict[str, Any]:
+    photos = [PhotoSource(source.camera, lambda source=source: photo_of(source.camera), source) for source in sources()]
+    task = OrthoTask(FRAME, site(), photos, folder / "dsm.tif", CELL_M, HOUSE, CELL_M / 2, 1)
+    return make_ortho(task, folder / "ortho_work", folder, report or Told())
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("products")
+    dsm(folder)
+    ortho(folder)
+    return folder
+
+
+def centres(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bands, and east and north of their cells."""
+    with rasterio.open(path) as raster:
+        columns, rows = np.meshgrid(np.arange(raster.width) + 0.5, np.arange(raster.height) + 0.5)
+        t = raster.transform
+        return raster.read(), t.c + t.a * columns, t.f + t.e * rows
+
+
+def test_a_site_is_as_large_and_as_fine_as_its_photos() -> None:
+    found = site()
+    assert 0.09 < found.gsd_m < 0.13  # 20 m away, 200 pixels of focal length; those around are nearer to the house
+    assert found.low_m < -2.0
+    assert 5.0 < found.high_m < 10.0
+    west, south, east, north = found.reach
+    assert west < -11.0 < 11.0 < east
+    assert south < -9.0 < 9.0 < north
+    assert found.sees(np.array([[0.0, 0.0], [1.0, 1.0]]))
+    assert not found.sees(np.array([[500.0, 0.0], [501.0, 1.0]]))
+
+
+def test_a_site_ends_at_its_boundary() -> None:
+    found = survey_site(sources(), [1.0] * len(sources()), HOUSE, 1)
+    assert found is not None
+    assert np.abs(found.reach).max() <= 5.5
+
+
+def test_a_site_is_read_as_it_was_written(tmp_path: Path) -> None:
+    save_site(tmp_path / "site.json", site(), 0.25)
+    loaded = load_site(tmp_path / "site.json")
+    assert loaded is not None
+    assert loaded[1] == 0.25
+    assert np.array_equal(loaded[0].covered, site().covered)
+    for field in ("gsd_m", "low_m", "high_m", "reach", "corner", "cell_m"):
+        assert getattr(loaded[0], field) == getattr(site(), field)
+    save_site(tmp_path / "none.json", None)
+    assert load_site(tmp_path / "none.json") is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"rows": 9e9}', '"site"', "\x00"])
+def test_a_broken_site_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "site.json").write_text(text)
+    with pytest.raises(StageError, match=r"site\.json"):
+        load_site(tmp_path / "site.json")
+
+
+def test_heights_are_where_they_are_and_end_at_the_boundary(made: Path) -> None:
+    (height,), east, north = centres(made / "dsm.tif")
+    known = height != -9999.0
+    inside = HOUSE.contains(np.stack([east.ravel(), north.ravel(), 0 * east.ravel()], axis=1)).reshape(east.shape)
+    assert known[inside].mean() > 0.99
+    assert not known[~inside].any()
+    clear = known & (edge_distance(east, north) > 2 * CELL_M)
+    assert np.abs(height - true_height(east, north))[clear].max() < 0.02
+
+
+def test_confidence_tells_photos_and_millimetres(made: Path) -> None:
+    (height,), _, _ = centres(made / "dsm.tif")
+    (photos, sigma), _, _ = centres(made / "dsm_confidence.tif")
+    known = height != -9999.0
+    assert (photos[known] >= 1).all()
+    assert np.median(photos[known]) >= 3
+    assert (photos[~known] == 0).all()
+    assert 5 < np.median(sigma[known]) < 100
+
+
+def test_contours_are_there_in_cad_and_not_on_a_map_without_a_place(made: Path) -> None:
+    assert (made / "contours.dxf").stat().st_size > 1000
+    assert not (made / "contours.geojson").exists()
+
+
+def test_the_orthophoto_lies_on_the_surface_model(made: Path) -> None:
+    bands, east, north = centres(made / "ortho.tif")
+    assert (bands[3] > 0).sum() * (CELL_M / 2) ** 2 == pytest.approx(95.04, rel=0.01)
+    off = ((np.arange(4) + 0.5) / 4 - 0.5) * CELL_M / 2
+    true = np.mean([true_orthophoto(east + e, north + n) for e in off for n in off], axis=0)
+    wrong = np.square(np.moveaxis(bands[:3], 0, -1) - true)[bands[3] > 0]
+    assert 10 * np.log10(255**2 / wrong.mean()) > 28.0
+
+
+@pytest.mark.parametrize("product", [dsm, ortho])
+def test_an_interrupted_product_goes_on_with_the_same_bytes(made: Path, tmp_path: Path, product: Callable) -> None:
+    for name in ("dsm.tif",) if product is ortho else ():
+        (tmp_path / name).write_bytes((made / name).read_bytes())
+    with pytest.raises(KeyboardInterrupt):
+        product(tmp_path, report=Told(stop_after=0))
+    assert not (tmp_path / ("dsm.tif" if product is dsm else "ortho.tif")).exists()
+    product(tmp_path)
+    again = Told()
+    product(tmp_path, report=again)
+    assert again.calls == 0  # all sheets were there
+    for path in tmp_path.glob("*.tif"):
+        assert path.read_bytes() == (made / path.name).read_bytes()
+
+
+def test_sheets_of_a_grid_agree_where_they_meet() -> None:
+    grid = make_grid(IN_UTM, np.array([[-6.0, -4.0, -1.0], [6.0, 4.0, 8.0]]), CELL_M)
+    low, high = 299.0, 308.0
+    whole = np.full((grid.height, grid.width), np.nan)
+    for sheet in grid_sheets(grid, low, high, side=25):
+        plane, part = sheet.sheet, sheet.part
+        moved = Capture(plane.depths(sources()), plane.lattice, plane.relief, Shelf(1 << 30))
+        found = tile_heights(moved, Tile(0, 0, part.height, part.width))
+        heights = sheet.heights(found.tile, found.height)
+        whole[part.row : part.row + part.height, part.column : part.column + part.width] = heights
+        back = sheet.over(grid, part, heights)
+        assert np.allclose(back, found.height, atol=1e-4, equal_nan=True)
+        lattice = sheet.lattice_of(grid, part)
+        assert (lattice.width, lattice.height) == (plane.lattice.width, plane.lattice.height)
+        assert np.allclose([lattice.east_m, lattice.north_m], [plane.lattice.east_m, plane.lattice.north_m], atol=1e-6)
+    local = grid.centres_in_local(Tile(0, 0, grid.height, grid.width), np.where(np.isnan(whole), low, whole))
+    east, north, up = np.moveaxis(local, -1, 0)
+    clear = np.isfinite(whole) & (edge_distance(east, north) > 2 * CELL_M)
+    assert clear.mean() > 0.7
+    assert np.abs(up - true_height(east, north))[clear].max() < 0.02

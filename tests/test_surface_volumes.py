@@ -1,0 +1,190 @@
+"""Volumes of solids whose volume is known, and how far noise moves them."""
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.surface.grid import Grid, make_grid
+from splatpipe.pipeline.surface.surface_file import SurfaceFile, open_surface
+from splatpipe.pipeline.surface.volume_file import write_volumes
+from splatpipe.pipeline.surface.volumes import SHARED_CELLS, measure_volume
+from splatpipe.pipeline.survey.frames import Frame, Origin
+
+CELL_M = 0.1
+BOX = np.array([[-15.0, -12.0, -5.0], [15.0, 12.0, 10.0]])
+LOCAL = Frame("arbitrary", Similarity.identity(), metres=True)
+PLACED = Frame("enu", Similarity.identity(), Origin(47.83, 13.51, 512.0), "ellipsoidal", crs="EPSG:32633")
+IN_FEET = Frame("enu", Similarity.identity(), Origin(47.83, 13.51, 512.0), "ellipsoidal", crs="EPSG:3857")
+NOISE_M = 0.03
+
+
+@cache
+def grid_of(crs: str) -> Grid:
+    return make_grid({"local": LOCAL, "utm": PLACED, "mercator": IN_FEET}[crs], BOX, CELL_M)
+
+
+def plain_file(path: Path, grid: Grid, bands: np.ndarray, nodata: float) -> None:
+    """As anybody's program writes it."""
+    size = {"width": grid.width, "height": grid.height, "count": len(bands), "dtype": bands.dtype, "nodata": nodata}
+    with rasterio.open(path, "w", driver="GTiff", transform=grid.transform, crs=grid.crs.horizontal, **size) as file:
+        file.write(np.where(np.isfinite(bands), bands, nodata).astype(bands.dtype))
+
+
+def surface_file(
+    folder: Path, grid: Grid, local_height: np.ndarray, sigma_m: float | None = None, name: str = "dsm"
+) -> SurfaceFile:
+    """Heights over the local plane as files in the CRS."""
+    tile = next(iter(grid.tiles(4096)))
+    places = grid.centres_in_local(tile, np.zeros((grid.height, grid.width)))
+    places[..., 2] = local_height
+    heights = grid.cells_from_local(places.reshape(-1, 3))[:, 2].reshape(local_height.shape)
+    plain_file(folder / f"{name}.tif", grid, heights[None].astype(np.float32), -9999.0)
+    if sigma_m is None:
+        return open_surface(folder / f"{name}.tif")
+    told = np.full((2, grid.height, grid.width), round(sigma_m * 1000.0), np.uint16)
+    plain_file(folder / f"{name}_confidence.tif", grid, told, 0.0)
+    return open_surface(folder / f"{name}.tif", folder / f"{name}_confidence.tif")
+
+
+def plan_of(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    places = grid.centres_in_local(next(iter(grid.tiles(4096))), np.full((grid.height, grid.width), 0.0))
+    return places[..., 0], places[..., 1]
+
+
+def square(half_m: float) -> PlanArea:
+    ring = np.array([[-half_m, -half_m], [half_m, -half_m], [half_m, half_m], [-half_m, half_m]])
+    return PlanArea.seen_from_above([(ring,)])
+
+
+def cone(east: np.ndarray, north: np.ndarray, radius_m: float = 6.0, height_m: float = 4.0) -> np.ndarray:
+    return height_m * np.maximum(1.0 - np.hypot(east, north) / radius_m, 0.0)
+
+
+CONE_M3 = math.pi * 6.0**2 * 4.0 / 3.0
+
+
+@pytest.mark.parametrize("crs", ["local", "utm", "mercator"])
+def test_a_cone_on_a_slope_has_its_volume_on_the_ground(tmp_path: Path, crs: str) -> None:
+    grid = grid_of(crs)
+    east, north = plan_of(grid)
+    surface = surface_file(tmp_path, grid, 0.05 * east - 0.02 * north + cone(east, north))
+    found = measure_volume(surface, square(8.0), grid.crs, "rim")
+    assert found.cut.m3 == pytest.approx(CONE_M3, rel=2e-3)
+    assert found.fill.m3 < 0.2  # of heights on whole steps, over 256 m²
+    assert found.area_m2 == pytest.approx(256.0, rel=1e-4)
+    assert found.known_m2 == pytest.approx(256.0, rel=2e-3)
+    assert found.base.misfit_m is not None
+    assert found.base.misfit_m < 1e-3
+
+
+def test_a_pit_is_filled_and_a_prism_cut(tmp_path: Path) -> None:
+    grid = grid_of("local")
+    east, north = plan_of(grid)
+    pit = (np.abs(east + 4.0) < 2.0) & (np.abs(north) < 2.0)
+    prism = (np.abs(east - 4.0) < 2.0) & (np.abs(north) < 3.0)
+    surface = surface_file(tmp_path, grid, np.where(pit, -1.0, np.where(prism, 2.0, 0.0)))
+    for base in ("rim", "lowest", 0.0):
+        found = measure_volume(surface, square(8.0), grid.crs, base)
+        assert found.cut.m3 == pytest.approx(48.0, rel=5e-3)
+        assert found.fill.m3 == pytest.approx(16.0, rel=5e-3)
+        assert found.net.m3 == pytest.approx(32.0, rel=5e-3)
+    above = measure_volume(surface, square(8.0), grid.crs, -1.0)
+    assert above.cut.m3 == pytest.approx(32.0 + 256.0, rel=5e-3)
+
+
+def test_an_outline_cuts_cells(tmp_path: Path) -> None:
+    grid = grid_of("local")
+    surface = surface_file(tmp_path, grid, np.ones((grid.height, grid.width)))
+    triangle = PlanArea.seen_from_above([(np.array([[0.03, 0.02], [4.01, 0.57], [1.53, 3.96]]),)])
+    found = measure_volume(surface, triangle, grid.crs, 0.0)
+    assert found.cut.m3 == pytest.approx(triangle.size(), rel=3e-3)
+    hole = PlanArea.seen_from_above([(square(5.0).polygons[0][0], square(2.0).polygons[0][0])])
+    assert measure_volume(surface, hole, grid.crs, 0.0).cut.m3 == pytest.approx(84.0, rel=2e-3)
+
+
+def noise_of(seed: int, shape: tuple[int, int]) -> np.ndarray:
+    """Noise that neighbours share as the module says."""
+    field = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(shape), (0, 0), SHARED_CELLS)
+    return np.asarray(field * (NOISE_M * 2.0 * math.sqrt(math.pi) * SHARED_CELLS))  # of a blur of white noise
+
+
+TRIALS = 24
+
+
+def test_the_uncertainty_is_that_of_many_trials(tmp_path: Path) -> None:
+    grid = make_grid(LOCAL, np.array([[-5.0, -5.0, -1.0], [5.0, 5.0, 5.0]]), CELL_M)
+    east, north = plan_of(grid)
+    true = cone(east, north, 3.5, 2.0)
+    trials = []
+    for seed in range(TRIALS):
+        surface = surface_file(tmp_path, grid, true + noise_of(seed, true.shape), NOISE_M)
+        trials.append([measure_volume(surface, square(4.0), grid.crs, base).net for base in ("rim", 0.0)])
+    for nets in zip(*trials, strict=True):
+        found = np.array([net.m3 for net in nets])
+        told = float(np.median([net.sigma_m3 for net in nets]))
+        assert 0.6 < found.std() / told < 1.5  # the deviation of so few is within 40 % of its own in 99 % of cases
+        assert abs(found.mean() - math.pi * 3.5**2 * 2.0 / 3.0) < 4.0 * told / math.sqrt(TRIALS) + 0.05
+
+
+def test_a_stated_height_has_the_datums_uncertainty(tmp_path: Path) -> None:
+    grid = grid_of("local")
+    surface = surface_file(tmp_path, grid, np.ones((grid.height, grid.width)), 0.001)
+    loose = measure_volume(surface, square(5.0), grid.crs, 0.0, datum_sigma_m=0.05)
+    assert loose.net.sigma_m3 == pytest.approx(100.0 * 0.05, rel=0.02)
+    assert measure_volume(surface, square(5.0), grid.crs, "rim", datum_sigma_m=0.05).net.sigma_m3 < 0.1
+
+
+def test_what_has_no_height_is_told_and_not_filled(tmp_path: Path) -> None:
+    grid = grid_of("local")
+    east, north = plan_of(grid)
+    surface = surface_file(tmp_path, grid, np.where((np.abs(east) < 2.0) & (np.abs(north) < 2.0), np.nan, 1.0))
+    found = measure_volume(surface, square(4.0), grid.crs, 0.0)
+    assert found.cut.m3 == pytest.approx(48.0, rel=5e-3)
+    assert found.area_m2 - found.known_m2 == pytest.approx(16.0, rel=2e-2)
+
+
+def test_a_base_that_nobody_knows_is_refused(tmp_path: Path) -> None:
+    grid = grid_of("local")
+    east, _ = plan_of(grid)
+    surface = surface_file(tmp_path, grid, np.where(np.abs(east) < 2.0, 1.0, np.nan))
+    with pytest.raises(SplatpipeError, match="outline has heights"):
+        measure_volume(surface, square(4.0), grid.crs, "rim")
+    away = PlanArea.seen_from_above([(square(4.0).polygons[0][0] + 100.0,)])
+    with pytest.raises(SplatpipeError, match="no heights inside"):
+        measure_volume(surface, away, grid.crs, 0.0)
+
+
+def test_the_file_tells_each_polygon_in_plain_units(tmp_path: Path) -> None:
+    grid = grid_of("utm")
+    east, north = plan_of(grid)
+    surface = surface_file(tmp_path, grid, cone(east, north), 0.01)
+    both = PlanArea.seen_from_above([*square(8.0).polygons, (square(1.0).polygons[0][0] + 9.5,)])
+    told = write_volumes(tmp_path / "volumes.json", surface, both, grid.crs, "lowest")
+    read = json.loads((tmp_path / "volumes.json").read_text())
+    assert read["volumes"] == told
+    assert [row["polygon"] for row in told] == [1, 2]
+    assert told[0]["cut_m3"] == pytest.approx(CONE_M3, rel=5e-3)
+    assert told[0]["base"]["height_m"] == pytest.approx(512.0, abs=2e-3)
+    assert told[1]["net_m3"] == pytest.approx(0.0, abs=0.01)
+    assert 0.0 < told[0]["net_sigma_m3"] < 5.0
+    assert told[0]["share_without_height"] < 2e-3
+
+
+def test_a_file_on_another_grid_is_refused(tmp_path: Path) -> None:
+    grid, other = grid_of("local"), make_grid(LOCAL, BOX / 2.0, CELL_M)
+    surface_file(tmp_path, grid, np.zeros((grid.height, grid.width)), 0.01)
+    surface_file(tmp_path, other, np.zeros((other.height, other.width)), 0.01, "other")
+    with pytest.raises(SplatpipeError, match="not on the grid"):
+        open_surface(tmp_path / "dsm.tif", tmp_path / "other_confidence.tif")
+    (tmp_path / "text.tif").write_text("no raster")
+    with pytest.raises(SplatpipeError, match="cannot be read"):
+        open_surface(tmp_path / "text.tif")
