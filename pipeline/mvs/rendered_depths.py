@@ -16,8 +16,8 @@ from jaxtyping import Float
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import DepthMap, confirmed_map
-from splatpipe.pipeline.mvs.depth_search import COMPARED, agreement_of
+from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_map
+from splatpipe.pipeline.mvs.depth_search import agreement_of
 from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
 from splatpipe.pipeline.mvs.patch_match import Depths
 
@@ -48,7 +48,7 @@ def rendered_depth_maps(
         _keep(folder / f"{number}.npy", partial(depth_of, camera))
         report.progress(number + 1, len(cameras), "rendering depths", "photos")
     tracks = load_tracks(dataset, [camera.name for camera in cameras])
-    near = neighbours(tracks, cameras, COMPARED)
+    near = neighbours(tracks, cameras, ASKED)
 
     def confirmed(number: int) -> DepthMap:
         agreement = agreement_of(number, cameras, near[number], partial(_kept, folder))
