@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +49,10 @@ def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) 
     cameras = [reduced_camera(view.camera, size) for view in load_views(dataset)]
     rendered.mkdir(exist_ok=True)
     with same_bits(inputs.machine.threads):
-        depth_of = partial(render, placed, options=options)
+
+        def depth_of(camera: Camera) -> Float[np.ndarray, "h w"]:
+            return render(placed, camera, options)
+
         found = rendered_depth_maps(depth_of, dataset, cameras, rendered, inputs.machine.threads, report)
         summary = keep_depth_maps(maps, found)
     shutil.rmtree(rendered)
