@@ -25,6 +25,8 @@ MARGIN = NEAR + FAR + 1  # cells around a tile that its holes look at
 BEHIND = 8  # photos that see a surface are worth one that looks through it: depths make what is near too wide
 FEW = 2  # photos that agree on a height, which counts where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
+MOST_VOTES = 4_000_000  # cells times photos at once: 200 MB while they are sorted
+LEAST_CELLS = 1 << 12  # of a tile that is not made in parts: margins would be the most of it
 MOST = np.iinfo(np.uint8).max
 
 
@@ -89,10 +91,18 @@ def surface_heights(capture: Capture, tiles: Sequence[Tile], threads: int) -> It
     return ordered_map(partial(tile_heights, capture), tiles, threads)
 
 
-def tile_heights(capture: Capture, tile: Tile) -> Heights:
-    """Heights of one tile."""
+def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Heights:
+    """Heights of one tile.
+
+    Args:
+        capture: Photos and cells.
+        tile: Which.
+        most: Cells times photos at once; larger ones are made in parts.
+    """
     wide = tile.grown(MARGIN)
     seen = seen_by([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
+    if len(seen) * wide.cells > most and tile.cells > LEAST_CELLS:
+        return _joined(tile, [tile_heights(capture, half, most) for half in tile.halves()])
     votes = Votes(capture.lattice, wide, capture.relief)
     for number, window in seen:
         votes.add(capture.depths(number), window)
@@ -147,6 +157,13 @@ def _may_see(
         view = sight(capture.depths(number), (east, north, height), capture.lattice.cell_m)
         count += view.seen | view.unknown
     return count
+
+
+def _joined(tile: Tile, halves: Sequence[Heights]) -> Heights:
+    """Of what a tile's halves are."""
+    axis = 0 if halves[0].tile.width == tile.width else 1
+    columns = zip(*((half.height, half.sigma, half.photos) for half in halves), strict=True)
+    return Heights(tile, *(np.concatenate(column, axis=axis) for column in columns))
 
 
 def _empty(tile: Tile) -> Heights:
