@@ -130,7 +130,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=5,
+    version=6,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views", "georef.boundary"),
     parts={"splat": "init.ply"},

@@ -194,7 +194,7 @@ def test_a_hole_at_a_wall_is_ground_and_a_wide_one_stays() -> None:
     height[:, :5] = 3.0
     height[3:6, 5] = np.nan
     height[:, 12:24] = np.nan
-    result, new = filled(height, 0.1)
+    result, new = filled(height, 0.1, 4)
     assert new[4, 5]
     assert result[4, 5] == 0.0
     assert np.isnan(result[:, 16:20]).all()

@@ -286,6 +286,29 @@ def look(
         ValueError: if sizes do not fit.
     """
 
+def confirm(
+    inverse: np.ndarray,
+    camera: _Camera,
+    places: _Places,
+    agreeing: tuple[float, float, float, float],
+    sums: np.ndarray,
+    votes: np.ndarray,
+) -> None:
+    """Where a photo's inverse depths put places along its rays, and whether that is where they are.
+
+    Args:
+        inverse: (height, width), float32; 0 where there is none.
+        camera: In that grid.
+        places: One-dimensional.
+        agreeing: Share of the depth within which two agree; far away as many pixels in the other photo, at most another
+            share; and the two photos' parallax of something one unit deep, pixels.
+        sums: (n, 3), float64; the place is added where they agree.
+        votes: (n,), uint8; grows by one there.
+
+    Raises:
+        ValueError: if sizes do not fit.
+    """
+
 def rate(camera: _Camera, places: _Places, cell: float, said: np.ndarray, cost: np.ndarray, seen: np.ndarray) -> int:
     """What it costs to colour places by a photo, and whether it sees them; returns how many it sees.
 

@@ -1,35 +1,35 @@
-"""Small holes in a height model, filled from their surroundings."""
+"""Holes in a height model, filled from their surroundings."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-REACH = 4  # cells: wider holes stay
 SIDES = 3  # of the four directions in which there has to be something within reach
 STEP_CELLS = 3.0  # heights this many cells above the lowest around are another surface: a hole at a wall is ground
 
 
 def filled(
-    height: Float64[np.ndarray, "h w"], cell_m: float
+    height: Float64[np.ndarray, "h w"], cell_m: float, reach: int
 ) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Fill cells that have heights near by on three sides at least.
 
     Args:
-        height: Metres, nan in holes; looked at within ``REACH`` cells of each.
+        height: Metres, nan in holes.
         cell_m: Side of a cell.
+        reach: Cells that are looked at on each side: wider holes stay.
 
     Returns:
         The heights, and which are new. What lies behind an edge is hidden rather than the edge itself, so a hole
         between two surfaces takes the lower one's.
     """
     rows, columns = np.nonzero(np.isnan(height))
-    wide = np.pad(height, REACH, constant_values=np.nan)
+    wide = np.pad(height, reach, constant_values=np.nan)
     values, nearness = [], []
     for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         value, distance = np.full(len(rows), np.nan), np.full(len(rows), np.inf)
-        for step in range(REACH, 0, -1):
-            there = wide[rows + REACH + step * down, columns + REACH + step * right]
+        for step in range(reach, 0, -1):
+            there = wide[rows + reach + step * down, columns + reach + step * right]
             known = np.isfinite(there)
             value[known], distance[known] = there[known], step
         values.append(value)

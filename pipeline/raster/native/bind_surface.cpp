@@ -128,6 +128,20 @@ std::int64_t rate(const Camera& given, const PlaceArrays& points, double cell, c
     return SPLAT_KERNELS(sight_kernels).rate(camera, places, cell, said.data(), cost.data(), seen.data());
 }
 
+void confirm(const Plane<const float>& inverse, const Camera& given, const PlaceArrays& points,
+             const std::array<double, 4>& agreeing, const Plane<double>& sums, const Row<std::uint8_t>& votes) {
+    const splat::SurfaceCamera camera = camera_of(given);
+    const splat::Places places = places_of(points);
+    const std::size_t size = std::get<2>(points).size();
+    require(is_size(camera, inverse.shape(0), inverse.shape(1)), "depths that are not of the camera's size");
+    require(sums.shape(0) == size && sums.shape(1) == 3 && votes.size() == size, "results of another size");
+    require(all_finite(agreeing.data(), 4) && agreeing[3] > 0.0, "photos without a parallax");
+    const nb::gil_scoped_release released;
+    SPLAT_KERNELS(sight_kernels)
+        .confirm(camera, inverse.data(), places, {agreeing[0], agreeing[1], agreeing[2], agreeing[3]}, sums.data(),
+                 votes.data());
+}
+
 splat::Photo photo_of(const Picture& given) {
     const auto& [pixels, tone, camera, lens] = given;
     splat::Photo photo{};
@@ -244,6 +258,8 @@ void bind_surface(nb::module_& m) {
           "said"_a.noconvert());
     m.def("rate", &rate, "camera"_a, "places"_a, "cell"_a, "said"_a.noconvert(), "cost"_a.noconvert(),
           "seen"_a.noconvert());
+    m.def("confirm", &confirm, "inverse"_a.noconvert(), "camera"_a, "places"_a, "agreeing"_a, "sums"_a.noconvert(),
+          "votes"_a.noconvert());
     m.def("sample_photo", &sample_photo, "photo"_a, "places"_a, "cell"_a, "seen"_a.noconvert(), "colour"_a.noconvert());
     m.def("compose_mosaic", &compose_mosaic, "seen"_a.noconvert(), "cost"_a.noconvert(), "colour"_a.noconvert(),
           "parity"_a, "label"_a.noconvert(), "blended"_a.noconvert());
