@@ -64,7 +64,7 @@ def robust() -> Technique:
 
 
 def distortion() -> Technique:
-    made, model = Distortion(0.1, iterations=1), Gaussians.empty(5, 0)
+    made, model = Distortion(0.1, after=0), Gaussians.empty(5, 0)
     made.settings(RenderOptions(0), model, CAMERAS[0], a_moment(1))  # its first look is allowed to wait
     return made
 

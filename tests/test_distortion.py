@@ -87,7 +87,7 @@ def test_gradient_agrees_with_finite_differences() -> None:
 
 
 def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> None:
-    distortion = Distortion(0.1, iterations=100)
+    distortion = Distortion(0.1, after=20)
     assert not distortion.is_counted(20) and distortion.is_counted(21)
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras()]
     for weight in (0.0, 0.1):
@@ -98,7 +98,7 @@ def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> N
 def test_on_a_device_the_centre_is_looked_for_seldom_and_goes_on_through_a_checkpoint() -> None:
     model, camera, options = layers((4.0, 6.0), 0.6), FRONT, rasterizer.RenderOptions(0)
     for device, moves in (("cpu", True), ("meta", False)):
-        distortion = Distortion(0.1, iterations=1)
+        distortion = Distortion(0.1, after=0)
         moment = make_schedule().at(CENTRE_EVERY, 0)
         distortion.settings(options, model, camera, moment)
         moved = replace(model, means=model.means + 1.0)
@@ -106,7 +106,7 @@ def test_on_a_device_the_centre_is_looked_for_seldom_and_goes_on_through_a_check
         later = make_schedule().at(CENTRE_EVERY + 1, 0)
         found = distortion.settings(options, elsewhere, camera, later).depth_origin
         assert found == pytest.approx(6.0 if moves else 5.0)
-        other = Distortion(0.1, iterations=1)
+        other = Distortion(0.1, after=0)
         other.load(distortion.to_arrays())
         assert other.settings(options, elsewhere, camera, later).depth_origin == found
 

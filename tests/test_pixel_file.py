@@ -58,7 +58,9 @@ def test_photos_that_memory_holds_stay_as_they_are(tmp_path: Path) -> None:
 
 
 def test_what_the_disk_has_no_room_for_stays_as_it_is(tmp_path: Path) -> None:
-    vast = PhotoSource(CAMERA, lambda: np.zeros((0, 0, 3), np.uint8), None, Lens(1 << 30, 1 << 30, 8.0, np.zeros(())))
+    vast = PhotoSource(
+        CAMERA, lambda: np.zeros((0, 0, 3), np.uint8), None, Lens(1 << 30, 1 << 30, 8.0, np.zeros((2, 2, 2)))
+    )
     with pixels_on_disk([vast], tmp_path, held_bytes=1000) as mapped:
         assert mapped == [vast]
 

@@ -14,7 +14,6 @@ from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, rated, sampled
 from splatpipe.pipeline.surface.sight import Points, place_in, sight
-from splatpipe.pipeline.surface.slopes import slopes
 from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, native_camera, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import Votes
@@ -59,8 +58,7 @@ def everything() -> list[np.ndarray]:
     made, points = votes(), places()
     layers = made.layers()
     fit = made.fitted(layers[0].height)
-    slant = [slopes(depths.depth, depths.camera.fx) for depths in maps()]
-    found = slant + [part for layer in layers for part in (layer.height, layer.count, layer.cover)]
+    found = [part for layer in layers for part in (layer.height, layer.count, layer.cover)]
     found += [fit.height, fit.sigma, fit.photos]
     offers = []
     for camera, depths in zip(cameras()[::3], maps(), strict=True):
@@ -124,22 +122,6 @@ def test_the_robust_mean_is_tukeys() -> None:
     assert np.array_equal(np.isnan(fit.sigma), ~known)
     assert not fit.photos[~known].any()
     assert np.isnan(made.fitted(np.full_like(start, np.nan)).height).all()
-
-
-def test_slopes_are_a_planes_and_unknown_without_neighbours() -> None:
-    row, column = np.mgrid[:30, :90]
-    depth = (1.0 / (0.05 + 1e-5 * column - 2e-5 * row)).astype(np.float32)
-    depth[10:20, 40:50] = 0.0
-    depth[14, 44] = 20.0
-    depth[:, 70:] *= 0.7  # a step
-    found = slopes(depth, 100.0)
-    known = (depth > 0.0) & (np.arange(90) < 70)
-    known[14, 44] = False
-    assert np.abs(found[0][known] - 1e-5).max() < 1e-7  # of float32 near 0.05
-    assert np.abs(found[1][known] + 2e-5).max() < 1e-7
-    assert np.isnan(found[:, 14, 44]).all()
-    assert np.isnan(found[:, depth == 0.0]).all()
-    assert np.abs(found[0][:, 70] - 1e-5 / 0.7).max() < 1e-7
 
 
 @pytest.mark.parametrize("number", range(3))
@@ -245,9 +227,6 @@ def test_photos_that_do_not_fit_are_refused() -> None:
     size = points[0].shape
     pixels, said, cost = np.zeros((180, 240, 3), np.uint8), np.zeros(size, np.uint8), np.zeros(size, np.uint16)
     depth, colour = np.ones((180, 240), np.float32), np.zeros((*size, 3), np.uint8)
-    for bad in ((depth[:0], 200.0), (depth, 0.0), (depth, np.nan), (depth.astype(np.float64), 200.0)):
-        refused(_native.slopes, *bad, np.empty((2, *bad[0].shape), np.float32))
-    refused(_native.slopes, depth, 200.0, np.empty((2, 180, 239), np.float32))
     refused(_native.look, depth[1:], camera, points, None, 0.0, said)
     refused(_native.look, depth, camera, points, None, 0.0, said[1:])
     refused(_native.look, depth, camera, points, np.zeros(3), 0.0, said)

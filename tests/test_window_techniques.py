@@ -89,7 +89,7 @@ def the_sky() -> SkyModel:
 def said(photos: list[TrainingPhoto], weights: list[float], penalties: bool) -> dict[str, Tensor]:
     """The weighted loss of some photos with its gradients by all that is trained."""
     model, sky, exposure = gaussians(), the_sky(), Exposure([CAMERA.name, "another"])
-    each = (sky, exposure, Distortion(0.5, 100)) if penalties else (exposure,)
+    each = (sky, exposure, Distortion(0.5, 20)) if penalties else (exposure,)
     techniques = Techniques(each)
     total = torch.zeros(())
     for photo, weight in zip(photos, weights, strict=True):
@@ -287,5 +287,5 @@ def test_a_window_that_shows_nothing_of_a_cell_leaves_what_is_known_of_it() -> N
 
 
 def test_the_moment_is_one_in_which_everything_takes_part() -> None:
-    assert isinstance(LATE, Moment) and Distortion(0.5, 100).is_counted(LATE.place)
+    assert isinstance(LATE, Moment) and Distortion(0.5, 20).is_counted(LATE.place)
     assert np.isfinite(gaussians().means.detach().numpy()).all()

@@ -21,7 +21,7 @@ from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch, SearchPlan
+from splatpipe.pipeline.mvs.depth_search import AGREEING, Agreement, DepthSearch, SearchPlan
 from splatpipe.pipeline.photos.dataset import View
 
 LIST = "maps.json"
@@ -71,7 +71,7 @@ class KeptMap:
         return found
 
 
-def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> dict[str, float]:
+def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> dict[str, int | float]:
     """Write maps as they come: `00000.npz` and so on, and `maps.json`, whose they are.
 
     Args:
@@ -146,10 +146,18 @@ def find_depth_maps(
 
 
 def _confirmed_map(search: DepthSearch, number: int) -> DepthMap:
-    camera = search.cameras[number]
+    return confirmed_map(search.cameras[number], search.agreement(number))
+
+
+def confirmed_map(camera: Camera, agreement: Agreement | None) -> DepthMap:
+    """A photo's depths that enough others found, too; a map without any where there is no agreement.
+
+    Args:
+        camera: In the map's grid.
+        agreement: Of the same photo.
+    """
     depth = np.zeros((camera.height, camera.width), np.float32)
     confidence = np.zeros(depth.shape, np.uint8)
-    agreement = search.agreement(number)
     if agreement is not None:
         sure = agreement.votes >= AGREEING
         rows, columns = agreement.rows[sure], agreement.columns[sure]

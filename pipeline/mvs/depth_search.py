@@ -5,7 +5,7 @@ Photos and depths lie in a folder meanwhile, so that memory holds those of a pho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -145,20 +145,7 @@ class DepthSearch:
 
     def agreement(self, number: int) -> Agreement | None:
         """What a photo's neighbours say of its depths; None where it has none."""
-        depths = self.depths(number)
-        if depths is None:
-            return None
-        camera = self.cameras[number]
-        rows, columns = np.nonzero(depths.inverse > 0.0)
-        inverse = depths.inverse[rows, columns].astype(np.float64)
-        points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), 1.0 / inverse)
-        total, votes = points.copy(), np.zeros(len(points), np.uint8)
-        east, north, up = tuple(np.ascontiguousarray(axis) for axis in points.T)
-        for other in self.near[number]:
-            theirs = self.depths(other)
-            if theirs is not None:
-                confirm((east, north, up), camera, self.cameras[other], theirs.inverse, (total, votes))
-        return Agreement(rows, columns, inverse, total / (1.0 + votes)[:, None], votes, depths.cost[rows, columns])
+        return agreement_of(number, self.cameras, self.near[number], self.depths)
 
     def _photo_path(self, number: int) -> Path:
         return self.folder / f"photo-{number}.npz"
@@ -197,6 +184,33 @@ def _save_whole(path: Path, **arrays: np.ndarray) -> None:
     aside = path.with_suffix(".part.npz")
     np.savez(aside, **arrays)  # type: ignore[arg-type]
     aside.replace(path)
+
+
+def agreement_of(
+    number: int, cameras: Sequence[Camera], others: Sequence[int], depths_of: Callable[[int], Depths | None]
+) -> Agreement | None:
+    """What other photos say of a photo's depths; None where it has none.
+
+    Args:
+        number: The photo's.
+        cameras: Of all photos, in the grids of their depths.
+        others: Numbers of those that are asked.
+        depths_of: What is known of a photo by its number; None where nothing is.
+    """
+    depths = depths_of(number)
+    if depths is None:
+        return None
+    camera = cameras[number]
+    rows, columns = np.nonzero(depths.inverse > 0.0)
+    inverse = depths.inverse[rows, columns].astype(np.float64)
+    points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), 1.0 / inverse)
+    total, votes = points.copy(), np.zeros(len(points), np.uint8)
+    east, north, up = tuple(np.ascontiguousarray(axis) for axis in points.T)
+    for other in others:
+        theirs = depths_of(other)
+        if theirs is not None:
+            confirm((east, north, up), camera, cameras[other], theirs.inverse, (total, votes))
+    return Agreement(rows, columns, inverse, total / (1.0 + votes)[:, None], votes, depths.cost[rows, columns])
 
 
 def confirm(

@@ -257,18 +257,6 @@ class CellVotes:
             photos: Written: how many agree; int32 (cells,).
         """
 
-def slopes(depth: np.ndarray, focal: float, found: np.ndarray) -> None:
-    """How the inverse depths of a picture grow from pixel to pixel.
-
-    Args:
-        depth: As of ``CellVotes.add``.
-        focal: Focal length, pixels.
-        found: Written: a pixel to the right, and down, nan where not known; float32 (2, h, w).
-
-    Raises:
-        ValueError: if sizes do not fit.
-    """
-
 def look(
     depth: np.ndarray, camera: _Camera, places: _Places, sines: np.ndarray | None, least: float, said: np.ndarray
 ) -> None:

@@ -141,6 +141,25 @@ def _depths(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOpti
     return np.asarray(rasterizer.render(gaussians, camera, options).median_depth.cpu().numpy())
 
 
+def render_mean_depth(
+    gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions
+) -> Float[np.ndarray, "h w"]:
+    """A camera's mean depth, of all that a ray meets by the light that each gives, as ``render_depth``.
+
+    Of a model that was flattened; in one that was trained for pictures alone, what shines through from behind draws it
+    far behind the surface.
+    """
+    with torch.no_grad():
+        return _by_strips(camera, lambda strip: _mean_depths(gaussians, strip, options.for_depths()))
+
+
+def _mean_depths(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w"]:
+    rendered = rasterizer.render(gaussians, camera, options)
+    seen = rendered.alpha >= SURFACE
+    mean = torch.where(seen, rendered.depth_sum, 0.0) / torch.where(seen, rendered.alpha, 1.0)
+    return np.asarray(mean.cpu().numpy())
+
+
 def render_normals(
     gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions
 ) -> Float[np.ndarray, "h w 3"]:

@@ -29,7 +29,7 @@ BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sill
 MOST_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
 SHELF_BYTES = 256 << 20  # of photos, and as many of depths
 
-Progress = Callable[[float, float], None]
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

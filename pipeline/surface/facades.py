@@ -44,7 +44,7 @@ class FacadesTask:
 
     Attributes:
         photos: With their depths, local metres, always in the same order.
-        area: Walls that stand outside of it are not drawn; None for all.
+        area: Walls whose middles lie outside of it are not drawn; None for all.
         crs: Of corners and lines.
         pixel_m: Side of a pixel of the elevations; what it becomes has three digits.
         lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
@@ -80,9 +80,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     report.progress(0, 1, "looking for walls")
     pixel_m = float(f"{task.pixel_m:.{DIGITS}g}")
     facets = upright_facets([photo.depths for photo in task.photos if photo.depths is not None], task.threads)
-    if task.area is not None:
-        facets = facets.select(task.area.contains(facets.places))
-    walls = stated_walls(task.lines, facets, task.crs) if task.lines else find_walls(facets, pixel_m)
+    walls = stated_walls(task.lines, facets, task.crs) if task.lines else _within(find_walls(facets), task.area)
     if not walls:
         report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
     places = facets.places[:: max(1, len(facets) // PLACES)]
@@ -90,7 +88,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     facts = []
     for number, wall in enumerate(walls):
 
-        def progress(done: float, total: float, number: int = number) -> None:
+        def progress(done: int, total: int, number: int = number) -> None:
             report.progress(number + done / total, len(walls), "façades", "façades")
 
         own = out / f"{wall.name}.json"
@@ -99,6 +97,14 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         facts.append(json.loads(own.read_text(encoding="utf-8")))
     write_facades(out / LIST, facts, task.crs)
     return facts
+
+
+def _within(walls: Sequence[Wall], area: PlanArea | None) -> list[Wall]:
+    """Walls whose middles lie in an area, named anew."""
+    if area is None or not walls:
+        return list(walls)
+    middles = np.array([[*((wall.left + wall.right) / 2.0), wall.low_m] for wall in walls])
+    return named([wall for wall, inside in zip(walls, area.contains(middles), strict=True) if inside])
 
 
 def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wall]:

@@ -22,6 +22,7 @@ LEAST_PHOTOS = 3  # that see a place
 NEAR = 4  # cells: smaller holes are filled from around,
 FAR = 16  # cells: larger ones where photos may see what is filled in
 MARGIN = NEAR + FAR + 1  # cells around a tile that its holes look at
+BEHIND = 8  # photos that see a surface are worth one that looks through it: depths make what is near too wide
 FEW = 2  # photos that agree on a height, which counts where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
 MOST_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
@@ -129,13 +130,6 @@ def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Height
     )
 
 
-def _joined(tile: Tile, halves: Sequence[Heights]) -> Heights:
-    """Of what a tile's halves are."""
-    axis = 0 if halves[0].tile.width == tile.width else 1
-    columns = zip(*((half.height, half.sigma, half.photos) for half in halves), strict=True)
-    return Heights(tile, *(np.concatenate(column, axis=axis) for column in columns))
-
-
 def _filled(
     capture: Capture, tile: Tile, height: Float64[np.ndarray, " c"], numbers: Sequence[int]
 ) -> tuple[Float64[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
@@ -165,13 +159,20 @@ def _may_see(
     return count
 
 
+def _joined(tile: Tile, halves: Sequence[Heights]) -> Heights:
+    """Of what a tile's halves are."""
+    axis = 0 if halves[0].tile.width == tile.width else 1
+    columns = zip(*((half.height, half.sigma, half.photos) for half in halves), strict=True)
+    return Heights(tile, *(np.concatenate(column, axis=axis) for column in columns))
+
+
 def _empty(tile: Tile) -> Heights:
     nothing = np.full((tile.height, tile.width), np.nan, np.float32)
     return Heights(tile, nothing, nothing.copy(), np.zeros((tile.height, tile.width), np.uint8))
 
 
 def _chosen(capture: Capture, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]) -> Float64[np.ndarray, " c"]:
-    """Of the surfaces in each cell the highest that no more photos look through than see it; nan where none is.
+    """Of the surfaces in each cell the highest that too few photos look through; nan where none is.
 
     Where there are several, one that covers half of the cell at least comes before others.
     """
@@ -194,7 +195,7 @@ def _balance(
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
-    """How many more photos see a surface than look through it."""
+    """How many more photos see a surface than ``BEHIND`` times those that look through it."""
     east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
     balance = np.zeros(heights.shape, np.int64)
     if not asked.size:
@@ -203,5 +204,5 @@ def _balance(
         found = capture.depths(number)
         for layer, height in enumerate(heights):
             view = sight(found, (east, north, height), capture.lattice.cell_m)
-            balance[layer] += view.seen.astype(np.int64) - view.through
+            balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)
     return balance

@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.schedule import Moment
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
-FIRST_SHARE = 0.2  # of the run, without it: the surface has to be found first
+FIRST_SHARE = 0.2  # of a run from sparse points, without it: the surface has to be found first
 LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth
 FREE_PX = 0.5  # standard deviation that costs nothing, pixels on the ground
 HALF_PX = 10.0  # beyond it at which half of the most is reached
@@ -35,18 +35,19 @@ class Distortion(Technique):
 
     Args:
         weight: In the loss.
-        iterations: Of the schedule.
+        after: Iterations of the schedule that pass without it.
+        about_median: As of ``spread_loss``.
     """
 
     name = "distortion"
 
-    def __init__(self, weight: float, iterations: int) -> None:
-        self._weight, self._iterations = weight, iterations
+    def __init__(self, weight: float, after: int, about_median: bool = False) -> None:
+        self._weight, self._after, self._about_median = weight, after, about_median
         self._centre = torch.full((3,), torch.nan, dtype=torch.float64)  # kept on the CPU
 
     def is_counted(self, place: int) -> bool:
         """Whether it has a part in the loss at a place of the schedule, from 1."""
-        return place > FIRST_SHARE * self._iterations
+        return place > self._after
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
         """With depths, measured from where float32 tells them best."""
@@ -75,8 +76,8 @@ class Distortion(Technique):
         """The spread of the photo's rays, weighted."""
         if not self.is_counted(shot.now.place):
             return None
-        photo = shot.photo
-        return self._weight * spread_loss(shot.rendered, shot.settings.depth_origin, photo.camera, photo.inside)
+        photo, origin = shot.photo, shot.settings.depth_origin
+        return self._weight * spread_loss(shot.rendered, origin, photo.camera, photo.inside, self._about_median)
 
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:
@@ -92,7 +93,11 @@ def depth_along(point: Float64[Tensor, " 3"], camera: Camera) -> float:
 
 
 def spread_loss(
-    rendered: Render, origin: float, camera: Camera, inside: tuple[slice, slice] = EVERYWHERE
+    rendered: Render,
+    origin: float,
+    camera: Camera,
+    inside: tuple[slice, slice] = EVERYWHERE,
+    about_median: bool = False,
 ) -> Float[Tensor, ""]:
     """How far the depths along each ray are apart, 0 to 1, mean over the pixels that show a surface.
 
@@ -101,11 +106,18 @@ def spread_loss(
         origin: World units along the view axis.
         camera: The photo's.
         inside: Rows and columns that count.
+        about_median: Depths are to lie at the ray's median, not at their mean, which what shines through from far
+            behind draws behind the surface.
     """
     seen = rendered.alpha.detach() >= LEAST_ALPHA
     alpha = torch.where(seen, rendered.alpha, 1.0)
     mean = torch.where(seen, rendered.depth_sum, 0.0) / alpha - origin
-    variance = torch.where(seen, rendered.depth_square_sum, 0.0) / alpha - torch.where(seen, mean, 0.0).square()
+    square = torch.where(seen, rendered.depth_square_sum, 0.0) / alpha
+    if about_median:
+        middle = torch.where(seen, rendered.median_depth, 0.0) - origin
+        variance = torch.where(seen, square - 2.0 * middle * mean + middle.square(), 0.0)
+    else:
+        variance = square - torch.where(seen, mean, 0.0).square()
     pixel = torch.where(seen, (mean.detach() + origin) / camera.fx, 1.0)  # on the ground, world units
     excess = torch.relu(variance / pixel.square() - FREE_PX**2)
     return torch.where(seen, excess / (excess + HALF_PX**2), 0.0)[inside].mean()

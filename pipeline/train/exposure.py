@@ -8,13 +8,16 @@ neutral appearance.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.train.hooks import Shot, Technique
@@ -109,3 +112,20 @@ def exposures_json(exposure: Exposure | None) -> str:
     """The text of `exposures.json`."""
     fields = {"model": "off", "views": {}} if exposure is None else {"model": "affine", "views": exposure.maps()}
     return json_text(fields)
+
+
+def read_exposures(path: Path, stage: str) -> dict[str, list[list[float]]]:
+    """The photos' maps, as ``Exposure.given`` takes them; none where exposure was not modelled.
+
+    Args:
+        path: What ``exposures_json`` told.
+        stage: That left it.
+
+    Raises:
+        StageError: if it is not that.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["views"]
+        return {str(name): [[float(value) for value in row] for row in rows] for name, rows in found.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StageError(f"{path.name} cannot be read.", hint=f"Run again with --rerun-from {stage}.") from error

@@ -99,3 +99,9 @@ class TrainConfig(StageConfig):
         if self.loss == "kornia":
             return "train.loss=kornia has no gradient on a CUDA device that is the same each time."
         return ""
+
+
+class SplatDepthsConfig(StageConfig):
+    enabled: bool = True
+    """Flatten a copy of the splat and render depths of all photos from it, for surface products: where photos have no
+    texture it knows more than they do."""

@@ -20,7 +20,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.backdrop import Backdrop
 from splatpipe.pipeline.train.clearing import Clearing, free_space_of
 from splatpipe.pipeline.train.densify import DensitySchedule
-from splatpipe.pipeline.train.distortion import Distortion
+from splatpipe.pipeline.train.distortion import FIRST_SHARE, Distortion
 from splatpipe.pipeline.train.dropout import Dropout
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.hooks import Shot, Technique
@@ -71,7 +71,7 @@ def make_techniques(
         robust.watch(view.camera for view in views)
         made.append(robust)
     if options.distortion_weight:
-        made.append(Distortion(options.distortion_weight, schedule.iterations))
+        made.append(Distortion(options.distortion_weight, int(FIRST_SHARE * schedule.iterations)))
     if options.prune_free_space and dataset is not None:
         made.append(Clearing(free_space_of(views, dataset), schedule))
     if area is not None:

@@ -11,7 +11,6 @@
 #include "surface_colours.h"
 #include "surface_mosaic.h"
 #include "surface_sight.h"
-#include "surface_slopes.h"
 
 namespace {
 
@@ -36,8 +35,6 @@ void check_votes(int width, int height) {
         confidence[k] = static_cast<std::uint8_t>(random.below(256));
     }
     const splat::DepthPicture picture{camera_of(width, height, 20.0), depth.data(), confidence.data()};
-    std::vector<float> slopes(2 * size);
-    splat::find_slopes(depth.data(), width, height, picture.camera.fx, slopes.data());
     splat::CellVotes votes({-3.0, 3.0, 0.1, -2, 1, 40, 50, -1.0, 1.0});
     for (int photo = 0; photo < 3; ++photo) votes.add(picture, 0, 0, width, height);
     const std::size_t cells = static_cast<std::size_t>(votes.cells());

@@ -17,7 +17,6 @@
 #include "surface_colours.h"
 #include "surface_mosaic.h"
 #include "surface_sight.h"
-#include "surface_slopes.h"
 #include "surface_votes.h"
 
 namespace nb = nanobind;
@@ -89,15 +88,6 @@ splat::CellTile tile_of(const Lattice& lattice, const Rectangle& tile, const std
 
 bool is_size(const splat::SurfaceCamera& camera, std::size_t height, std::size_t width) {
     return height == static_cast<std::size_t>(camera.height) && width == static_cast<std::size_t>(camera.width);
-}
-
-void slopes(const Plane<const float>& depth, double focal, const Stack<float>& found) {
-    const std::size_t height = depth.shape(0), width = depth.shape(1);
-    require(height >= 1 && width >= 1 && height <= INT_MAX / width, "depths without pixels, or with too many");
-    require(found.shape(0) == 2 && found.shape(1) == height && found.shape(2) == width, "a result of another size");
-    require(std::isfinite(focal) && focal > 0.0, "a camera that is none");
-    const nb::gil_scoped_release released;
-    splat::find_slopes(depth.data(), static_cast<int>(width), static_cast<int>(height), focal, found.data());
 }
 
 splat::Places places_of(const PlaceArrays& given) {
@@ -253,7 +243,6 @@ void bind_surface(nb::module_& m) {
     m.attr("SEEN") = splat::kSeen, m.attr("THROUGH") = splat::kThrough;
     m.attr("MIXED") = splat::kMixed, m.attr("UNKNOWN") = splat::kUnknown;
     m.attr("MOSAIC_MARGIN") = splat::kMosaicMargin;
-    m.def("slopes", &slopes, "depth"_a.noconvert(), "focal"_a, "found"_a.noconvert());
     m.def("look", &look, "depth"_a.noconvert(), "camera"_a, "places"_a, "sines"_a.noconvert().none(), "least"_a,
           "said"_a.noconvert());
     m.def("rate", &rate, "camera"_a, "places"_a, "cell"_a, "said"_a.noconvert(), "cost"_a.noconvert(),

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <limits>
 
-#include "surface_slopes.h"
+#include "surface_votes.h"
 
 namespace splat {
 namespace {
@@ -120,11 +120,26 @@ void CellVotes::add(const DepthPicture& picture, int left, int top, int right, i
 
 void CellVotes::read_window(const DepthPicture& picture, int left, int top, int right, int bottom) {
     const VoteKernels& kernels = SPLAT_KERNELS(vote_kernels);
-    InverseRows inverses(picture.depth, picture.camera.width, picture.camera.height, left, right);
+    const SurfaceCamera& camera = picture.camera;
+    constexpr int kRows = 2 * kSlopeReach + 1;
+    const std::size_t width = static_cast<std::size_t>(right - left) + 2 * kSlopeReach + kRowPadding;
+    std::vector<float> ring(kRows * width);
     std::vector<std::uint64_t> found(static_cast<std::size_t>(right - left) * kMostParts * kMostParts);
+    const auto fill = [&](int row) {
+        float* out = ring.data() + static_cast<std::size_t>((row + kRows) % kRows) * width;
+        std::fill(out, out + width, std::numeric_limits<float>::quiet_NaN());
+        if (row < 0 || row >= camera.height) return;
+        const int first = std::max(left - kSlopeReach, 0), last = std::min(right + kSlopeReach, camera.width);
+        kernels.invert(picture.depth + static_cast<std::int64_t>(row) * camera.width + first, last - first,
+                       out + (first - left + kSlopeReach));
+    };
+    for (int row = top - kSlopeReach; row < top + kSlopeReach; ++row) fill(row);
     for (int row = top; row < bottom; ++row) {
-        const HeightRow job{picture, tile_, row, left, right, inverses.around(row)};
-        const std::int64_t count = kernels.heights(job, found.data());
+        fill(row + kSlopeReach);
+        const float* inverses[kRows];
+        for (int k = 0; k < kRows; ++k)
+            inverses[k] = ring.data() + static_cast<std::size_t>((row - kSlopeReach + k + kRows) % kRows) * width;
+        const std::int64_t count = kernels.heights({picture, tile_, row, left, right, inverses}, found.data());
         keys_.insert(keys_.end(), found.begin(), found.begin() + count);
     }
 }

@@ -29,9 +29,6 @@ struct HeightRow {
 struct VoteKernels {
     // Inverse depths, NaN where there is none.
     void (*invert)(const float* depth, int count, float* inverse);
-    // How the inverse depths of `count` pixels grow from each to the next one to the right and below; NaN: not known.
-    // `inverses` are rows as of HeightRow, `focal` the focal length in pixels.
-    void (*slopes)(const float* const* inverses, int count, double focal, float* across, float* down);
     // Where the row's pixels, as small planes, cover cells of the tile. Returns how many keys it wrote, kMostParts
     // squared a pixel at most.
     std::int64_t (*heights)(const HeightRow& job, std::uint64_t* keys);

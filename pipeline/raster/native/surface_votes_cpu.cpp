@@ -75,48 +75,31 @@ bool place(const HeightRow& job, const RowRay& ray, Block* block) {
 
 SPLAT_INLINE Floats size(Floats v) { return max(v, fill(0.0f) - v); }  // NaN stays
 
-// How inverse depths grow from pixels to the next ones in a direction, by least squares over pairs of pixels on both
-// sides that lie in one plane with each; from one side alone at a surface's rim; NaN where there is no neighbour.
-// `rows` are of inverse depths from two above to two below, at the first pixel.
-SPLAT_INLINE void slope(const float* const* rows, float same, bool is_down, float* out) {
-    const auto at = [&](int down, int right) { return rows[kSlopeReach + down] + right; };
+// How inverse depths grow from a pixel to the next one in a direction, by least squares over pairs of pixels on both
+// sides that lie in one plane with it; from one side alone at a surface's rim; NaN where there is no neighbour.
+SPLAT_INLINE void slope(const HeightRow& job, const Block& block, float same, bool is_down, float* out) {
+    const int offset = block.first - job.left + kSlopeReach;
+    const auto row = [&](int down, int right) { return job.inverses[kSlopeReach + down] + offset + right; };
     for (int k = 0; k < kBlock; k += kLanes) {
-        const Floats centre = load(at(0, 0) + k), near = centre * fill(same), twice = centre + centre;
+        const Floats centre = load(row(0, 0) + k), near = centre * fill(same), twice = centre + centre;
         Floats total = fill(0.0f), weight = fill(0.0f);
         for (int along = 1; along <= 2; ++along) {
             const Floats step = fill(static_cast<float>(along)), steep = fill(2.0f) * step * near;
             for (int aside = -1; aside <= 1; ++aside) {
-                const Floats ahead = load((is_down ? at(along, aside) : at(aside, along)) + k);
-                const Floats behind = load((is_down ? at(-along, aside) : at(aside, -along)) + k);
+                const Floats ahead = load((is_down ? row(along, aside) : row(aside, along)) + k);
+                const Floats behind = load((is_down ? row(-along, aside) : row(aside, -along)) + k);
                 const Floats difference = ahead - behind;
                 const Mask is_flat = both(less(size(ahead + behind - twice), near), less(size(difference), steep));
                 total = total + only(is_flat, step * difference);
                 weight = weight + only(is_flat, fill(2.0f) * step * step);
             }
         }
-        const Floats onward = load((is_down ? at(1, 0) : at(0, 1)) + k) - centre;
-        const Floats back = centre - load((is_down ? at(-1, 0) : at(0, -1)) + k);
+        const Floats onward = load((is_down ? row(1, 0) : row(0, 1)) + k) - centre;
+        const Floats back = centre - load((is_down ? row(-1, 0) : row(0, -1)) + k);
         const Floats last = select(less(size(back), near), back, fill(__builtin_nanf("")));
         const Floats single = select(less(size(onward), near), onward, last);
         const Mask is_paired = less(fill(0.0f), weight);
         store(out + k, select(is_paired, total / select(is_paired, weight, fill(1.0f)), single));
-    }
-}
-
-// Both, of a row from pixel `first` on.
-SPLAT_INLINE void both_slopes(const float* const* inverses, int first, double focal, float* across, float* down) {
-    const float same = kSamePixels / static_cast<float>(focal);
-    const float* rows[2 * kSlopeReach + 1];
-    for (int k = 0; k <= 2 * kSlopeReach; ++k) rows[k] = inverses[k] + first + kSlopeReach;
-    slope(rows, same, false, across), slope(rows, same, true, down);
-}
-
-void slopes(const float* const* inverses, int count, double focal, float* across, float* down) {
-    float block[2][kBlock];
-    for (int first = 0; first < count; first += kBlock) {
-        both_slopes(inverses, first, focal, block[0], block[1]);
-        for (int k = 0; k < kBlock && first + k < count; ++k)
-            across[first + k] = block[0][k], down[first + k] = block[1][k];
     }
 }
 
@@ -206,13 +189,14 @@ SPLAT_INLINE int64_t cover(const HeightRow& job, const Block& block, int k, uint
 int64_t heights(const HeightRow& job, uint64_t* keys) {
     const SurfaceCamera& camera = job.picture.camera;
     const RowRay ray = row_ray(job);
-    const double focal = camera.fx > camera.fy ? camera.fx : camera.fy;
+    const float same = kSamePixels / static_cast<float>(camera.fx > camera.fy ? camera.fx : camera.fy);
     int64_t written = 0;
     for (int first = job.left; first < job.right; first += kBlock) {
         Block block;
         block.first = first, block.count = job.right - first < kBlock ? job.right - first : kBlock;
         if (!place(job, ray, &block)) continue;
-        both_slopes(job.inverses, first - job.left, focal, block.slope_x, block.slope_y);
+        slope(job, block, same, false, block.slope_x);
+        slope(job, block, same, true, block.slope_y);
         lay(job, ray, &block);
         for (int k = 0; k < block.count; ++k)
             if (block.wide[k]) written += cover(job, block, k, keys + written);
@@ -222,7 +206,7 @@ int64_t heights(const HeightRow& job, uint64_t* keys) {
 
 }  // namespace
 
-extern const VoteKernels vote_kernels = {invert, slopes, heights};
+extern const VoteKernels vote_kernels = {invert, heights};
 
 }  // namespace SPLAT_ISA_NAMESPACE
 }  // namespace splat

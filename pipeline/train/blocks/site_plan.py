@@ -70,6 +70,18 @@ def whole_json(limit_bytes: int = 0) -> str:
     return json_text({"shards": 0} | ({"limit_bytes": limit_bytes} if limit_bytes else {}))
 
 
+def is_in_blocks(path: Path) -> bool:
+    """Whether the scene is trained in blocks.
+
+    Raises:
+        StageError: if it cannot be read.
+    """
+    try:
+        return int(json.loads(path.read_text(encoding="utf-8"))["shards"]) > 0
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
+
+
 def limit_of_whole(path: Path) -> int:
     """Of memory, that the training of a scene in one has to keep to though nobody asked for it; 0 for none.
 

@@ -6,12 +6,10 @@ cell and margin alone; ``merging.py`` puts the cells together.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import JSON, Machine, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
@@ -27,7 +25,7 @@ from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.blocks.prospect import Prospect, Surveyor, read_free_space, rows_of
 from splatpipe.pipeline.train.blocks.schedules import block_schedule
 from splatpipe.pipeline.train.clearing import Clearing
-from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.train.exposure import Exposure, read_exposures
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.hooks import Technique
 from splatpipe.pipeline.train.looks import Look
@@ -143,7 +141,7 @@ class Block:
         views, split = load_views(parts.dataset), load_split(parts.split)
         kept = set(split.train)
         trained_on = [view for view in views if view.camera.name in kept]
-        exposures = _read_exposures(parts.coarse / "exposures.json")
+        exposures = read_exposures(parts.coarse / "exposures.json", "blocks")
         exposure = "affine" if exposures else "off"
         # The cap keeps its memory: what the process holds besides, as of blocks before, is not to end its growth.
         decided = {
@@ -249,12 +247,3 @@ def _leave(block: Block, plan: Plan, out: Path, trained: tuple[Gaussians, Histor
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     (out / "history.json").write_text(history.to_json(), encoding="utf-8")
     return {"gaussians": len(gaussians), "photos": len(plan.train_views)}
-
-
-def _read_exposures(path: Path) -> dict[str, list[list[float]]]:
-    """The photos' maps; none where exposure was not modelled."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))["views"]
-        return {str(name): [[float(value) for value in row] for row in rows] for name, rows in found.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error

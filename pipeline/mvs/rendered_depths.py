@@ -1,0 +1,76 @@
+"""Depth maps of photos rendered from a model, kept where other photos' maps show the same place.
+
+A model has one surface, but a photo may see it through a haze that is there for another photo's sake, or see a hole's
+far side: what enough others do not confirm is no depth, as with depths that are found in photos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_map
+from splatpipe.pipeline.mvs.depth_search import agreement_of
+from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
+from splatpipe.pipeline.mvs.patch_match import Depths
+
+
+def rendered_depth_maps(
+    depth_of: Callable[[Camera], Float[np.ndarray, "h w"]],
+    dataset: Path,
+    cameras: Sequence[Camera],
+    folder: Path,
+    threads: int,
+    report: Reporter,
+) -> Iterator[tuple[Camera, DepthMap]]:
+    """The depth maps of photos as a model has them, in the order of the cameras; the same for any number of threads.
+
+    Args:
+        depth_of: Renders a camera's depths along its z, world units; 0 where the model has none.
+        dataset: The folder that `undistort` left: who is compared with whom follows from its sparse points.
+        cameras: In the grids of the maps.
+        folder: Where there is room for 4 bytes a pixel of all maps meanwhile; what a killed run left there is gone on
+            from.
+        threads: Photos at a time where they are compared.
+        report: Told of progress.
+
+    Raises:
+        StageError: if the sparse model cannot be read.
+    """
+    for number, camera in enumerate(cameras):
+        _keep(folder / f"{number}.npy", partial(depth_of, camera))
+        report.progress(number + 1, len(cameras), "rendering depths", "photos")
+    tracks = load_tracks(dataset, [camera.name for camera in cameras])
+    near = neighbours(tracks, cameras, ASKED)
+
+    def confirmed(number: int) -> DepthMap:
+        agreement = agreement_of(number, cameras, near[number], partial(_kept, folder))
+        return confirmed_map(cameras[number], agreement)
+
+    maps = ordered_map(confirmed, range(len(cameras)), threads)
+    for done, (camera, found) in enumerate(zip(cameras, maps, strict=True), start=1):
+        yield camera, found
+        report.progress(done, len(cameras), "comparing depths", "photos")
+
+
+def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
+    """Render inverse depths into a file that is there whole or not at all; one that is there is left alone."""
+    if path.is_file():
+        return
+    depth = render()
+    there = np.isfinite(depth) & (depth > 0.0)
+    aside = path.with_suffix(".part.npy")
+    np.save(aside, np.where(there, 1.0 / np.where(there, depth, 1.0), 0.0).astype(np.float32))
+    aside.replace(path)
+
+
+def _kept(folder: Path, number: int) -> Depths:
+    inverse = np.load(folder / f"{number}.npy", allow_pickle=False)
+    return Depths(inverse, np.zeros_like(inverse))

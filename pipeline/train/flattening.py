@@ -1,0 +1,172 @@
+"""A copy of a trained model, flattened: every ray meets one even surface, for depths to be rendered from.
+
+A splat is trained for pictures. Its surfaces are clouds of Gaussians which shine through, and where a wall is plain
+they hang before and behind it: nothing in a photo tells. The copy is trained on for some hundred iterations, at the
+size at which photos are seen whole, with what draws all that a ray meets to one depth (``distortion``, about the
+median) and depths to those around them (``evenness``). Density control is off, sky and exposures stay as they were
+trained. That costs its pictures some decibels, so the delivered splat stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import Machine, Reporter
+from splatpipe.pipeline.photos.dataset import Split, View, load_split, load_views
+from splatpipe.pipeline.raster.device import Device, choose_device
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.rendering import Rendering, load_rendering
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import read_panorama
+from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.train.distortion import Distortion
+from splatpipe.pipeline.train.evenness import Evenness
+from splatpipe.pipeline.train.exposure import Exposure, read_exposures
+from splatpipe.pipeline.train.lengths import WINDOW_PIXELS, Stretch
+from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.train.loop import CHECKPOINT, Course, go_through
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.rates import Rates
+from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.techniques import Techniques, make_techniques
+from splatpipe.pipeline.train.visits import PhotoVisits, Visits
+
+VISITS = 8  # of every photo
+LEAST_ITERATIONS = 300  # where photos are few
+SPREAD_WEIGHT = 0.5  # ten times what a splat for pictures is trained with
+EVENNESS_WEIGHT = 0.1
+FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6  # of positions, times the extent: the published ones' later half
+OPACITY_RATE = 0.05  # as published
+
+FLATTENED = "flattened.ply"
+
+
+@dataclass(frozen=True)
+class TrainedParts:
+    """What is flattened, and what it was trained on.
+
+    Attributes:
+        model: The splat.
+        rendering: How it is to be rendered.
+        sky: Its panorama.
+        exposures: The photos'.
+        dataset: Photos and sparse points.
+        split: Which photos were trained on: those that were not are none to the copy either.
+    """
+
+    model: Path
+    rendering: Path
+    sky: Path
+    exposures: Path
+    dataset: Path
+    split: Path
+
+
+def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter) -> Gaussians:
+    """The flattened copy, kept in `flattened.ply`; goes on from a checkpoint where a killed run left one.
+
+    The same bits for any number of threads, and for a run that was killed.
+
+    Args:
+        trained: What is flattened.
+        machine: Changes only speed.
+        out: Has the copy, a checkpoint and decoded photos meanwhile; the copy is taken as it is where it is there.
+        report: Takes what people want to know.
+
+    Raises:
+        SplatpipeError: if a file is missing or broken.
+        MachineError: if the device asked for is not there.
+        KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
+    """
+    path = out / FLATTENED
+    if not path.is_file():
+        device = choose_device(machine.device, note=report.note)
+        with same_bits(machine.threads), device.one_order():
+            course = _course(trained, device, machine.threads)
+            state = go_through(course, out, report)
+            aside = path.with_suffix(".part")
+            write_splat(aside, state.finished())
+            aside.replace(path)
+        (out / CHECKPOINT).unlink(missing_ok=True)
+    return read_splat(path)
+
+
+def _course(trained: TrainedParts, device: Device, threads: int) -> Course:
+    """What the copy goes through."""
+    views, split = load_views(trained.dataset), load_split(trained.split)
+    exposures = read_exposures(trained.exposures, "train")
+    gaussians, rendering = read_splat(trained.model), load_rendering(trained.rendering)
+    options = options_of(gaussians, rendering, has_exposures=bool(exposures))
+    plan = flattening_plan(options, views, split, len(gaussians), WINDOW_PIXELS[device.name])
+    kept = set(split.train)
+    trained_on = [view for view in views if view.camera.name in kept]
+    sky = _sky(trained, trained_on, threads)
+
+    def visits(looks: Sequence[Look]) -> Visits:
+        return PhotoVisits([view.camera for view in trained_on], looks, options.seed, plan.megapixels)
+
+    def techniques() -> Techniques:
+        made = make_techniques(plan, sky, device=device.tensors)
+        if exposures:
+            given = Exposure.given({name: exposures[name] for name in plan.train_views})
+            given.move_to(device.tensors)
+            made = made.with_given(given)
+        return Techniques((*made, Distortion(SPREAD_WEIGHT, 0, about_median=True), Evenness(EVENNESS_WEIGHT)))
+
+    return Course(plan, device, trained_on, visits, techniques, start=lambda: gaussians)
+
+
+def _sky(trained: TrainedParts, views: Sequence[View], threads: int) -> SkyModel | None:
+    """The trained panorama, with the skies found in the photos again; None where there is none."""
+    panorama = read_panorama(trained.sky)
+    found = None if panorama is None else SkyModel.begin(views, trained.dataset, threads)
+    return None if panorama is None or found is None else SkyModel.given(panorama, found.masks)
+
+
+def options_of(gaussians: Gaussians, rendering: Rendering, has_exposures: bool) -> TrainConfig:
+    """A training's that goes on with a model as it is: as many Gaussians to the end.
+
+    Args:
+        gaussians: The model.
+        rendering: How it is to be rendered.
+        has_exposures: Whether photos have exposures of their own.
+    """
+    return TrainConfig(
+        max_megapixels=rendering.megapixels or 0.0,
+        max_gaussians=max(1, len(gaussians)),
+        sh_degree=gaussians.sh_degree,
+        exposure="affine" if has_exposures else "off",
+        antialias=rendering.antialias,
+        densify=False,
+        prune_free_space=0,
+        dropout=0.0,
+    )
+
+
+def flattening_plan(
+    options: TrainConfig, views: Sequence[View], split: Split, gaussians: int, window_pixels: int
+) -> Plan:
+    """What the copy is trained with.
+
+    Args:
+        options: As of ``options_of``.
+        views: All photos of the dataset.
+        split: Which of them are trained on.
+        gaussians: Of the model.
+        window_pixels: Of a photo, that an iteration looks at at most; photos are halved until they fit into that.
+    """
+    plan = make_plan(options, views, split, gaussians, window_pixels)
+    footage = plan.footage
+    level = footage.first_level
+    iterations = max(LEAST_ITERATIONS, VISITS * footage.parts(level))
+    schedule = replace(
+        plan.schedule,
+        iterations=iterations,
+        sh_every=1,
+        stretches=(Stretch(level, footage.window_at(level), iterations),),
+        rates=Rates(means=FIRST_MEANS_RATE, means_final=LAST_MEANS_RATE, opacity=OPACITY_RATE),
+    )
+    return replace(plan, schedule=schedule, last_iteration=iterations)
