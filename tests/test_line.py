@@ -30,6 +30,7 @@ QUICK = (
     "dsm.cell_m=0.3",
     "ortho.gsd_m=0.3",
 )
+SURFACES = ["dsm", "ortho", "facades", "cloud", "mesh"]
 STAGES = [stage.name for stage in LINE]
 KILLED_RUN = Path(__file__).with_name("killed_run.py")
 
@@ -97,7 +98,7 @@ def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp
     before = json.loads((copy_of_run / "metrics.json").read_text())
     for file in (fewer, more):
         told = splatpipe("georef", copy_of_run, "--gcp", file)
-        assert ran(told) == ["control", "targets", "georef", "evaluate", "export", "dsm", "ortho"]
+        assert ran(told) == ["control", "targets", "georef", "evaluate", "export", *SURFACES]
     after = json.loads((copy_of_run / "metrics.json").read_text())
     assert before["accuracy"]["splat"] is None and after["psnr"] == before["psnr"]
     tables = after["accuracy"]["tables"]
@@ -106,7 +107,7 @@ def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp
     assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:32633"
     assert ran(splatpipe("georef", copy_of_run)) == []
     told = splatpipe("georef", copy_of_run, *sets("georef.crs=EPSG:31255"))
-    assert "train" not in ran(told) and ran(told)[-3:] == ["export", "dsm", "ortho"]
+    assert "train" not in ran(told) and ran(told)[-6:] == ["export", *SURFACES]
     assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:31255"
 
 
@@ -166,13 +167,13 @@ def test_a_second_run_does_nothing(photos: Path, copy_of_run: Path) -> None:
 
 def test_changed_option_reruns_only_downstream(photos: Path, copy_of_run: Path) -> None:
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK, "train.iterations=40"))
-    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough"]
+    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough", "splat_depths"]
 
 
 def test_a_budget_is_planned_shown_and_reused(photos: Path, copy_of_run: Path) -> None:
     budgets = ("--time-budget", "8s", "--max-memory", "4G")
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK), *budgets)
-    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough"]
+    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough", "splat_depths"]
     events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text().splitlines()]
     notes = [event["data"]["message"] for event in events if event["kind"] == "note"]
     assert any(note.startswith("plan: ") and "8 s budget, within 4.0 GB" in note for note in notes), notes

@@ -235,8 +235,11 @@ def show_outputs(out: Path, seconds: float, ran: int, metrics: Mapping[str, JSON
     console = Console(file=sys.stderr, highlight=False)
     done = "Everything was there already: nothing to do." if not ran else f"Done in {_duration(seconds)}."
     console.print(f"\n[bold]{done}[/]  {escape(_brief(metrics))}", soft_wrap=True)
-    for path in files:
-        size = path.stat().st_size
+    sizes: dict[Path, int] = {}
+    for path in files:  # what lies in a folder is told of as that
+        shown = out / path.relative_to(out).parts[0]
+        sizes[shown] = sizes.get(shown, 0) + path.stat().st_size
+    for path, size in sizes.items():
         console.print(f"  {escape(str(path))}  [dim]{_bytes(size)}[/]", soft_wrap=True)
     if not ran:
         console.print(f"[dim]Change an option, or --rerun a stage, to do more. Results: {escape(str(out))}[/]")
