@@ -8,7 +8,13 @@ from typing import Any
 from splatpipe.pipeline.engine.errors import UsageError
 
 CELL_PIXELS = 2.0  # of the orthophoto along a cell of the surface model, where somebody says how large pixels are
-NEEDS = {"dsm": ("depths",), "ortho": ("depths", "dsm")}
+NEEDS = {
+    "dsm": ("depths",),
+    "ortho": ("depths", "dsm"),
+    "facades": ("depths", "dsm"),
+    "cloud": ("depths", "dsm"),
+    "mesh": ("depths", "dsm"),
+}
 """Products, and the stages that each needs besides its own."""
 
 NO_PRODUCTS: dict[str, Any] = {stage: {"enabled": False} for stage in ("depths", *NEEDS)}
@@ -41,8 +47,12 @@ def options_for(products: Sequence[str], gsd_m: float | None) -> dict[str, Any]:
         for stage in (*NEEDS[name], name):
             table[stage] = {"enabled": True}
     if gsd_m is not None:
-        sizes = {"dsm": {"cell_m": CELL_PIXELS * gsd_m}, "ortho": {"gsd_m": gsd_m}}
-        for name, size in sizes.items():
-            if name in table:
-                table[name] |= size
+        sizes = {
+            "dsm": {"cell_m": CELL_PIXELS * gsd_m},
+            "ortho": {"gsd_m": gsd_m},
+            "facades": {"gsd_m": gsd_m},
+            "cloud": {"spacing_m": gsd_m},
+        }
+        for name in set(sizes) & set(products):
+            table[name] |= sizes[name]
     return table

@@ -22,6 +22,7 @@ from splatpipe.pipeline.surface import elevation as elevation_module
 from splatpipe.pipeline.surface.elevation import Elevation, Photos, draw_elevation, wall_sheet
 from splatpipe.pipeline.surface.facades import FacadesTask, make_facades
 from splatpipe.pipeline.surface.facets import Facets, facets_of, upright_facets
+from splatpipe.pipeline.surface.holes import filled
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
 from splatpipe.pipeline.surface.openings import outlines, projections, recesses
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
@@ -221,6 +222,26 @@ def test_threads_change_no_bit_of_an_elevation() -> None:
     many = drawn("south", threads=3)
     assert np.array_equal(many.depth, south().depth, equal_nan=True)
     assert np.array_equal(many.colour, south().colour)
+
+
+def test_specks_go_and_edges_stay() -> None:
+    depth = np.zeros((600, 40), np.float32)
+    depth[:, 20:] = -0.16
+    depth[300:, :3] = np.nan
+    speck = depth.copy()
+    speck[100, 10], speck[256, 30], speck[0, 0] = 0.3, 0.1, -0.2
+    assert np.array_equal(elevation_module.without_specks(speck), depth, equal_nan=True)
+    assert np.array_equal(elevation_module.without_specks(depth), depth, equal_nan=True)
+
+
+def test_a_hole_beside_a_window_is_the_walls() -> None:
+    depth = np.zeros((40, 60))
+    depth[:, :20] = -0.16
+    depth[18:22, 20:30] = np.nan
+    upright, new = filled(depth, 0.028, 16, upright=True)
+    assert new.sum() == 40
+    assert np.abs(upright[18:22, 22:30]).max() < 1e-9
+    assert filled(depth, 0.028, 16)[0][20, 22] == -0.16  # what lies behind an edge is hidden, seen from above
 
 
 def test_an_elevation_of_too_many_pixels_is_refused() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
@@ -35,6 +36,7 @@ from splatpipe.pipeline.surface.whole_file import whole_file
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
 PLACES = 4000  # that photos' exposures are compared at
+LONGEST_TEXT = 10_000  # characters of stated lines
 Line = tuple[float, float, float, float]
 
 
@@ -105,6 +107,24 @@ def _within(walls: Sequence[Wall], area: PlanArea | None) -> list[Wall]:
         return list(walls)
     middles = np.array([[*((wall.left + wall.right) / 2.0), wall.low_m] for wall in walls])
     return named([wall for wall, inside in zip(walls, area.contains(middles), strict=True) if inside])
+
+
+def parse_lines(text: str) -> list[Line]:
+    """Walls in plan of ``x1,y1,x2,y2; …``.
+
+    Raises:
+        UsageError: if it is anything else.
+    """
+    lines: list[Line] = []
+    for part in text[:LONGEST_TEXT].split(";") if text.strip() else ():
+        try:
+            x1, y1, x2, y2 = (float(number) for number in part.split(","))
+        except ValueError:
+            x1 = y1 = x2 = y2 = math.nan
+        if not all(math.isfinite(number) for number in (x1, y1, x2, y2)):
+            raise UsageError(f'Cannot understand the line "{part.strip()[:60]}".', hint="Write it as x1,y1,x2,y2.")
+        lines.append((x1, y1, x2, y2))
+    return lines
 
 
 def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wall]:

@@ -57,12 +57,14 @@ class Capture:
         lattice: Whose cells get heights.
         relief: Between which heights.
         shelf: Holds a few depths.
+        upright: Whether the lattice is a wall's, and not the ground's.
     """
 
     sources: Sequence[DepthSource]
     lattice: Lattice
     relief: Relief
     shelf: Shelf[DepthMap]
+    upright: bool = False
 
     def depths(self, number: int) -> DepthMap:
         """A photo's depths, loaded if they are not at hand."""
@@ -135,8 +137,8 @@ def _filled(
 ) -> tuple[Float64[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
     """A tile's heights with small holes filled, and larger ones where enough photos may see that; and which are new."""
     shape, cell_m = (tile.height, tile.width), capture.lattice.cell_m
-    near, _ = filled(height.reshape(shape), cell_m, NEAR)
-    far, new = filled(near, cell_m, FAR)
+    near, _ = filled(height.reshape(shape), cell_m, NEAR, capture.upright)
+    far, new = filled(near, cell_m, FAR, capture.upright)
     result, asked = far.ravel(), np.flatnonzero(new)
     seen = _may_see(capture, tile, asked, result[asked], numbers) >= LEAST_PHOTOS
     result[asked[~seen]] = np.nan
