@@ -162,7 +162,8 @@ def test_the_orthophoto_lies_on_the_surface_model(made: Path) -> None:
     assert (bands[3] > 0).sum() * (CELL_M / 2) ** 2 == pytest.approx(95.04, rel=0.01)
     off = ((np.arange(4) + 0.5) / 4 - 0.5) * CELL_M / 2
     true = np.mean([true_orthophoto(east + e, north + n) for e in off for n in off], axis=0)
-    wrong = np.square(np.moveaxis(bands[:3], 0, -1) - true)[bands[3] > 0]
+    counts = (bands[3] > 0) & (edge_distance(east, north) > CELL_M / 2)  # the eaves halve cells of the surface model
+    wrong = np.square(np.moveaxis(bands[:3], 0, -1) - true)[counts]
     assert 10 * np.log10(255**2 / wrong.mean()) > 28.0
 
 

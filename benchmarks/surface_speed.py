@@ -1,0 +1,101 @@
+"""CPU seconds of the surface model and the orthophoto by the million cells: ``surface_speed.py --depths FOLDER``.
+
+FOLDER is of ``python -m splatpipe.demo.depth_maps`` (extra ``demo``): depth maps of the demo's photos, true ones or, of
+its ``--noise``, such with errors, and beside the true ones the photos without their lens. A part of the plot around the
+house is made, on one thread; nearly all photos see all of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from tables import Row, print_table
+
+from splatpipe.demo.depth_maps import load
+from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.height_field import HeightField
+from splatpipe.pipeline.surface.heights import TILE as HEIGHTS_TILE
+from splatpipe.pipeline.surface.heights import Capture, surface_heights
+from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.run_sources import MetricMap
+from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
+
+GSD_M = 0.028  # of the original photos, at the house
+HALF_M = 9.0  # of the part's side
+RELIEF = Relief(-2.0, 14.0)
+HELD_BYTES = 1 << 30
+EVERY = 5  # cells of the surface model from place to place that exposures are compared at
+FIGURES = {"what": "what:", "cells": "cells:,", "CPU s": "cpu:.2f", "s a million": "million:.1f", "known": "known:.4f"}
+Result = TypeVar("Result")
+
+
+def lattice_of(cell_m: float) -> Lattice:
+    """The part in cells of a size."""
+    side = round(2.0 * HALF_M / cell_m)
+    return Lattice(-HALF_M, HALF_M, cell_m, side, side)
+
+
+def timed(make: Callable[[], Result]) -> tuple[Result, float]:
+    """A result, and the CPU seconds that it took."""
+    start = time.process_time()
+    return make(), time.process_time() - start
+
+
+def heights_of(sources: list[DepthSource], lattice: Lattice) -> HeightField:
+    """The surface model."""
+    height = np.full((lattice.height, lattice.width), np.nan, np.float32)
+    capture = Capture(sources, lattice, RELIEF, Shelf(HELD_BYTES))
+    for part in surface_heights(capture, list(lattice.tiles(HEIGHTS_TILE)), threads=1):
+        rows, columns = slice(part.tile.row, None), slice(part.tile.column, None)
+        height[rows, columns][: part.tile.height, : part.tile.width] = part.height
+    return HeightField(lattice, height)
+
+
+def coloured(photos: list[PhotoSource], surface: HeightField, lattice: Lattice) -> float:
+    """The share of an orthophoto's pixels that have a colour."""
+    centres = surface.lattice.centres(next(surface.lattice.tiles(surface.lattice.width)))
+    places = np.concatenate([centres, surface.height[..., None].astype(np.float64)], axis=-1)
+    places = places[::EVERY, ::EVERY].reshape(-1, 3)
+    gains = exposure_gains(photos, places[np.isfinite(places[:, 2])], 2.0 * lattice.cell_m, threads=1)
+    album = Album(photos, surface, lattice, RELIEF, gains, Shelf(HELD_BYTES), Shelf(HELD_BYTES))
+    tiles = list(lattice.tiles(TILE))
+    known = sum(int(part.known.sum()) for part in orthophotos(album, tiles, threads=1))
+    return known / (lattice.width * lattice.height)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--depths", type=Path, required=True, help="depth maps")
+    parser.add_argument("--photos", type=Path, help="the photos that they are of, where those lie elsewhere")
+    parser.add_argument("--gsd", type=float, default=GSD_M, help="metres of a pixel; of a cell twice as much")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    photos = []
+    for path in sorted(arguments.depths.glob("*.npz")):
+        found = MetricMap(*load(path))
+        pixels = cv2.imread(str((arguments.photos or arguments.depths) / f"{path.stem}.png"))[..., ::-1].copy()
+        depths = DepthSource(found.camera, lambda found=found: found)
+        photos.append(PhotoSource(found.camera, lambda pixels=pixels: pixels, depths))
+    cells, fine = lattice_of(2.0 * arguments.gsd), lattice_of(arguments.gsd)
+    surface, cpu = timed(lambda: heights_of([photo.depths for photo in photos if photo.depths], cells))
+    known = float(np.isfinite(surface.height).mean())
+    rows = [_row("surface model", cells, cpu, known)]
+    share, cpu = timed(lambda: coloured(photos, surface, fine))
+    print_table(f"{len(photos)} photos", [*rows, _row("orthophoto", fine, cpu, share)], FIGURES)
+
+
+def _row(what: str, lattice: Lattice, cpu_s: float, known: float) -> Row:
+    count = lattice.width * lattice.height
+    return {"what": what, "cells": count, "cpu": cpu_s, "million": cpu_s / count * 1e6, "known": known}
+
+
+if __name__ == "__main__":
+    main()
