@@ -34,8 +34,8 @@ STAGES = {
     "stage": "stage:",
     "CPU s": "cpu:,.0f",
     "wall s": "seconds:,.0f",
-    "peak": "peak:MB",
-    "files": "bytes:MB",
+    "peak MB": "peak:MB",
+    "files MB": "bytes:MB",
     "machine": "machine:",
 }
 FIGURES = {

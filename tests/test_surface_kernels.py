@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, rated, sampled
 from splatpipe.pipeline.surface.sight import Points, place_in, sight
-from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, native_camera, window_of
+from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import Votes
 

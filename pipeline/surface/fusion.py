@@ -25,7 +25,7 @@ REACH = 2.5  # deviations of the mean within which a photo counts (Tukey's biwei
 SIGMA_PX = 0.7  # of a depth, in pixels' lengths on the surface
 ROUNDS = 3  # of the robust mean
 STALE = 0.3  # of points that are lost, which it is time to leave behind
-BATCH = 1 << 15  # points at a time: what each photo says of them is held
+BATCH = 1 << 14  # points at a time: what each photo says of them is held, 16 bytes a point and photo
 MOST = np.iinfo(np.uint8).max
 
 

@@ -25,7 +25,7 @@ FAR_ON_WALLS = 28  # and still larger ones on walls, which are plain where no de
 BEHIND = 8  # photos that see a surface are worth one that looks through it: depths make what is near too wide
 FEW = 2  # photos that agree on a height, which counts where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
-MOST_VOTES = 4_000_000  # cells times photos at once: 200 MB while they are sorted
+MOST_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
 LEAST_CELLS = 1 << 12  # of a tile that is not made in parts: margins would be the most of it
 MOST = np.iinfo(np.uint8).max
 

@@ -90,6 +90,11 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
     return RunSurface(frame, area, tuple(depths.values()), tuple(photos), finer)
 
 
+def metric_depths(maps: Sequence[KeptMap], local_from_model: Similarity) -> list[DepthSource]:
+    """Depth maps of the model's frame in local metres."""
+    return [_in_metres(kept, None, local_from_model) for kept in maps]
+
+
 def _of_both(found: Sequence[KeptMap], rendered: Sequence[KeptMap]) -> dict[str, tuple[KeptMap, KeptMap | None]]:
     """Each photo's depths by its name, and what fills their holes."""
     others = {kept.camera.name: kept for kept in rendered}

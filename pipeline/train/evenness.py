@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.distortion import LEAST_ALPHA
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
-REACHES_PX = (1, 4)  # between a place and those on either side: what is rough, and what is wavy
+REACHES_PX = (1, 4, 12)  # between a place and those on either side: from what is rough to what is wavy
 HALF_PX = 1.0  # off the line, pixels on the ground, at which half of the most is reached
 
 
