@@ -51,7 +51,7 @@ def elevation_drawing(elevation: Elevation, crs: MapCrs, zero_m: float, picture:
     bar, lengths = scale_bar(wall.length_m, low, scale)
     about = (
         f"1:{scale} on A3, {wall.length_m:.2f} m × {high - low:.2f} m, {lattice.cell_m * 1000.0:g} mm a pixel",
-        f"Heights {crs.described_heights().rpartition(',')[0]}, metres. {crs.horizontal.name}",
+        f"Heights: {crs.described_heights().rpartition(',')[0]}, metres. {crs.horizontal.name}",
     )
     title = caption(f"Façade {wall.name}", about, 0.0, low, scale)
     bottom = lattice.north_m + zero_m - height_m

@@ -20,8 +20,8 @@ from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, undecided
 TILE = 256  # cells a side
 LEAST_PHOTOS = 3  # that see a place
 NEAR = 4  # cells: smaller holes are filled from around,
-FAR = 16  # cells: larger ones where photos may see what is filled in
-MARGIN = NEAR + FAR + 1  # cells around a tile that its holes look at
+FAR = 16  # cells: larger ones where photos may see what is filled in,
+FAR_ON_WALLS = 28  # and still larger ones on walls, which are plain where no depths are found, and flat
 BEHIND = 8  # photos that see a surface are worth one that looks through it: depths make what is near too wide
 FEW = 2  # photos that agree on a height, which counts where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
@@ -66,6 +66,16 @@ class Capture:
     shelf: Shelf[DepthMap]
     upright: bool = False
 
+    @property
+    def far(self) -> int:
+        """How far larger holes look around, cells."""
+        return FAR_ON_WALLS if self.upright else FAR
+
+    @property
+    def margin(self) -> int:
+        """Cells around a tile that its holes look at."""
+        return NEAR + self.far + 1
+
     def depths(self, number: int) -> DepthMap:
         """A photo's depths, loaded if they are not at hand."""
         return self.shelf.get(number, partial(_loaded, self.sources[number]))
@@ -101,7 +111,7 @@ def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Height
         tile: Which.
         most: Cells times photos at once; larger ones are made in parts.
     """
-    wide = tile.grown(MARGIN)
+    wide = tile.grown(capture.margin)
     seen = seen_by([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
     if len(seen) * wide.cells > most and tile.cells > LEAST_CELLS:
         return _joined(tile, [tile_heights(capture, half, most) for half in tile.halves()])
@@ -122,7 +132,7 @@ def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Height
     sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma).reshape(shape)
     counted = np.where(np.isfinite(agreed), np.minimum(fit.photos, MOST), 0)
     photos, height = np.where(new, 1, counted).reshape(shape), height.reshape(shape)
-    inner = (slice(MARGIN, MARGIN + tile.height), slice(MARGIN, MARGIN + tile.width))
+    inner = tuple(slice(capture.margin, capture.margin + side) for side in (tile.height, tile.width))
     known = np.isfinite(height)
     return Heights(
         tile,
@@ -138,7 +148,7 @@ def _filled(
     """A tile's heights with small holes filled, and larger ones where enough photos may see that; and which are new."""
     shape, cell_m = (tile.height, tile.width), capture.lattice.cell_m
     near, _ = filled(height.reshape(shape), cell_m, NEAR, capture.upright)
-    far, new = filled(near, cell_m, FAR, capture.upright)
+    far, new = filled(near, cell_m, capture.far, capture.upright)
     result, asked = far.ravel(), np.flatnonzero(new)
     seen = _may_see(capture, tile, asked, result[asked], numbers) >= LEAST_PHOTOS
     result[asked[~seen]] = np.nan

@@ -15,7 +15,7 @@ SOFT_M = 0.06  # of a mask: notches and spots that are narrower go
 BRIDGED_M = 1.2  # of the wall's outline: bushes before it that are narrower make no notch
 STRAIGHT_CELLS = 1.5  # that an outline's corners may be off by
 ENCLOSED, RIM_CELLS = 0.5, 3  # share of the cells around an opening that are the wall: of a roof behind it a few are
-SQUARE = 0.88  # share of its level rectangle that an opening fills to be drawn as one
+SQUARE = 0.8  # share of its level rectangle that an opening fills to be drawn as one; a round window fills 0.79
 Ring = Float64[np.ndarray, "_ 2"]
 
 

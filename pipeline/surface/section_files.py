@@ -95,7 +95,7 @@ def section_drawing(name: str, section: Section, crs: MapCrs) -> Drawing:
     x1, y1, x2, y2 = section.line
     about = (
         f"1:{scale} on A3, {section.length_m:.2f} m from {x1:.3f}, {y1:.3f} to {x2:.3f}, {y2:.3f}",
-        f"Heights {crs.described_heights().rpartition(',')[0]}, metres. {crs.horizontal.name}",
+        f"Heights: {crs.described_heights().rpartition(',')[0]}, metres. {crs.horizontal.name}",
     )
     title = caption(name.replace("-", " ").capitalize(), about, 0.0, bottom - 3.0 * LABEL_MM * scale / 1000.0, scale)
     dots = Dots(POINTS, section.points) if len(section.points) else None

@@ -36,7 +36,7 @@ FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
 LEAST_FLAT = 0.6  # of the facets before and behind a wall, those within its band: in hedges and trees they scatter
 CORNER_M = 0.4  # from where a wall's facets end to the plane of the next one, at most: two facets
 CORNER_COSINE = math.cos(math.radians(30.0))  # planes that meet at less than this angle make no corner
-TOP_M = 0.3  # above the last facets, which end a facet or two below the eaves
+TOP_M = 0.4  # above the last facets, which end two of them below the eaves
 END_SHARE = 0.4  # of a wall's usual height that is seen at its ends: what goes on beyond them is a bush or a fence
 ROUNDS = 5  # of a plane's robust fit
 
