@@ -40,7 +40,7 @@ FILES = {
     "mesh": ("mesh.ply", "mesh.glb"),
     "cloud": ("cloud.laz", "cloud.las", "cloud.ply"),
 }
-FOLDERS = (".", "surface", "products", "facades")
+FOLDERS = (".", "surface", "products", "facades", "mesh")
 ELLIPSOIDAL = "ellipsoidal"
 Z_UP_FROM_GLB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # glTF is y up
 

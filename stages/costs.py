@@ -69,8 +69,12 @@ REFERENCE = Costs(
             "export": StageCosts(2.07e-05, 620e6, 560.0, 375.0),
             "flythrough": StageCosts(0.3, 486e6, 0.0, 0.13e6),
             "depths": StageCosts(13.5, 400e6, 0.0, 5e6),
-            "dsm": StageCosts(3.0, 900e6, 0.0, 0.2e6),
-            "ortho": StageCosts(3.0, 1800e6, 0.0, 0.5e6),
+            "splat_depths": StageCosts(3.0, 600e6, 0.0, 5e6),
+            "dsm": StageCosts(0.35, 900e6, 0.0, 0.2e6),
+            "ortho": StageCosts(0.4, 1000e6, 0.0, 0.5e6),
+            "facades": StageCosts(1.0, 1000e6, 0.0, 0.2e6),
+            "cloud": StageCosts(2.0, 1500e6, 0.0, 0.5e6),
+            "mesh": StageCosts(2.0, 2000e6, 0.0, 0.5e6),
         }
     ),
 )

@@ -8,10 +8,10 @@ from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.surface.options import DsmConfig, OrthoConfig
+from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, FacadesConfig, MeshConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
-from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
 
 INGEST = Stage(
@@ -130,7 +130,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=5,
+    version=6,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views", "georef.boundary"),
     parts={"splat": "init.ply"},
@@ -243,18 +243,38 @@ DEPTHS = Stage(
     entry="splatpipe.stages.depths:run",
     resumable=True,
 )
+SPLAT_DEPTHS = Stage(
+    "splat_depths",
+    version=1,
+    config=SplatDepthsConfig,
+    reads=(
+        "train.model",
+        "train.rendering",
+        "train.sky",
+        "train.exposures",
+        "blocks.plan",
+        "undistort.dataset",
+        "split.views",
+    ),
+    parts={"maps": "maps"},
+    entry="splatpipe.stages.splat_depths:run",
+    borrows=("depths.max_megapixels",),
+    resumable=True,
+)
+SURFACE_READS = (
+    "depths.maps",
+    "splat_depths.maps",
+    "undistort.dataset",
+    "georef.frame",
+    "georef.model",
+    "georef.boundary",
+    "ingest.photos",
+)
 DSM = Stage(
     "dsm",
     version=1,
     config=DsmConfig,
-    reads=(
-        "depths.maps",
-        "undistort.dataset",
-        "georef.frame",
-        "georef.model",
-        "georef.boundary",
-        "ingest.photos",
-    ),
+    reads=SURFACE_READS,
     parts={"files": "files", "site": "site.json"},
     entry="splatpipe.stages.dsm:run",
     resumable=True,
@@ -264,18 +284,39 @@ ORTHO = Stage(
     "ortho",
     version=1,
     config=OrthoConfig,
-    reads=(
-        "dsm.files",
-        "dsm.site",
-        "depths.maps",
-        "undistort.dataset",
-        "georef.frame",
-        "georef.model",
-        "georef.boundary",
-        "ingest.photos",
-    ),
+    reads=("dsm.files", "dsm.site", *SURFACE_READS),
     parts={"files": "files"},
     entry="splatpipe.stages.ortho:run",
+    resumable=True,
+    deliverables=("files",),
+)
+FACADES = Stage(
+    "facades",
+    version=1,
+    config=FacadesConfig,
+    reads=("dsm.site", *SURFACE_READS),
+    parts={"files": "files"},
+    entry="splatpipe.stages.facades:run",
+    resumable=True,
+    deliverables=("files",),
+)
+CLOUD = Stage(
+    "cloud",
+    version=1,
+    config=CloudConfig,
+    reads=("dsm.site", *SURFACE_READS),
+    parts={"files": "files"},
+    entry="splatpipe.stages.cloud:run",
+    resumable=True,
+    deliverables=("files",),
+)
+MESH = Stage(
+    "mesh",
+    version=1,
+    config=MeshConfig,
+    reads=("dsm.site", *SURFACE_READS),
+    parts={"files": "files"},
+    entry="splatpipe.stages.mesh:run",
     resumable=True,
     deliverables=("files",),
 )
@@ -297,6 +338,10 @@ LINE = (
     EXPORT,
     FLYTHROUGH,
     DEPTHS,
+    SPLAT_DEPTHS,
     DSM,
     ORTHO,
+    FACADES,
+    CLOUD,
+    MESH,
 )

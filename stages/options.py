@@ -11,11 +11,11 @@ from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.surface.options import DsmConfig, OrthoConfig
+from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, FacadesConfig, MeshConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import GONE as GONE_OF_TRAIN
-from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
 
 
@@ -54,5 +54,9 @@ class LineConfig(StageConfig):
     export: ExportConfig = ExportConfig()
     flythrough: FlythroughConfig = FlythroughConfig()
     depths: DepthsConfig = DepthsConfig()
+    splat_depths: SplatDepthsConfig = SplatDepthsConfig()
     dsm: DsmConfig = DsmConfig()
     ortho: OrthoConfig = OrthoConfig()
+    facades: FacadesConfig = FacadesConfig()
+    cloud: CloudConfig = CloudConfig()
+    mesh: MeshConfig = MeshConfig()

@@ -69,6 +69,10 @@ PARALLEL = {
     "depths": 0.97,
     "dsm": 0.9,
     "ortho": 0.9,
+    "splat_depths": 0.9,
+    "facades": 0.8,
+    "cloud": 0.9,
+    "mesh": 0.5,
 }
 """Of each stage's CPU seconds, what more threads divide among themselves; measured with one and two."""
 
@@ -319,7 +323,7 @@ class Work:
         photos, pixels = float(size.photos), size.photos * size.megapixels
         keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
         judged = photos * min(self.kept_at, JUDGED_MEGAPIXELS)
-        searched = self.config.depths
+        searched, rendered = self.config.depths, self.config.splat_depths.enabled
         depths = photos * min(self.kept_at, searched.max_megapixels) if searched.enabled else 0.0
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
@@ -353,6 +357,12 @@ class Work:
             "depths": Units(depths, 0.0, depths),
             "dsm": Units(pixels if self.config.dsm.enabled and depths else 0.0, 0.0, pixels),
             "ortho": Units(pixels if self.config.ortho.enabled and depths else 0.0, 0.0, pixels),
+            "splat_depths": Units(
+                photos * min(self.kept_at, searched.max_megapixels) if rendered else 0.0, 0.0, pixels
+            ),
+            "facades": Units(pixels if self.config.facades.enabled else 0.0, 0.0, pixels),
+            "cloud": Units(pixels if self.config.cloud.enabled else 0.0, 0.0, pixels),
+            "mesh": Units(pixels if self.config.mesh.enabled else 0.0, 0.0, pixels),
         }
 
     @property

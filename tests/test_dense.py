@@ -12,7 +12,7 @@ import pytest
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.dense import WIDER, Cover, DensePoints, dense_points, thinned
-from splatpipe.pipeline.mvs.depth_search import confirmed
+from splatpipe.pipeline.mvs.depth_search import confirm
 from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, neighbours
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.mvs.patch_match import find_depths
@@ -272,10 +272,11 @@ def test_photos_agree_within_half_a_pixel_far_away(depth: float, agrees: bool) -
     camera.cam_from_world[0, 3] = -1.0
     points = np.array([[0.5, 0.0, depth]])
     inverse = np.full((48, 64), 1.03 / depth, np.float32)
-    moved, found = confirmed(points, photo, camera, inverse)
-    assert found.tolist() == [agrees]
-    if agrees:
-        np.testing.assert_allclose(moved, camera.centre() + (points - camera.centre()) / 1.03, rtol=1e-6)
+    moved, votes = np.zeros((1, 3)), np.zeros(1, np.uint8)
+    confirm((points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()), photo, camera, inverse, (moved, votes))
+    assert votes.tolist() == [agrees]
+    expected = camera.centre() + (points - camera.centre()) / 1.03 if agrees else np.zeros((1, 3))
+    np.testing.assert_allclose(moved, expected, rtol=1e-6)
 
 
 def test_a_cap_of_one_leaves_one_point_on_all_sides_of_the_origin() -> None:

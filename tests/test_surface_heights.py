@@ -115,6 +115,14 @@ def test_tiles_threads_and_memory_change_no_bit() -> None:
         assert np.array_equal(part.photos, whole.photos[cut])
 
 
+def test_what_is_too_much_at_once_is_made_in_parts() -> None:
+    whole, parts = made_noisy(), tile_heights(capture(noisy()), WHOLE, most=60_000)  # of 180,000
+    assert np.array_equal(parts.height, whole.height, equal_nan=True)
+    assert np.array_equal(parts.sigma, whole.sigma, equal_nan=True)
+    assert np.array_equal(parts.photos, whole.photos)
+    assert parts.tile == WHOLE
+
+
 def test_cells_smaller_than_pixels_have_no_gaps_and_no_steps() -> None:
     lattice = Lattice(-3.02, 2.51, 0.04, 60, 60)  # on the roof, which slopes
     off, _ = errors(tile_heights(capture(exact(), lattice=lattice), Tile(0, 0, 60, 60)), lattice)
@@ -186,7 +194,7 @@ def test_a_hole_at_a_wall_is_ground_and_a_wide_one_stays() -> None:
     height[:, :5] = 3.0
     height[3:6, 5] = np.nan
     height[:, 12:24] = np.nan
-    result, new = filled(height, 0.1)
+    result, new = filled(height, 0.1, 4)
     assert new[4, 5]
     assert result[4, 5] == 0.0
     assert np.isnan(result[:, 16:20]).all()

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.mosaic import MARGIN, composed
+from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, rated, sampled
 from splatpipe.pipeline.surface.sight import Points, place_in, sight
-from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, native_camera, window_of
+from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import Votes
 
@@ -68,7 +69,8 @@ def everything() -> list[np.ndarray]:
         offers.append((seen, cost, sampled(source, photo_of(camera, 1), points, seen, 0.1, PLAIN_TONE)))
     stacked = [np.stack(column) for column in zip(*offers, strict=True)]
     mosaic = composed(*(part.copy() for part in stacked), parity=1)
-    return [*found, *stacked, mosaic.label, mosaic.colour, mosaic.seen_by]
+    best = stacked[0].copy()
+    return [*found, mosaic.label, mosaic.colour, keep_best(best, stacked[1]), best, *stacked]
 
 
 @cache
@@ -156,7 +158,7 @@ def test_colours_are_opencvs_cubic() -> None:
 
 
 def test_cells_away_from_the_rim_do_not_depend_on_it() -> None:
-    offers = everything_at_best()[-6:-3]
+    offers = everything_at_best()[-3:]
     whole = composed(*(part.copy() for part in offers), parity=0)
     part = composed(*(part[:, 5:, 7:].copy() for part in offers), parity=0)
     inner = np.s_[5 + MARGIN : -MARGIN, 7 + MARGIN : -MARGIN]
@@ -245,10 +247,14 @@ def test_photos_that_do_not_fit_are_refused() -> None:
     refused(_native.sample_photo, (pixels, PLAIN_TONE, camera, None), points, np.nan, said, colour)
     seen, many = np.zeros((2, 6, 7), np.uint8), np.zeros((2, 6, 7), np.uint16)
     colours, label, counts = np.zeros((2, 6, 7, 3), np.uint8), np.zeros((6, 7), np.int16), np.zeros((6, 7), np.uint8)
-    refused(_native.compose_mosaic, seen, many[:1], colours, 0, label, colours[0], counts)
-    refused(_native.compose_mosaic, seen, many, colours, 2, label, colours[0], counts)
-    refused(_native.compose_mosaic, seen, many, colours, 0, label[1:], colours[0], counts)
-    refused(_native.compose_mosaic, seen, many, colours, 0, label, colours, counts)
+    refused(_native.keep_best, seen, many[:1], 8, counts)
+    refused(_native.keep_best, seen, many, 8, counts[1:])
+    for most in (0, -1, 17):
+        refused(_native.keep_best, seen, many, most, counts)
+    refused(_native.compose_mosaic, seen, many[:1], colours, 0, label, colours[0])
+    refused(_native.compose_mosaic, seen, many, colours, 2, label, colours[0])
+    refused(_native.compose_mosaic, seen, many, colours, 0, label[1:], colours[0])
+    refused(_native.compose_mosaic, seen, many, colours, 0, label, colours)
 
 
 def test_a_lens_that_leads_beyond_the_photo_ends_at_its_rim() -> None:

@@ -108,6 +108,13 @@ def test_tiles_and_threads_change_no_bit() -> None:
             assert np.array_equal(getattr(part, name), getattr(made(), name)[cut])
 
 
+def test_what_is_too_much_at_once_is_made_in_parts() -> None:
+    parts = tile_orthophoto(album(), WHOLE, most=1)
+    for name in ("colour", "label", "photos", "known"):
+        assert np.array_equal(getattr(parts, name), getattr(made(), name))
+    assert parts.tile == WHOLE
+
+
 def test_a_cell_that_nobody_sees_is_filled_and_told() -> None:
     whole = album()
     height = whole.surface.height.copy()
@@ -201,7 +208,16 @@ def test_what_one_photo_of_five_shows_is_not_shown() -> None:
     made = mosaic.composed(np.ones(cost.shape, np.bool_), cost, colour, parity=1)
     assert (made.colour[22:38, 22:38] == 90).all()  # colours mix around the seam
     assert (made.label[28:32, 2:4] == 3).all()
-    assert (made.seen_by == 5).all()
+
+
+def test_of_many_photos_the_best_are_kept() -> None:
+    random = np.random.default_rng(0)
+    seen, cost = random.random((20, 30, 40)) < 0.7, random.integers(0, 50, (20, 30, 40)).astype(np.uint16)
+    count, costs = seen.sum(axis=0), np.where(seen, cost, 9999)
+    limit = np.sort(costs, axis=0)[mosaic.KEPT - 1]
+    kept = seen.copy()
+    assert np.array_equal(mosaic.keep_best(kept, cost), count)
+    assert np.array_equal(kept, seen & (cost <= limit))  # more than so many only where costs are the same
 
 
 def test_heights_between_cells_are_straight_on_slopes_and_sharp_at_steps() -> None:

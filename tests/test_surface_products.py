@@ -63,7 +63,7 @@ def sources() -> tuple[DepthSource, ...]:
 
 @cache
 def site() -> Site:
-    found = survey_site(sources(), [1.0] * len(sources()), None, 1)
+    found = survey_site(sources(), 1.0, None, 1)
     assert found is not None
     return found
 
@@ -108,7 +108,7 @@ def test_a_site_is_as_large_and_as_fine_as_its_photos() -> None:
 
 
 def test_a_site_ends_at_its_boundary() -> None:
-    found = survey_site(sources(), [1.0] * len(sources()), HOUSE, 1)
+    found = survey_site(sources(), 1.0, HOUSE, 1)
     assert found is not None
     assert np.abs(found.reach).max() <= 5.5
 

@@ -208,11 +208,31 @@ def georef(
 @app.command()
 def surface(
     out: OutArgument,
-    products: Annotated[str, typer.Option(metavar="NAMES", help="What to make: ortho, dsm.")] = "ortho,dsm",
+    products: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="What to make: ortho, dsm, facades, cloud, mesh. Without it ortho,dsm, or what the run has already.",
+        ),
+    ] = None,
     gsd: Annotated[
         str | None,
         typer.Option(metavar="2cm", help="Side of a pixel on the ground; heights have cells twice as wide."),
     ] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(help="Whose depths: photos, splat, or both: photos', and the splat's in their holes."),
+    ] = None,
+    section: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X1,Y1,X2,Y2", help="Cut a section between two points of the run's CRS. Repeatable."),
+    ] = None,
+    volume: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Measure volumes inside the polygons of a GeoJSON.")
+    ] = None,
+    base: Annotated[
+        str, typer.Option(metavar="rim|lowest|HEIGHT", help="Of volumes: a plane through the rim, or a level one.")
+    ] = "rim",
     assignments: SetOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 0,
@@ -220,17 +240,21 @@ def surface(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make surface products of a finished run: an orthophoto, a surface model. Those that it has stay."""
+    """Make surface products of a finished run: orthophoto, surface model, façades, cloud, mesh; sections, volumes."""
+    from splatpipe.pipeline.app.surfaces import Wanted, measure_surface
     from splatpipe.pipeline.engine.quantities import parse_length
-    from splatpipe.stages.products import options_for, parse_products
+    from splatpipe.stages.products import options_for
 
     with Ending(out, as_json) as done:
         done.notify_by(notify)
-        asked = options_for(parse_products(products), None if gsd is None else parse_length(gsd, "--gsd"))
+        wanted = Wanted.of(section or [], volume, base)
+        asked = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
         tables = [asked, *overrides(None, assignments, None).tables]
         with RunSession(existing(out, tables, device, threads), wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
+        if wanted.anything:
+            done.told = {"surface": measure_surface(out, wanted, threads or available_cores())}
 
 
 @app.command()

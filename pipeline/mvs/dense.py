@@ -111,7 +111,7 @@ def _agreed(search: DepthSearch, number: int) -> DensePoints | None:
     taken = camera.project(search.tracks.xyz[search.tracks.seen[number]])
     thin = ~np.isin(cell, _cells(camera, taken[:, 0], taken[:, 1]))
     sure, cell = sure[thin], cell[thin]
-    scores = agreement.votes[sure] - agreement.cost[sure]
+    scores = agreement.votes[sure].astype(np.float64) - agreement.cost[sure]
     order = np.lexsort((sure, -scores, cell))
     first = order[np.unique(cell[order], return_index=True)[1]]
     chosen = sure[first]

@@ -21,8 +21,7 @@ from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.confirmation import Inverse, confirmations
-from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch, SearchPlan
+from splatpipe.pipeline.mvs.depth_search import AGREEING, Agreement, DepthSearch, SearchPlan
 from splatpipe.pipeline.photos.dataset import View
 
 LIST = "maps.json"
@@ -147,22 +146,21 @@ def find_depth_maps(
 
 
 def _confirmed_map(search: DepthSearch, number: int) -> DepthMap:
-    camera, found = search.cameras[number], search.depths(number)
-    if found is None:
-        size = (camera.height, camera.width)
-        return DepthMap(np.zeros(size, np.float32), np.zeros(size, np.uint8))
-    asked = ((search.cameras[other], search.depths(other)) for other in search.near[number])
-    others = ((each, theirs.inverse) for each, theirs in asked if theirs is not None)
-    return confirmed_map(found.inverse, confirmations(camera, found.inverse, others))
+    return confirmed_map(search.cameras[number], search.agreement(number))
 
 
-def confirmed_map(inverse: Inverse, votes: UInt8[np.ndarray, "h w"]) -> DepthMap:
-    """Depths that enough other photos confirm.
+def confirmed_map(camera: Camera, agreement: Agreement | None) -> DepthMap:
+    """A photo's depths that enough others found, too; a map without any where there is no agreement.
 
     Args:
-        inverse: Inverse depths, 0 where there is none.
-        votes: How many photos confirm each.
+        camera: In the map's grid.
+        agreement: Of the same photo.
     """
-    sure = votes >= AGREEING
-    depth = np.where(sure, np.float32(1.0) / np.where(sure, inverse, np.float32(1.0)), np.float32(0.0))
-    return DepthMap(depth, np.where(sure, votes, np.uint8(0)))
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    confidence = np.zeros(depth.shape, np.uint8)
+    if agreement is not None:
+        sure = agreement.votes >= AGREEING
+        rows, columns = agreement.rows[sure], agreement.columns[sure]
+        depth[rows, columns] = 1.0 / agreement.inverse[sure]
+        confidence[rows, columns] = agreement.votes[sure]
+    return DepthMap(depth, confidence)

@@ -5,14 +5,14 @@ Photos and depths lie in a folder meanwhile, so that memory holds those of a pho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
@@ -23,12 +23,16 @@ from splatpipe.pipeline.mvs.picture import Picture
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.photos.small_views import small_view
+from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.raster.threads import same_bits
 
 AGREEING = 2  # so many have to agree at least
 TOLERANCE = 0.01  # of the depth, within which two photos agree;
 TOLERANCE_PX = 0.5  # far away as much of it as moves the point so far in the other's photo,
 LOOSEST = 0.2  # of the depth at most
+
+Axes = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,7 @@ class Agreement:
     columns: Int64[np.ndarray, " n"]
     inverse: Float64[np.ndarray, " n"]
     xyz: Float64[np.ndarray, "n 3"]
-    votes: Int64[np.ndarray, " n"]
+    votes: UInt8[np.ndarray, " n"]
     cost: Float32[np.ndarray, " n"]
 
 
@@ -141,21 +145,7 @@ class DepthSearch:
 
     def agreement(self, number: int) -> Agreement | None:
         """What a photo's neighbours say of its depths; None where it has none."""
-        depths = self.depths(number)
-        if depths is None:
-            return None
-        camera = self.cameras[number]
-        rows, columns = np.nonzero(depths.inverse > 0.0)
-        inverse = depths.inverse[rows, columns].astype(np.float64)
-        points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), 1.0 / inverse)
-        total, votes = points.copy(), np.zeros(len(points), np.int64)
-        for other in self.near[number]:
-            theirs = self.depths(other)
-            if theirs is not None:
-                moved, agrees = confirmed(points, camera, self.cameras[other], theirs.inverse)
-                total[agrees] += moved[agrees]
-                votes += agrees
-        return Agreement(rows, columns, inverse, total / (1 + votes)[:, None], votes, depths.cost[rows, columns])
+        return agreement_of(number, self.cameras, self.near[number], self.depths)
 
     def _photo_path(self, number: int) -> Path:
         return self.folder / f"photo-{number}.npz"
@@ -196,25 +186,50 @@ def _save_whole(path: Path, **arrays: np.ndarray) -> None:
     aside.replace(path)
 
 
-def confirmed(
-    points: Float64[np.ndarray, "n 3"], photo: Camera, camera: Camera, inverse: Float32[np.ndarray, "h w"]
-) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Points of a photo where a camera's own depths put them along its rays, and whether that is where they are.
+def agreement_of(
+    number: int, cameras: Sequence[Camera], others: Sequence[int], depths_of: Callable[[int], Depths | None]
+) -> Agreement | None:
+    """What other photos say of a photo's depths; None where it has none.
 
     Args:
-        points: World units.
+        number: The photo's.
+        cameras: Of all photos, in the grids of their depths.
+        others: Numbers of those that are asked.
+        depths_of: What is known of a photo by its number; None where nothing is.
+    """
+    depths = depths_of(number)
+    if depths is None:
+        return None
+    camera = cameras[number]
+    rows, columns = np.nonzero(depths.inverse > 0.0)
+    inverse = depths.inverse[rows, columns].astype(np.float64)
+    points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), 1.0 / inverse)
+    total, votes = points.copy(), np.zeros(len(points), np.uint8)
+    east, north, up = tuple(np.ascontiguousarray(axis) for axis in points.T)
+    for other in others:
+        theirs = depths_of(other)
+        if theirs is not None:
+            confirm((east, north, up), camera, cameras[other], theirs.inverse, (total, votes))
+    return Agreement(rows, columns, inverse, total / (1.0 + votes)[:, None], votes, depths.cost[rows, columns])
+
+
+def confirm(
+    places: Axes,
+    photo: Camera,
+    camera: Camera,
+    inverse: Float32[np.ndarray, "h w"],
+    found: tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]],
+) -> None:
+    """Ask a camera's own depths for the places of a photo's points.
+
+    Args:
+        places: x, y, z of the points, world units.
         photo: The camera that found them.
         camera: The one that is asked.
         inverse: Its inverse depths, 0 where it has none.
+        found: Where it puts them along its rays is added to the first, and a vote to the second, where that is where
+            they are.
     """
-    rows, pixels, depth = camera.in_view(points)
-    x, y = pixels.T.astype(np.int64)
-    ratio = np.zeros(len(points))  # of the point's depth over the one that the camera found
-    ratio[rows] = depth * inverse[y, x]
-    centre = camera.centre()
-    parallax = camera.fx * float(np.linalg.norm(centre - photo.centre()))  # of something one unit deep, in pixels
-    tolerance = np.zeros(len(points))
-    tolerance[rows] = np.clip(TOLERANCE_PX * depth / max(parallax, 1e-9), TOLERANCE, LOOSEST)
-    agrees = np.abs(ratio - 1.0) < tolerance
-    moved = centre + (points - centre) / np.where(agrees, ratio, 1.0)[:, None]
-    return moved, agrees
+    parallax = camera.fx * float(np.linalg.norm(camera.centre() - photo.centre()))  # of something one unit deep, pixels
+    agreeing = TOLERANCE, TOLERANCE_PX, LOOSEST, max(parallax, 1e-9)
+    _native.confirm(inverse, native_camera(camera), places, agreeing, *found)

@@ -16,9 +16,10 @@ from jaxtyping import Float
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.confirmation import Inverse, confirmations
 from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_map
+from splatpipe.pipeline.mvs.depth_search import agreement_of
 from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
+from splatpipe.pipeline.mvs.patch_match import Depths
 
 
 def rendered_depth_maps(
@@ -50,9 +51,8 @@ def rendered_depth_maps(
     near = neighbours(tracks, cameras, ASKED)
 
     def confirmed(number: int) -> DepthMap:
-        inverse = _kept(folder, number)
-        others = ((cameras[other], _kept(folder, other)) for other in near[number])
-        return confirmed_map(inverse, confirmations(cameras[number], inverse, others))
+        agreement = agreement_of(number, cameras, near[number], partial(_kept, folder))
+        return confirmed_map(cameras[number], agreement)
 
     maps = ordered_map(confirmed, range(len(cameras)), threads)
     for done, (camera, found) in enumerate(zip(cameras, maps, strict=True), start=1):
@@ -71,5 +71,6 @@ def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
     aside.replace(path)
 
 
-def _kept(folder: Path, number: int) -> Inverse:
-    return np.asarray(np.load(folder / f"{number}.npy", allow_pickle=False), np.float32)
+def _kept(folder: Path, number: int) -> Depths:
+    inverse = np.load(folder / f"{number}.npy", allow_pickle=False)
+    return Depths(inverse, np.zeros_like(inverse))

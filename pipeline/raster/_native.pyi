@@ -274,6 +274,29 @@ def look(
         ValueError: if sizes do not fit.
     """
 
+def confirm(
+    inverse: np.ndarray,
+    camera: _Camera,
+    places: _Places,
+    agreeing: tuple[float, float, float, float],
+    sums: np.ndarray,
+    votes: np.ndarray,
+) -> None:
+    """Where a photo's inverse depths put places along its rays, and whether that is where they are.
+
+    Args:
+        inverse: (height, width), float32; 0 where there is none.
+        camera: In that grid.
+        places: One-dimensional.
+        agreeing: Share of the depth within which two agree; far away as many pixels in the other photo, at most another
+            share; and the two photos' parallax of something one unit deep, pixels.
+        sums: (n, 3), float64; the place is added where they agree.
+        votes: (n,), uint8; grows by one there.
+
+    Raises:
+        ValueError: if sizes do not fit.
+    """
+
 def rate(camera: _Camera, places: _Places, cell: float, said: np.ndarray, cost: np.ndarray, seen: np.ndarray) -> int:
     """What it costs to colour places by a photo, and whether it sees them; returns how many it sees.
 
@@ -308,6 +331,19 @@ def sample_photo(
         ValueError: if sizes do not fit.
     """
 
+def keep_best(seen: np.ndarray, cost: np.ndarray, most: int, seen_by: np.ndarray) -> None:
+    """Leave each cell the photos of least cost that see it.
+
+    Args:
+        seen: Where each photo sees the cells, 0 or 1; uint8 (n, h, w), n at most 32,767. Changed.
+        cost: Of colouring them by it; uint16 (n, h, w).
+        most: So many, 16 at most; more where costs are the same.
+        seen_by: Written: how many photos saw the cell, 255 at most; uint8 (h, w).
+
+    Raises:
+        ValueError: if sizes do not fit.
+    """
+
 def compose_mosaic(
     seen: np.ndarray,
     cost: np.ndarray,
@@ -315,7 +351,6 @@ def compose_mosaic(
     parity: int,
     label: np.ndarray,
     blended: np.ndarray,
-    seen_by: np.ndarray,
 ) -> None:
     """Colour cells by photos, with seams where these look alike.
 
@@ -326,7 +361,6 @@ def compose_mosaic(
         parity: Of the first cell's row plus column in the whole picture.
         label: Written: number of the photo, -1 where none; int16 (h, w).
         blended: Written: uint8 (h, w, 3).
-        seen_by: Written: how many photos see the cell, 255 at most; uint8 (h, w).
 
     Raises:
         ValueError: if sizes do not fit.

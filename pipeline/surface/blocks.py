@@ -10,13 +10,12 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.depth_points import place_of
-from splatpipe.pipeline.surface.photo_set import PhotoSet
+from splatpipe.pipeline.surface.photo_set import PhotoSet, place_of
 from splatpipe.pipeline.surface.sources import DepthMap
 
 SIDE = 8  # voxels of a block: a surface fills smaller blocks better than open3d's usual 16
 BAND = 3.0  # voxels on either side of a surface that know how far off it is
-LEAST_PHOTOS = 3  # that have to see a surface in a block
+LEAST_PHOTOS = 2  # that have to see a surface in a block: each of their depths is confirmed by others already
 LEAST_CONFIDENCE = 2  # other photos that confirm a depth
 EVERY = 3  # pixels, of which one is looked at: blocks are wider
 LEAST_GROWTH = 1.05  # of voxels that were too small

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, dot, look_at
-from splatpipe.pipeline.surface.slopes import SAME_PX, inverse_and_gradient, turned
-from splatpipe.pipeline.surface.sources import PhotoWindow, Relief
+from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, dot, look_at, place_of, turned
+from splatpipe.pipeline.surface.sources import Relief
 from splatpipe.pipeline.surface.tiles import Tile
 
-NORMAL_REACH = 3  # pixels on either side that a normal is taken from: nearer ones say little but noise
+SAME_PX = 10.0  # depths that bend by more than so many pixels' widths are not one surface
+REACHES = (3, 1)  # pixels on either side that a normal is taken from: nearer ones say little but noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +30,7 @@ class DepthPoints:
     pieces: Facing
     footprint: Float64[np.ndarray, " n"]
 
-    def select(self, rows: np.ndarray) -> DepthPoints:
+    def select(self, rows: np.ndarray | slice) -> DepthPoints:
         """Those of them."""
         return DepthPoints(self.number, self.pieces.select(rows), self.footprint[rows])
 
@@ -45,48 +44,40 @@ def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: Relief) 
         tile: Which of them.
         relief: Outside of these heights nothing is returned.
     """
-    camera = part.camera
-    window = PhotoWindow(0, 0, camera.width, camera.height)
-    inverse, gradient = inverse_and_gradient(part.depth, window, SAME_PX / max(camera.fx, camera.fy))
-    known = np.flatnonzero(np.isfinite(gradient).all(axis=0).ravel() & (inverse.ravel() > 0.0))
-    row, column = np.divmod(known, camera.width)
-    xyz = place_of(camera, row, column, inverse.ravel()[known].astype(np.float64))
-    some = np.flatnonzero(
-        (lattice.cells(tile, xyz[0], xyz[1]) >= 0) & (xyz[2] >= relief.low_m) & (xyz[2] < relief.high_m)
-    )
-    known, row, column = known[some], row[some], column[some]
-    slopes = gradient.reshape(2, -1)[:, known].astype(np.float64)
-    normal = _normal(part, row, column, inverse.ravel()[known].astype(np.float64), slopes)
-    wide, flat = picture_normals(part, row, column)
-    pieces = Facing(xyz[:, some], np.where(flat, wide, normal))
-    footprint = look_at(camera, pieces).footprint
-    seen = np.flatnonzero(np.isfinite(footprint))
+    row, column = np.nonzero(part.depth > 0.0)
+    xyz = place_of(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64))
+    inside = (lattice.cells(tile, xyz[0], xyz[1]) >= 0) & (xyz[2] >= relief.low_m) & (xyz[2] < relief.high_m)
+    row, column, xyz = row[inside], column[inside], xyz[:, inside]
+    normal, known = picture_normals(part, row, column, REACHES[0])
+    for reach in REACHES[1:]:
+        rest = np.flatnonzero(~known)
+        normal[:, rest], known[rest] = picture_normals(part, row[rest], column[rest], reach)
+    pieces = Facing(xyz, normal)
+    footprint = look_at(part.camera, pieces).footprint
+    seen = np.flatnonzero(known & np.isfinite(footprint))
     return DepthPoints(part.number, pieces.select(seen), footprint[seen])
 
 
-def place_of(
-    camera: Camera, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], inverse: Float64[np.ndarray, " n"]
-) -> Float64[np.ndarray, "3 n"]:
-    """East, north, up of pixels' centres at inverse depths, each by itself."""
-    x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
-    ray = turned(camera.cam_from_world[:3, :3].T, x, y)
-    centre = camera.centre()
-    return np.stack([centre[axis] + ray[axis] / inverse for axis in range(3)])
-
-
 def picture_normals(
-    part: DepthPart, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"]
+    part: DepthPart, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], reach: int
 ) -> tuple[Float64[np.ndarray, "3 n"], Bool[np.ndarray, " n"]]:
     """Normals of pixels' surfaces from depths on all four sides, and where these lie in one surface.
 
-    Inverse depth is linear in a plane's pixels, as in ``slopes``.
+    Inverse depth is linear in a plane's pixels, w = n · (x, y, 1) for the plane n · X = 1; so its gradient in the
+    picture is the plane's normal in the camera.
+
+    Args:
+        part: Of a photo's depths.
+        row: Of the pixels.
+        column: Of the pixels.
+        reach: Pixels on either side that are looked at.
     """
     height, width = part.depth.shape
     here = part.depth[row, column].astype(np.float64)
     w = 1.0 / np.where(here > 0.0, here, np.inf)
     near = w * (SAME_PX / max(part.camera.fx, part.camera.fy))
     flat, slopes = here > 0.0, []
-    for down, right in ((0, NORMAL_REACH), (NORMAL_REACH, 0)):
+    for down, right in ((0, reach), (reach, 0)):
         inside = (row >= down) & (row + down < height) & (column >= right) & (column + right < width)
         behind, ahead = (
             part.depth[np.where(inside, row + s * down, 0), np.where(inside, column + s * right, 0)].astype(np.float64)
@@ -95,7 +86,7 @@ def picture_normals(
         there = inside & (behind > 0.0) & (ahead > 0.0)
         behind, ahead = (1.0 / np.where(there, side, 1.0) for side in (behind, ahead))
         flat &= there & (np.abs(ahead + behind - 2.0 * w) < near)
-        slopes.append((ahead - behind) / (2.0 * NORMAL_REACH))
+        slopes.append((ahead - behind) / (2.0 * reach))
     return _normal(part, row, column, w, np.stack(slopes)), flat
 
 

@@ -28,6 +28,7 @@ EXTENT, OUTLINE, OPENINGS, PROJECTIONS, SURFACE, POINTS, GRID, TEXTS, PICTURE = 
     "PICTURE",
 )
 Line2 = Float64[np.ndarray, "_ 2"]
+Place2 = Float64[np.ndarray, " 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,7 @@ class Drawing:
     picture: Placed | None = None
     dots: Dots | None = None
 
-    def box(self) -> tuple[Line2, Line2]:
+    def box(self) -> tuple[Place2, Place2]:
         """Lower left and upper right of all lines and the picture; texts reach a little beyond."""
         parts = [stroke.line for stroke in self.strokes]
         if self.picture is not None:

@@ -27,9 +27,10 @@ from splatpipe.pipeline.surface.walls import Wall
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sills and cornices; balconies do not
 MOST_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
+STRIP = 256  # rows that are softened at a time
 SHELF_BYTES = 256 << 20  # of photos, and as many of depths
 
-Progress = Callable[[float, float], None]
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +122,12 @@ def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress
     agreeing, colour = np.zeros(shape, np.uint8), np.zeros((*shape, 4), np.uint8)
     shelf: Shelf[DepthMap] = Shelf(SHELF_BYTES)
     known = [source.depths for source in sources if source.depths is not None]
-    capture = Capture(known, sheet.lattice, sheet.relief, shelf)
+    capture = Capture(known, sheet.lattice, sheet.relief, shelf, upright=True)
     for done, part in enumerate(surface_heights(capture, depths_tiles, photos.threads), 1):
         cut = part.tile.slices
         depth[cut], sigma[cut], agreeing[cut] = part.height, part.sigma, part.photos
         progress(done, total)
+    depth = without_specks(depth)
     surface = HeightField(sheet.lattice, depth)
     album = Album(sources, surface, sheet.lattice, sheet.relief, gains, Shelf(SHELF_BYTES), Shelf(SHELF_BYTES))
     for done, drawn in enumerate(orthophotos(album, colour_tiles, photos.threads), len(depths_tiles) + 1):
@@ -134,6 +136,20 @@ def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress
         colour[(*cut, 3)] = np.where(drawn.known, np.uint8(255), np.uint8(0))
         progress(done, total)
     return Elevation(wall, sheet, depth, sigma, agreeing, colour)
+
+
+def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """The median of each cell and those around it that are known: edges stay, single cells' errors go."""
+    result = np.empty_like(depth)
+    wide = np.pad(depth, 1, constant_values=np.nan)
+    for top in range(0, len(depth), STRIP):
+        rows = min(STRIP, len(depth) - top)
+        around = np.stack([wide[top + i : top + i + rows, j : j + depth.shape[1]] for i in range(3) for j in range(3)])
+        around.sort(axis=0)  # nan last
+        count = np.maximum(np.isfinite(around).sum(axis=0), 1)
+        low, high = (np.take_along_axis(around, at[None], 0)[0] for at in ((count - 1) // 2, count // 2))
+        result[top : top + rows] = np.where(np.isfinite(depth[top : top + rows]), (low + high) / 2, np.nan)
+    return result
 
 
 def _before(sheet: Sheet, photos: Photos) -> tuple[list[PhotoSource], Float64[np.ndarray, "n 3"]]:

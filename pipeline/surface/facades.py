@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
@@ -35,6 +36,7 @@ from splatpipe.pipeline.surface.whole_file import whole_file
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
 PLACES = 4000  # that photos' exposures are compared at
+LONGEST_TEXT = 10_000  # characters of stated lines
 Line = tuple[float, float, float, float]
 
 
@@ -44,7 +46,7 @@ class FacadesTask:
 
     Attributes:
         photos: With their depths, local metres, always in the same order.
-        area: Walls that stand outside of it are not drawn; None for all.
+        area: Walls whose middles lie outside of it are not drawn; None for all.
         crs: Of corners and lines.
         pixel_m: Side of a pixel of the elevations; what it becomes has three digits.
         lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
@@ -80,9 +82,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     report.progress(0, 1, "looking for walls")
     pixel_m = float(f"{task.pixel_m:.{DIGITS}g}")
     facets = upright_facets([photo.depths for photo in task.photos if photo.depths is not None], task.threads)
-    if task.area is not None:
-        facets = facets.select(task.area.contains(facets.places))
-    walls = stated_walls(task.lines, facets, task.crs) if task.lines else find_walls(facets, pixel_m)
+    walls = stated_walls(task.lines, facets, task.crs) if task.lines else _within(find_walls(facets), task.area)
     if not walls:
         report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
     places = facets.places[:: max(1, len(facets) // PLACES)]
@@ -90,7 +90,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     facts = []
     for number, wall in enumerate(walls):
 
-        def progress(done: float, total: float, number: int = number) -> None:
+        def progress(done: int, total: int, number: int = number) -> None:
             report.progress(number + done / total, len(walls), "façades", "façades")
 
         own = out / f"{wall.name}.json"
@@ -99,6 +99,32 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         facts.append(json.loads(own.read_text(encoding="utf-8")))
     write_facades(out / LIST, facts, task.crs)
     return facts
+
+
+def _within(walls: Sequence[Wall], area: PlanArea | None) -> list[Wall]:
+    """Walls whose middles lie in an area, named anew."""
+    if area is None or not walls:
+        return list(walls)
+    middles = np.array([[*((wall.left + wall.right) / 2.0), wall.low_m] for wall in walls])
+    return named([wall for wall, inside in zip(walls, area.contains(middles), strict=True) if inside])
+
+
+def parse_lines(text: str) -> list[Line]:
+    """Walls in plan of ``x1,y1,x2,y2; …``.
+
+    Raises:
+        UsageError: if it is anything else.
+    """
+    lines: list[Line] = []
+    for part in text[:LONGEST_TEXT].split(";") if text.strip() else ():
+        try:
+            x1, y1, x2, y2 = (float(number) for number in part.split(","))
+        except ValueError:
+            x1 = y1 = x2 = y2 = math.nan
+        if not all(math.isfinite(number) for number in (x1, y1, x2, y2)):
+            raise UsageError(f'Cannot understand the line "{part.strip()[:60]}".', hint="Write it as x1,y1,x2,y2.")
+        lines.append((x1, y1, x2, y2))
+    return lines
 
 
 def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wall]:

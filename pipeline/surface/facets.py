@@ -19,6 +19,7 @@ LEAST_CONFIRMED = 2  # other photos, of a pixel that counts
 LEAST_SHARE = 0.6  # of a block's pixels that count
 ROUGH_PX = 3.0  # pixels' widths that a block's depths may scatter by about its plane: more are two surfaces
 UPRIGHT = 0.35  # upward part of a normal, at most: 20°, three deviations of a small block's
+COARSEST = 2.0  # times the usual pixel: coarser ones are of houses beyond those that were flown for
 STRIP_PIXELS = 1 << 20  # fitted at a time: some 100 MB
 MOST_FACETS = 1_000_000  # of all photos; of more, some are left out evenly
 
@@ -31,22 +32,24 @@ class Facets:
         places: Their middles, local metres.
         facing: Unit vectors in plan that they face.
         areas: Square metres.
+        pixels_m: Side of a pixel of the depths at each, at a right angle to the ray.
     """
 
     places: Float64[np.ndarray, "n 3"]
     facing: Float64[np.ndarray, "n 2"]
     areas: Float64[np.ndarray, " n"]
+    pixels_m: Float64[np.ndarray, " n"]
 
     def select(self, rows: Bool[np.ndarray, " n"] | Int64[np.ndarray, " k"]) -> Facets:
         """Those of it."""
-        return Facets(self.places[rows], self.facing[rows], self.areas[rows])
+        return Facets(self.places[rows], self.facing[rows], self.areas[rows], self.pixels_m[rows])
 
     def __len__(self) -> int:
         return len(self.areas)
 
 
 def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
-    """Upright facets of all photos; the same bits for any number of threads.
+    """Upright facets of all photos, without what only coarse pixels show; the same bits for any number of threads.
 
     Args:
         sources: Depths of photos, always in the same order.
@@ -58,7 +61,8 @@ def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
         found = facets_of(source.load())
         return found.select(np.arange(0, len(found), share))
 
-    return _joined(list(ordered_map(thinned, sources, threads)))
+    every = _joined(list(ordered_map(thinned, sources, threads)))
+    return every.select(every.pixels_m <= COARSEST * np.median(every.pixels_m)) if len(every) else every
 
 
 def facets_of(found: DepthMap) -> Facets:
@@ -92,12 +96,13 @@ def _strip_facets(found: DepthMap, top: int, rows: int, side: int) -> Facets:
     w = (middle * normal).sum(axis=1)
     rough = np.sqrt((weight * misfit).sum(axis=1) / total)
     good = (w > 0.0) & (rough * camera.fx <= ROUGH_PX * w)
-    return _standing(camera, middle[good], normal[good], side * side / w[good] ** 2 / (camera.fx * camera.fy))
+    return _standing(camera, middle[good], normal[good], side)
 
 
 def _joined(parts: Sequence[Facets]) -> Facets:
-    every = [Facets(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)), *parts]
-    return Facets(*(np.concatenate([getattr(part, name) for part in every]) for name in ("places", "facing", "areas")))
+    every = [Facets(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0)), *parts]
+    fields = ("places", "facing", "areas", "pixels_m")
+    return Facets(*(np.concatenate([getattr(part, name) for part in every]) for name in fields))
 
 
 def _blocks(values: np.ndarray, side: int) -> np.ndarray:
@@ -123,7 +128,7 @@ def _standing(
     camera: Camera,
     rays: Float64[np.ndarray, "n 3"],
     normals: Float64[np.ndarray, "n 3"],
-    flat_m2: Float64[np.ndarray, " n"],
+    side: int,
 ) -> Facets:
     """Those whose normals are level, towards the camera.
 
@@ -131,14 +136,15 @@ def _standing(
         camera: The photo's.
         rays: To their middles, (x, y, 1) in the camera.
         normals: n of n · X = 1, in the camera: away from it.
-        flat_m2: Their areas if they faced the camera.
+        side: Of their blocks, pixels.
     """
     length = np.linalg.norm(normals, axis=1)
     w = (rays * normals).sum(axis=1)
     turn = camera.cam_from_world[:3, :3]
     places = (rays / w[:, None]) @ turn + camera.centre()
     towards = -(normals / length[:, None]) @ turn
-    areas = flat_m2 * length / w  # over the cosine against the view axis, as pixels are counted
+    pixels_m = 1.0 / (w * math.sqrt(camera.fx * camera.fy))
+    areas = np.square(side * pixels_m) * length / w  # over the cosine against the view axis, as pixels are counted
     plan = np.linalg.norm(towards[:, :2], axis=1)
     kept = np.abs(towards[:, 2]) <= UPRIGHT
-    return Facets(places[kept], towards[kept, :2] / plan[kept, None], areas[kept])
+    return Facets(places[kept], towards[kept, :2] / plan[kept, None], areas[kept], pixels_m[kept])

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatpipe.pipeline.surface.depth_points import DepthPoints, depth_points, picture_normals, place_of
+from splatpipe.pipeline.surface.depth_points import REACHES, DepthPoints, depth_points, picture_normals
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, Look, dot, look_at
+from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, Look, dot, look_at, place_of
 from splatpipe.pipeline.surface.sources import Relief
 from splatpipe.pipeline.surface.tiles import Tile
 
@@ -24,6 +24,7 @@ LEAST_PHOTOS = 3  # that have to see a point, its own among them
 REACH = 2.5  # deviations of the mean within which a photo counts (Tukey's biweight; Beaton and Tukey 1974)
 SIGMA_PX = 0.7  # of a depth, in pixels' lengths on the surface
 ROUNDS = 3  # of the robust mean
+STALE = 0.3  # of points that are lost, which it is time to leave behind
 BATCH = 1 << 15  # points at a time: what each photo says of them is held
 MOST = np.iinfo(np.uint8).max
 
@@ -59,21 +60,20 @@ def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: Reli
         tile: Which of them.
         relief: Points outside of these heights are noise.
     """
+    if not parts:
+        return joined([])
     nearest = _by_distance(parts, lattice, tile)
     finest = [_finest(depth_points(part, lattice, tile, relief), nearest) for part in parts]
-    xyz, footprint = (
-        np.concatenate([each.pieces.xyz for each in finest] or [np.zeros((3, 0))], axis=1),
-        np.concatenate([each.footprint for each in finest] or [np.zeros(0)]),
-    )
+    xyz = np.concatenate([each.pieces.xyz for each in finest], axis=1)
+    footprint = np.concatenate([each.footprint for each in finest])
     kept = np.zeros(len(footprint), np.bool_)
     kept[finest_of_cubes(xyz, footprint, lattice, tile)] = True
-    ends = np.cumsum([len(each.footprint) for each in finest], dtype=np.int64)
+    ends = np.cumsum([len(each.footprint) for each in finest])
     found = []
-    for points, some in zip(finest, np.split(kept, ends[:-1]), strict=True) if finest else ():
+    for points, some in zip(finest, np.split(kept, ends[:-1]), strict=True):
         points = points.select(some)
-        for start in range(0, len(points.footprint), BATCH):
-            rows = np.arange(start, min(start + BATCH, len(points.footprint)))
-            found.append(_agreed(points.select(rows), parts))
+        starts = range(0, len(points.footprint), BATCH)
+        found += [_agreed(points.select(np.s_[start : start + BATCH]), parts) for start in starts]
     return joined(found)
 
 
@@ -110,17 +110,19 @@ def _by_distance(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile) -> li
 
 def _finest(points: DepthPoints, others: Sequence[DepthPart]) -> DepthPoints:
     """Points that no other photo sees more finely."""
+    lost = np.zeros(len(points.footprint), np.bool_)
     for other in others:
-        if other.number == points.number or not points.footprint.size:
+        if lost.all():
+            break
+        if other.number == points.number:
             continue
+        if lost.mean() > STALE:
+            points, lost = points.select(~lost), np.zeros(int((~lost).sum()), np.bool_)
         look = look_at(other.camera, points.pieces)
-        finer = look.footprint < FINER * points.footprint
-        asked = np.flatnonzero(finer)
-        sight = look.select(finer).sight(other)
-        lost = np.zeros(len(finer), np.bool_)
+        asked = np.flatnonzero((look.footprint < FINER * points.footprint) & ~lost)
+        sight = look.sight(other, asked)
         lost[asked] = sight.seen & ~sight.mixed
-        points = points.select(~lost)
-    return points
+    return points.select(~lost)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +164,7 @@ def _heard(
         if part.number == points.number:
             continue
         look = look_at(part.camera, points.pieces)
-        sight = look.sight(part)
+        sight = look.sight(part, np.s_[:])
         facing = np.isfinite(look.footprint)
         balance -= sight.through
         seen = sight.seen & facing
@@ -188,7 +190,7 @@ def _place_and_normal(
     """
     row, column = look.place.row[seen].astype(np.int64), look.place.column[seen].astype(np.int64)
     offset = place_of(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64)) - pieces.xyz[:, seen]
-    normal, flat = picture_normals(part, row, column)
+    normal, flat = picture_normals(part, row, column, REACHES[0])
     return offset, np.where(flat, normal, 0.0)
 
 

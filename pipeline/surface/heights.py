@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.holes import REACH, filled
+from splatpipe.pipeline.surface.holes import filled
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sight import sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
@@ -19,8 +19,14 @@ from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, undecided
 
 TILE = 256  # cells a side
 LEAST_PHOTOS = 3  # that see a place
-MARGIN = REACH + 1  # cells around a tile that its holes look at
+NEAR = 4  # cells: smaller holes are filled from around,
+FAR = 16  # cells: larger ones where photos may see what is filled in
+MARGIN = NEAR + FAR + 1  # cells around a tile that its holes look at
+BEHIND = 8  # photos that see a surface are worth one that looks through it: depths make what is near too wide
+FEW = 2  # photos that agree on a height, which counts where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
+MOST_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
+LEAST_CELLS = 1 << 12  # of a tile that is not made in parts: margins would be the most of it
 MOST = np.iinfo(np.uint8).max
 
 
@@ -32,7 +38,8 @@ class Heights:
         tile: Which.
         height: Of the topmost surface at the cells' centres, local metres; nan where fewer than three photos see.
         sigma: Expected deviation of each, metres; nan where there is none.
-        photos: How many photos agree on each; 1 where it was filled from around, 0 where there is none.
+        photos: How many photos agree on each; 2 where a third one may see it, 1 where it was filled from around, 0
+            where there is none.
     """
 
     tile: Tile
@@ -50,12 +57,14 @@ class Capture:
         lattice: Whose cells get heights.
         relief: Between which heights.
         shelf: Holds a few depths.
+        upright: Whether the lattice is a wall's, and not the ground's.
     """
 
     sources: Sequence[DepthSource]
     lattice: Lattice
     relief: Relief
     shelf: Shelf[DepthMap]
+    upright: bool = False
 
     def depths(self, number: int) -> DepthMap:
         """A photo's depths, loaded if they are not at hand."""
@@ -84,23 +93,35 @@ def surface_heights(capture: Capture, tiles: Sequence[Tile], threads: int) -> It
     return ordered_map(partial(tile_heights, capture), tiles, threads)
 
 
-def tile_heights(capture: Capture, tile: Tile) -> Heights:
-    """Heights of one tile."""
+def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Heights:
+    """Heights of one tile.
+
+    Args:
+        capture: Photos and cells.
+        tile: Which.
+        most: Cells times photos at once; larger ones are made in parts.
+    """
     wide = tile.grown(MARGIN)
     seen = seen_by([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
+    if len(seen) * wide.cells > most and tile.cells > LEAST_CELLS:
+        return _joined(tile, [tile_heights(capture, half, most) for half in tile.halves()])
     votes = Votes(capture.lattice, wide, capture.relief)
     for number, window in seen:
         votes.add(capture.depths(number), window)
     found = votes.layers()
     if not found:
         return _empty(tile)
-    start = _chosen(capture, wide, found, [number for number, _ in seen])
-    fit = votes.fitted(start)
-    enough = fit.photos >= LEAST_PHOTOS
+    numbers = [number for number, _ in seen]
+    fit = votes.fitted(_chosen(capture, wide, found, numbers))
+    agreed = np.where(fit.photos >= LEAST_PHOTOS, fit.height, np.nan)
+    few = np.flatnonzero((fit.photos == FEW) & np.isfinite(fit.height))
+    may = _may_see(capture, wide, few, fit.height[few], numbers) >= LEAST_PHOTOS
+    agreed[few[may]] = fit.height[few[may]]
+    height, new = _filled(capture, wide, agreed, numbers)
     shape = (wide.height, wide.width)
-    height, new = filled(np.where(enough, fit.height, np.nan).reshape(shape), capture.lattice.cell_m)
-    sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma.reshape(shape))
-    photos = np.where(new, 1, np.where(enough, np.minimum(fit.photos, MOST), 0).reshape(shape))
+    sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma).reshape(shape)
+    counted = np.where(np.isfinite(agreed), np.minimum(fit.photos, MOST), 0)
+    photos, height = np.where(new, 1, counted).reshape(shape), height.reshape(shape)
     inner = (slice(MARGIN, MARGIN + tile.height), slice(MARGIN, MARGIN + tile.width))
     known = np.isfinite(height)
     return Heights(
@@ -111,13 +132,49 @@ def tile_heights(capture: Capture, tile: Tile) -> Heights:
     )
 
 
+def _filled(
+    capture: Capture, tile: Tile, height: Float64[np.ndarray, " c"], numbers: Sequence[int]
+) -> tuple[Float64[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
+    """A tile's heights with small holes filled, and larger ones where enough photos may see that; and which are new."""
+    shape, cell_m = (tile.height, tile.width), capture.lattice.cell_m
+    near, _ = filled(height.reshape(shape), cell_m, NEAR, capture.upright)
+    far, new = filled(near, cell_m, FAR, capture.upright)
+    result, asked = far.ravel(), np.flatnonzero(new)
+    seen = _may_see(capture, tile, asked, result[asked], numbers) >= LEAST_PHOTOS
+    result[asked[~seen]] = np.nan
+    return result, np.isfinite(result) & np.isnan(height)
+
+
+def _may_see(
+    capture: Capture,
+    tile: Tile,
+    asked: Int64[np.ndarray, " a"],
+    height: Float64[np.ndarray, " a"],
+    numbers: Sequence[int],
+) -> Int64[np.ndarray, " a"]:
+    """How many photos see places, or look there and have no depth."""
+    count = np.zeros(len(asked), np.int64)
+    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
+    for number in reversed(numbers) if asked.size else ():
+        view = sight(capture.depths(number), (east, north, height), capture.lattice.cell_m)
+        count += view.seen | view.unknown
+    return count
+
+
+def _joined(tile: Tile, halves: Sequence[Heights]) -> Heights:
+    """Of what a tile's halves are."""
+    axis = 0 if halves[0].tile.width == tile.width else 1
+    columns = zip(*((half.height, half.sigma, half.photos) for half in halves), strict=True)
+    return Heights(tile, *(np.concatenate(column, axis=axis) for column in columns))
+
+
 def _empty(tile: Tile) -> Heights:
     nothing = np.full((tile.height, tile.width), np.nan, np.float32)
     return Heights(tile, nothing, nothing.copy(), np.zeros((tile.height, tile.width), np.uint8))
 
 
 def _chosen(capture: Capture, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]) -> Float64[np.ndarray, " c"]:
-    """Of the surfaces in each cell the highest that no more photos look through than see it; nan where none is.
+    """Of the surfaces in each cell the highest that too few photos look through; nan where none is.
 
     Where there are several, one that covers half of the cell at least comes before others.
     """
@@ -140,7 +197,7 @@ def _balance(
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
-    """How many more photos see a surface than look through it."""
+    """How many more photos see a surface than ``BEHIND`` times those that look through it."""
     east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
     balance = np.zeros(heights.shape, np.int64)
     if not asked.size:
@@ -149,5 +206,5 @@ def _balance(
         found = capture.depths(number)
         for layer, height in enumerate(heights):
             view = sight(found, (east, north, height), capture.lattice.cell_m)
-            balance[layer] += view.seen.astype(np.int64) - view.through
+            balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)
     return balance

@@ -1,35 +1,36 @@
-"""Small holes in a height model, filled from their surroundings."""
+"""Holes in a height model, filled from their surroundings."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-REACH = 4  # cells: wider holes stay
 SIDES = 3  # of the four directions in which there has to be something within reach
 STEP_CELLS = 3.0  # heights this many cells above the lowest around are another surface: a hole at a wall is ground
 
 
 def filled(
-    height: Float64[np.ndarray, "h w"], cell_m: float
+    height: Float64[np.ndarray, "h w"], cell_m: float, reach: int, upright: bool = False
 ) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Fill cells that have heights near by on three sides at least.
 
     Args:
-        height: Metres, nan in holes; looked at within ``REACH`` cells of each.
+        height: Metres, nan in holes.
         cell_m: Side of a cell.
+        reach: Cells that are looked at on each side: wider holes stay.
+        upright: Whether they are depths of a wall.
 
     Returns:
         The heights, and which are new. What lies behind an edge is hidden rather than the edge itself, so a hole
-        between two surfaces takes the lower one's.
+        between two surfaces takes the lower one's; on a wall, where photos look from all sides, the nearer one's.
     """
     rows, columns = np.nonzero(np.isnan(height))
-    wide = np.pad(height, REACH, constant_values=np.nan)
+    wide = np.pad(height, reach, constant_values=np.nan)
     values, nearness = [], []
     for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         value, distance = np.full(len(rows), np.nan), np.full(len(rows), np.inf)
-        for step in range(REACH, 0, -1):
-            there = wide[rows + REACH + step * down, columns + REACH + step * right]
+        for step in range(reach, 0, -1):
+            there = wide[rows + reach + step * down, columns + reach + step * right]
             known = np.isfinite(there)
             value[known], distance[known] = there[known], step
         values.append(value)
@@ -37,8 +38,8 @@ def filled(
     value, weight = np.stack(values), np.stack(nearness)
     known = weight > 0.0
     enough = known.sum(axis=0) >= SIDES
-    lowest = np.min(np.where(known, value, np.inf), axis=0)
-    used = np.where(known & (value <= lowest + STEP_CELLS * cell_m), weight, 0.0)
+    like = _likest(value, weight, STEP_CELLS * cell_m) if upright else np.min(np.where(known, value, np.inf), axis=0)
+    used = np.where(known & (np.abs(value - like) <= STEP_CELLS * cell_m), weight, 0.0)
     total = used[0] + used[1] + used[2] + used[3]
     parts = used * np.where(known, value, 0.0)
     mean = (parts[0] + parts[1] + parts[2] + parts[3]) / np.where(total > 0.0, total, 1.0)
@@ -46,3 +47,12 @@ def filled(
     result[rows[enough], columns[enough]] = mean[enough]
     new[rows[enough], columns[enough]] = True
     return result, new
+
+
+def _likest(
+    value: Float64[np.ndarray, "4 n"], weight: Float64[np.ndarray, "4 n"], step_m: float
+) -> Float64[np.ndarray, " n"]:
+    """Of the heights around each hole the one that the others are most like, near ones before far ones."""
+    like = np.abs(value[:, None] - value[None]) <= step_m  # False for nan
+    support = np.where(weight > 0.0, (like * weight[None]).sum(axis=1), -1.0)
+    return np.asarray(np.take_along_axis(value, np.argmax(support, axis=0)[None], 0)[0])

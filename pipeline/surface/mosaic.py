@@ -16,6 +16,7 @@ from jaxtyping import Bool, Int16, UInt8, UInt16
 
 from splatpipe.pipeline.raster import _native
 
+KEPT = 8  # photos that a cell is coloured from: enough to tell what is odd
 MARGIN: int = _native.MOSAIC_MARGIN  # cells around a tile that its colours depend on
 
 
@@ -26,12 +27,25 @@ class Mosaic:
     Attributes:
         label: Number of the photo that colours it; -1 where none sees it.
         colour: Of that photo, mixed at seams; black where none.
-        seen_by: How many photos see it, at most 255.
     """
 
     label: Int16[np.ndarray, "h w"]
     colour: UInt8[np.ndarray, "h w 3"]
-    seen_by: UInt8[np.ndarray, "h w"]
+
+
+def keep_best(seen: Bool[np.ndarray, "n h w"], cost: UInt16[np.ndarray, "n h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Leave each cell the few photos of least cost that see it: the others would not colour it, and need not be read.
+
+    Args:
+        seen: Whether a photo sees a cell; changed.
+        cost: Of colouring it by the photo.
+
+    Returns:
+        How many photos saw each cell, at most 255.
+    """
+    seen_by = np.empty(seen.shape[1:], np.uint8)
+    _native.keep_best(seen.view(np.uint8), cost, KEPT, seen_by)
+    return seen_by
 
 
 def composed(
@@ -49,8 +63,8 @@ def composed(
         parity: 0 or 1: colour of the first cell on the whole picture's chessboard.
     """
     shape = seen.shape[1:]
-    made = Mosaic(np.empty(shape, np.int16), np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8))
-    _native.compose_mosaic(seen.view(np.uint8), cost, colour, parity, made.label, made.colour, made.seen_by)
+    made = Mosaic(np.empty(shape, np.int16), np.empty((*shape, 3), np.uint8))
+    _native.compose_mosaic(seen.view(np.uint8), cost, colour, parity, made.label, made.colour)
     return made
 
 

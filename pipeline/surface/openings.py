@@ -37,13 +37,15 @@ def outlines(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
     known = np.isfinite(depth).astype(np.uint8)
     reach = round(BRIDGED_M / sheet.lattice.cell_m)
     wide = cv2.copyMakeBorder(known, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
-    closed = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(reach)))
+    closed = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _square(reach)))
     height, width = known.shape
     return _rings(closed[reach : reach + height, reach : reach + width] > 0, sheet, None)
 
 
-def _disc(reach: int) -> UInt8[np.ndarray, "k k"]:
-    return np.ones((reach + 1, reach + 1), np.uint8)
+def _square(cells: int) -> UInt8[np.ndarray, "k k"]:
+    """A kernel with a middle: an even one would move what it is applied to."""
+    side = 2 * (cells // 2) + 1
+    return np.ones((side, side), np.uint8)
 
 
 def _rings(there: Bool[np.ndarray, "h w"], sheet: Sheet, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
@@ -56,7 +58,7 @@ def _rings(there: Bool[np.ndarray, "h w"], sheet: Sheet, face: Bool[np.ndarray, 
             none.
     """
     cell = sheet.lattice.cell_m
-    kernel = _disc(max(1, round(SOFT_M / cell)))
+    kernel = _square(round(SOFT_M / cell))
     mask = np.asarray(cv2.morphologyEx(there.astype(np.uint8), cv2.MORPH_OPEN, kernel))
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
     count, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.stage import Reporter
@@ -22,6 +23,7 @@ from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.mosaic import MARGIN
 from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, Album, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.pixel_file import pixels_on_disk
 from splatpipe.pipeline.surface.sheet import GridSheet, grid_sheets
 from splatpipe.pipeline.surface.sheet_work import Arrays, SheetWork
 from splatpipe.pipeline.surface.site import Site
@@ -29,7 +31,7 @@ from splatpipe.pipeline.surface.sources import Shelf
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.survey.frames import Frame
 
-PIXEL_BYTES = 1 << 30  # of decoded photos in memory
+PIXEL_BYTES = 1 << 30  # of decoded photos in memory; all together lie on the disk where they are more
 AROUND = 3  # cells of the surface model more than the pixels drawn need: heights between cells
 COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
 
@@ -78,25 +80,11 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
     grid = make_grid(task.frame, task.site.box, task.gsd_m)
     heights = make_grid(task.frame, task.site.box, task.dsm_cell_m)
     sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
-    gains = exposure_gains(task.photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
-    pixels: Shelf[Any] = Shelf(PIXEL_BYTES)
-
-    def colours(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
-        plane = sheet.sheet
-        depths = plane.depths([photo.depths for photo in task.photos if photo.depths is not None])
-        moved = iter(depths)
-        photos = [
-            replace(photo, camera=plane.moved(photo.camera), depths=photo.depths and next(moved))
-            for photo in task.photos
-        ]
-        surface = _surface(sheet, task.dsm, heights)
-        album = Album(photos, surface, plane.lattice, plane.relief, gains, pixels, Shelf(HELD_BYTES))
-        for part in orthophotos(album, tiles, task.threads):
-            alpha = np.where(part.known, 255, 0).astype(np.uint8)
-            yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}
-
     making = SheetWork(sheets, task.site, task.area, TILE, work, report, "orthophoto")
-    making.run(colours)
+    work.mkdir(exist_ok=True)
+    with pixels_on_disk(task.photos, work, PIXEL_BYTES) as photos:
+        gains = exposure_gains(photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
+        making.run(partial(_colours, replace(task, photos=photos), heights, gains, Shelf(PIXEL_BYTES)))
     known = 0
     with raster_file(out / "ortho.tif", grid, COLOURS) as file:
         for part, arrays in making.finished():
@@ -111,6 +99,27 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
         "exposures_stops": round(float(np.ptp(np.log2(gains[:, 1]))), 3) if len(gains) else 0.0,
         "crs": grid.crs.horizontal.name,
     }
+
+
+def _colours(
+    task: OrthoTask,
+    heights: Grid,
+    gains: Float64[np.ndarray, "n 3"],
+    pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]],
+    sheet: GridSheet,
+    tiles: Sequence[Tile],
+) -> Iterator[tuple[Tile, Arrays]]:
+    """The colours of a sheet's tiles."""
+    plane = sheet.sheet
+    moved = iter(plane.depths([photo.depths for photo in task.photos if photo.depths is not None]))
+    photos = [
+        replace(photo, camera=plane.moved(photo.camera), depths=photo.depths and next(moved)) for photo in task.photos
+    ]
+    surface = _surface(sheet, task.dsm, heights)
+    album = Album(photos, surface, plane.lattice, plane.relief, gains, pixels, Shelf(HELD_BYTES))
+    for part in orthophotos(album, tiles, task.threads):
+        alpha = np.where(part.known, 255, 0).astype(np.uint8)
+        yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}
 
 
 def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int16, UInt8, UInt16
+from jaxtyping import Bool, Float64, Int16, Int64, UInt8, UInt16
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.mosaic import MARGIN, composed, spread
+from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best, spread
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, loader, rated, sampled, tone_curve
 from splatpipe.pipeline.surface.sight import Points, contiguous, sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
@@ -20,6 +20,8 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells a side
 SPREAD = 24  # cells that colours are spread to where no photo sees; further off there is none
+MOST_RATED = 24_000_000  # cells times photos at once: 70 MB of costs, and colours of a few
+LEAST_CELLS = 1 << 14  # of a tile that is not made in parts: margins would be the most of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,27 +66,6 @@ class Album:
     depths: Shelf[DepthMap]
 
 
-@dataclass(frozen=True, eq=False)
-class _Offers:
-    """What photos offer to a tile; room for so many.
-
-    Attributes:
-        seen: Where each sees the surface.
-        cost: Of being coloured by it; told beside, too, for what lies around a cell counts.
-        colour: Levelled; black where it does not see the surface.
-    """
-
-    seen: Bool[np.ndarray, "n h w"]
-    cost: UInt16[np.ndarray, "n h w"]
-    colour: UInt8[np.ndarray, "n h w 3"]
-
-    @classmethod
-    def room(cls, count: int, shape: tuple[int, ...]) -> _Offers:
-        """For so many photos."""
-        whole = (count, *shape)
-        return cls(np.empty(whole, np.bool_), np.empty(whole, np.uint16), np.empty((*whole, 3), np.uint8))
-
-
 def orthophotos(album: Album, tiles: Sequence[Tile], threads: int) -> Iterator[Orthophoto]:
     """Tiles of the orthophoto, in their order: the same bits for any number of threads, and however cells are tiled.
 
@@ -99,38 +80,63 @@ def orthophotos(album: Album, tiles: Sequence[Tile], threads: int) -> Iterator[O
     return ordered_map(partial(tile_orthophoto, album), tiles, threads)
 
 
-def tile_orthophoto(album: Album, tile: Tile) -> Orthophoto:
-    """One tile of the orthophoto."""
+def tile_orthophoto(album: Album, tile: Tile, most: int = MOST_RATED) -> Orthophoto:
+    """One tile of the orthophoto.
+
+    Args:
+        album: Photos, surface and cells.
+        tile: Which.
+        most: Cells times photos at once; larger ones are made in parts.
+    """
     wide = tile.grown(MARGIN + SPREAD)
+    windows = seen_by([source.camera for source in album.sources], album.lattice, wide, album.relief)
+    if len(windows) * wide.cells > most and tile.cells > LEAST_CELLS:
+        return _joined(tile, [tile_orthophoto(album, half, most) for half in tile.halves()])
     east, north = np.moveaxis(album.lattice.centres(wide), -1, 0)
     points = contiguous((east, north, album.surface.at(east, north)))
-    windows = seen_by([source.camera for source in album.sources], album.lattice, wide, album.relief)
-    offers = _Offers.room(len(windows), east.shape)
-    numbers: list[int] = []
-    for number, _ in windows:
-        if _offer(album, number, points, offers, len(numbers)):
-            numbers.append(number)
-    given = slice(len(numbers))
-    made = composed(offers.seen[given], offers.cost[given], offers.colour[given], (wide.row + wide.column) % 2)
-    colour, known = spread(made.colour, made.label >= 0, np.isfinite(points[2]), SPREAD)
+    numbers, seen, cost = _rated(album, [number for number, _ in windows], points)
+    photos = keep_best(seen, cost)
+    best = np.flatnonzero(seen.any(axis=(1, 2)))
+    numbers, seen, cost = numbers[best], seen[best], cost[best]
+    colour = np.empty((*seen.shape, 3), np.uint8)
+    for number, there, out in zip(numbers, seen, colour, strict=True):
+        source, tone = album.sources[number], tone_curve(album.gains[number])
+        pixels = album.pixels.get(number, loader(source))
+        out[:] = sampled(source, pixels, points, there, album.lattice.cell_m, tone)
+    made = composed(seen, cost, colour, (wide.row + wide.column) % 2)
+    filled, known = spread(made.colour, made.label >= 0, np.isfinite(points[2]), SPREAD)
     inner = tuple(slice(MARGIN + SPREAD, MARGIN + SPREAD + size) for size in (tile.height, tile.width))
-    label = np.array([*numbers, -1], np.int16)[made.label]
-    return Orthophoto(tile, colour[inner], made.seen_by[inner], label[inner], known[inner])
+    label = np.append(numbers, -1).astype(np.int16)[made.label]
+    return Orthophoto(tile, filled[inner], photos[inner], label[inner], known[inner])
 
 
-def _offer(album: Album, number: int, points: Points, offers: _Offers, at: int) -> bool:
-    """Write what a photo offers as one of the offers; False where it sees nothing."""
-    source = album.sources[number]
-    if source.depths is None:
-        return False
-    view = sight(album.depths.get(number, partial(_loaded, source.depths)), points, 0.0)
-    cost, seen = rated(source.camera, points, album.lattice.cell_m, view.said)
-    if not seen.any():
-        return False
-    pixels = album.pixels.get(number, loader(source))
-    offers.seen[at], offers.cost[at] = seen, cost
-    offers.colour[at] = sampled(source, pixels, points, seen, album.lattice.cell_m, tone_curve(album.gains[number]))
-    return True
+def _rated(
+    album: Album, numbers: Sequence[int], points: Points
+) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, "n h w"], UInt16[np.ndarray, "n h w"]]:
+    """Numbers of the photos that see any of the points, where they see them, and what it costs to be coloured by them.
+
+    Costs are told beside what is seen, too, for what lies around a cell counts.
+    """
+    shape = (len(numbers), *points[2].shape)
+    seen, cost = np.empty(shape, np.bool_), np.empty(shape, np.uint16)
+    found: list[int] = []
+    for number in numbers:
+        source = album.sources[number]
+        if source.depths is None:
+            continue
+        view = sight(album.depths.get(number, partial(_loaded, source.depths)), points, 0.0)
+        each, there = rated(source.camera, points, album.lattice.cell_m, view.said)
+        if there.any():
+            cost[len(found)], seen[len(found)] = each, there
+            found.append(number)
+    return np.array(found, np.int64), seen[: len(found)], cost[: len(found)]
+
+
+def _joined(tile: Tile, halves: Sequence[Orthophoto]) -> Orthophoto:
+    """Of what a tile's halves are."""
+    axis = 0 if halves[0].tile.width == tile.width else 1
+    columns = zip(*((half.colour, half.photos, half.label, half.known) for half in halves), strict=True)
+    return Orthophoto(tile, *(np.concatenate(column, axis=axis) for column in columns))
 
 
 def _loaded(source: DepthSource) -> tuple[DepthMap, int]:

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float64, UInt8, UInt16
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.sight import Points, contiguous
-from splatpipe.pipeline.surface.sources import DepthSource, native_camera
+from splatpipe.pipeline.surface.sources import DepthSource
 
 
 @dataclass(frozen=True, eq=False)

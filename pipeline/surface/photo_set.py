@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
@@ -16,6 +16,9 @@ from splatpipe.pipeline.surface.sight import Place, Sight, place_in, sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, PhotoWindow, Relief, Shelf, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 
+EVERY = 4  # pixels, of which one is looked at where heights are looked for
+LAYER_M = 1.0  # of such heights, and their margin
+LEAST_PHOTOS = 2  # that see something between them
 LEAST_COSINE = 0.1  # of a ray and a surface's normal: flatter rays count as this one
 
 
@@ -48,15 +51,59 @@ class PhotoSet:
         return self.depths.get(number, partial(_loaded, source))
 
     def parts_in(self, lattice: Lattice, tile: Tile, relief: Relief) -> list[DepthPart]:
-        """The parts of all photos' depths that may lie in a tile, each photo loaded once."""
+        """The parts of all photos' depths that may lie in a tile, between the heights that there are in it.
+
+        Between a whole site's heights, a tile in the hills would be most of each photo.
+        """
+        numbers = self._seeing(lattice, tile, relief)
+        narrow = self._heights_in(numbers, lattice, tile, relief)
         found = []
-        for number in self.with_depths():
-            source = self.sources[number].depths
-            assert source is not None
-            window = window_of(source.camera, lattice, tile, relief)
+        for number in reversed(numbers) if narrow is not None else ():  # the last ones are still at hand
+            whole = self.depth_map(number)
+            window = window_of(whole.camera, lattice, tile, narrow or relief)
             if window is not None:
-                found.append(_part(number, self.depth_map(number), window))
-        return found
+                found.append(_part(number, whole, window))
+        return found[::-1]
+
+    def _seeing(self, lattice: Lattice, tile: Tile, relief: Relief) -> list[int]:
+        cameras = [(number, source.depths.camera) for number, source in enumerate(self.sources) if source.depths]
+        return [number for number, camera in cameras if window_of(camera, lattice, tile, relief) is not None]
+
+    def _heights_in(self, numbers: Sequence[int], lattice: Lattice, tile: Tile, relief: Relief) -> Relief | None:
+        """Between which heights two photos at least see something in a tile; None where nothing is."""
+        photos = np.zeros(int((relief.high_m - relief.low_m) / LAYER_M) + 1, np.int64)
+        for number in numbers:
+            found = self.depth_map(number)
+            window = window_of(found.camera, lattice, tile, relief)
+            assert window is not None
+            east, north, up = _some_places(found, window)
+            inside = (lattice.cells(tile, east, north) >= 0) & (up >= relief.low_m) & (up < relief.high_m)
+            photos[np.unique(((up[inside] - relief.low_m) / LAYER_M).astype(np.int64))] += 1
+        layers = np.flatnonzero(photos >= LEAST_PHOTOS)
+        if not layers.size:
+            return None
+        low, high = (relief.low_m + LAYER_M * float(edge) for edge in (layers[0] - 1, layers[-1] + 2))
+        return Relief(max(low, relief.low_m), min(high, relief.high_m))
+
+
+def _some_places(found: DepthMap, window: PhotoWindow) -> Float64[np.ndarray, "3 n"]:
+    """East, north, up of some of the depths in a window, evenly."""
+    row, column = (
+        grid.ravel() for grid in np.mgrid[window.top : window.bottom : EVERY, window.left : window.right : EVERY]
+    )
+    depth = found.depth[row, column].astype(np.float64)
+    row, column, depth = (each[depth > 0.0] for each in (row, column, depth))
+    return place_of(found.camera, row, column, 1.0 / depth)
+
+
+def place_of(
+    camera: Camera, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], inverse: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, "3 n"]:
+    """East, north, up of pixels' centres at inverse depths, each by itself."""
+    x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
+    ray = turned(camera.cam_from_world[:3, :3].T, x, y)
+    centre = camera.centre()
+    return np.stack([centre[axis] + ray[axis] / inverse for axis in range(3)])
 
 
 def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
@@ -65,6 +112,16 @@ def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
     if found.depth.shape != shape or found.confidence.shape != shape:
         raise ValueError(f"{found.camera.name}: depths of {found.depth.shape} for a camera of {shape}")
     return found, found.depth.nbytes + found.confidence.nbytes
+
+
+def turned(
+    turn: Float64[np.ndarray, "3 3"],
+    x: Float64[np.ndarray, " n"],
+    y: Float64[np.ndarray, " n"],
+    z: Float64[np.ndarray, " n"] | float = 1.0,
+) -> list[Float64[np.ndarray, " n"]]:
+    """A matrix times vectors, each by itself: a library's product would depend on how many there are."""
+    return [turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z for i in range(3)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,16 +178,10 @@ class Look:
     place: Place
     footprint: Float64[np.ndarray, " n"]
 
-    def select(self, rows: Bool[np.ndarray, " n"]) -> Look:
-        """Those of them."""
-        place = self.place
-        parts = (place.column[rows], place.row[rows], place.depth[rows], place.sine[rows], place.inside[rows])
-        return Look(self.pieces.select(rows), Place(*parts), self.footprint[rows])
-
-    def sight(self, found: DepthMap) -> Sight:
-        """What the photo's depths say, in whose grid the look is."""
-        east, north, up = self.pieces.xyz
-        return sight(found, (east, north, up), 0.0, np.ascontiguousarray(self.place.sine))
+    def sight(self, found: DepthMap, rows: np.ndarray | slice) -> Sight:
+        """What the photo's depths, in whose grid the look is, say of some of the pieces."""
+        east, north, up = self.pieces.xyz[:, rows]
+        return sight(found, (east, north, up), 0.0, np.ascontiguousarray(self.place.sine[rows]))
 
 
 def look_at(camera: Camera, pieces: Facing) -> Look:

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.depth_points import place_of
 from splatpipe.pipeline.surface.exposures import exposure_gains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded, sampled, tone_curve
-from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet, look_at
+from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet, look_at, place_of
 from splatpipe.pipeline.surface.sight import place_in
 from splatpipe.pipeline.surface.sources import DepthMap, Shelf
 
@@ -116,10 +115,9 @@ def _seen(
         return rows, np.zeros(0, np.float32)
     found = photos.depth_map(number)
     look = look_at(found.camera, pieces.select(rows))
-    facing = np.isfinite(look.footprint)
-    rows, look = rows[facing], look.select(facing)
-    sight = look.sight(found)
-    coarse = np.maximum(look.footprint / cell_m, 0.1)  # finer ones are no better, and powers stay finite
+    facing = np.flatnonzero(np.isfinite(look.footprint))
+    sight = look.sight(found, facing)
+    coarse = np.maximum(look.footprint[facing] / cell_m, 0.1)  # finer ones are no better, and powers stay finite
     weight = np.where(sight.seen, np.where(sight.mixed, MIXED, 1.0), 0.0) / coarse**COARSE
     kept = weight > 0.0
-    return rows[kept], weight[kept].astype(np.float32)
+    return rows[facing[kept]], weight[kept].astype(np.float32)

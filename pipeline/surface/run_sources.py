@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,13 +13,18 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, Float64, UInt8
 
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.stage import Inputs, Reporter
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.mvs.depth_maps import KeptMap
-from splatpipe.pipeline.photos.photo_list import decode
-from splatpipe.pipeline.photos.undistortion import Placed
+from splatpipe.pipeline.mvs.depth_maps import KeptMap, kept_depth_maps
+from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
+from splatpipe.pipeline.photos.undistortion import Placed, place, read_flown
 from splatpipe.pipeline.surface.photo_samples import Lens, PhotoSource
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+from splatpipe.pipeline.survey.frames import Frame, load_frame
 
 LENS_STEP = 8.0  # pixels
 
@@ -37,35 +44,81 @@ class MetricMap:
     confidence: UInt8[np.ndarray, "h w"]
 
 
-def depth_sources(maps: Sequence[KeptMap], local_from_model: Similarity) -> list[DepthSource]:
-    """Depth maps of the model's frame in local metres.
+@dataclass(frozen=True, eq=False)
+class RunSurface:
+    """What all products of a run are made from.
+
+    Attributes:
+        frame: The run's, in metres.
+        area: Its boundary; None for all.
+        depths: Of its photos.
+        photos: As flown, those with depths and others.
+        finer: How many pixels of a photo as flown lie along one of its depths, the middle one of all.
+    """
+
+    frame: Frame
+    area: PlanArea | None
+    depths: tuple[DepthSource, ...]
+    photos: tuple[PhotoSource, ...]
+    finer: float
+
+
+def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
+    """Open what a run's products are made from; None without metres, or without any depths.
 
     Args:
-        maps: What `depths` left.
-        local_from_model: The frame's, in metres.
+        inputs: Of a stage that reads `depths.maps`, `splat_depths.maps`, `undistort.dataset`, `georef.frame`,
+            `georef.model`, `georef.boundary` and `ingest.photos`.
+        report: Told of photos that are not there.
+
+    Raises:
+        SplatpipeError: if one of them is broken.
     """
-    return [_in_metres(kept, local_from_model) for kept in maps]
+    frame, views = load_frame(inputs["georef.frame"]), load_views(inputs["undistort.dataset"])
+    found, rendered = (kept_depth_maps(inputs[part], views) for part in ("depths.maps", "splat_depths.maps"))
+    maps = _of_both(found, rendered)
+    if not maps or not frame.in_metres:
+        return None
+    local_from_model = frame.world_from_model
+    depths = {name: _in_metres(*each, local_from_model) for name, each in maps.items()}
+    flown = load_photo_list(inputs["ingest.photos"]).photos
+    placed = place(read_flown(inputs["georef.model"]), flown, math.inf, report)
+    photos = photo_sources(placed, depths, local_from_model, (inputs["ingest.photos"], inputs.photos_dir))
+    focal = {view.photo.name: view.source.mean_focal_length() for view in placed}
+    finer = statistics.median(focal.get(name, each.camera.fx) / each.camera.fx for name, each in depths.items())
+    area = read_world_area(inputs.parts.get("georef.boundary"))
+    return RunSurface(frame, area, tuple(depths.values()), tuple(photos), finer)
 
 
-def _in_metres(kept: KeptMap, local_from_model: Similarity) -> DepthSource:
+def metric_depths(maps: Sequence[KeptMap], local_from_model: Similarity) -> list[DepthSource]:
+    """Depth maps of the model's frame in local metres."""
+    return [_in_metres(kept, None, local_from_model) for kept in maps]
+
+
+def _of_both(found: Sequence[KeptMap], rendered: Sequence[KeptMap]) -> dict[str, tuple[KeptMap, KeptMap | None]]:
+    """Each photo's depths by its name, and what fills their holes."""
+    others = {kept.camera.name: kept for kept in rendered}
+    if not found:
+        return {name: (kept, None) for name, kept in others.items()}
+    return {kept.camera.name: (kept, others.get(kept.camera.name)) for kept in found}
+
+
+def _in_metres(kept: KeptMap, filling: KeptMap | None, local_from_model: Similarity) -> DepthSource:
     camera = replace(kept.camera, cam_from_world=local_from_model.camera_pose(kept.camera.cam_from_world))
 
     def load() -> DepthMap:
         found = kept.load()
-        return MetricMap(camera, found.depth * np.float32(local_from_model.scale), found.confidence)
+        depth, confidence = found.depth, found.confidence
+        if filling is not None:
+            other, hole = filling.load(), found.depth <= 0.0
+            if other.depth.shape != depth.shape:
+                raise StageError(f"{kept.camera.name}: depths of two sizes.", "Run again with --rerun splat_depths.")
+            depth, confidence = (
+                np.where(hole, theirs, own) for theirs, own in ((other.depth, depth), (other.confidence, confidence))
+            )
+        return MetricMap(camera, depth * np.float32(local_from_model.scale), confidence)
 
     return DepthSource(camera, load)
-
-
-def times_finer(kept: Sequence[KeptMap], placed: Sequence[Placed]) -> list[float]:
-    """How many of a photo's pixels, as it was flown, lie along one of its depths; 1 where the photo is not there.
-
-    Args:
-        kept: Depths.
-        placed: Photos with their cameras.
-    """
-    focal = {view.photo.name: view.source.mean_focal_length() for view in placed}
-    return [focal.get(each.camera.name, each.camera.fx) / each.camera.fx for each in kept]
 
 
 def photo_sources(

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import _native
-from splatpipe.pipeline.surface.sources import DepthMap, native_camera
+from splatpipe.pipeline.raster.native_camera import native_camera
+from splatpipe.pipeline.surface.sources import DepthMap
 
 Points = tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"]]  # east, north, up
 

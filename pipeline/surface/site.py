@@ -112,19 +112,16 @@ def load_site(path: Path) -> tuple[Site, float] | None:
         raise StageError(f"The site {path.name} cannot be read: {error}", "Run again with --rerun dsm.") from error
 
 
-def survey_site(
-    sources: Sequence[DepthSource], sizes: Sequence[float], area: PlanArea | None, threads: int
-) -> Site | None:
+def survey_site(sources: Sequence[DepthSource], finer: float, area: PlanArea | None, threads: int) -> Site | None:
     """Look at the depths of all photos; None where nothing is seen by enough of them.
 
     Args:
         sources: In local metres.
-        sizes: How many times finer each photo as flown is than its depths.
+        finer: How many times finer photos as flown are than their depths.
         area: Nothing outside of it counts; None where all does.
         threads: Photos at a time.
     """
-    numbers = range(len(sources))
-    looks = list(ordered_map(partial(_look, sources, sizes), numbers, threads))
+    looks = list(ordered_map(partial(_look, finer), sources, threads))
     seen = [look for look in looks if len(look)]
     if not seen:
         return None
@@ -151,9 +148,9 @@ def survey_site(
     return Site(gsd, low, high, reach, (float(corner[0]), float(corner[1])), cell, wider)
 
 
-def _look(sources: Sequence[DepthSource], sizes: Sequence[float], number: int) -> Float64[np.ndarray, "n 5"]:
+def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
     """East, north, up of some depths, and a pixel's side there: on the ground, and across the ray."""
-    found: DepthMap = sources[number].load()
+    found: DepthMap = source.load()
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
     row, column = (grid.ravel() for grid in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
@@ -163,7 +160,7 @@ def _look(sources: Sequence[DepthSource], sizes: Sequence[float], number: int) -
     points = camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), depth)
     away = np.linalg.norm(points - camera.centre(), axis=1)
     sine = (camera.centre()[2] - points[:, 2]) / np.maximum(away, 1e-9)
-    pixel = depth / max(camera.fx, camera.fy) / sizes[number]
+    pixel = depth / max(camera.fx, camera.fy) / finer
     return np.column_stack([points, pixel / np.maximum(sine, 1e-3), pixel])
 
 

@@ -38,15 +38,6 @@ class DepthMap(Protocol):
     def confidence(self) -> UInt8[np.ndarray, "h w"]: ...
 
 
-NativeCamera = tuple[Float64[np.ndarray, "4 4"], tuple[int, int], tuple[float, float, float, float]]
-
-
-def native_camera(camera: Camera) -> NativeCamera:
-    """A camera as native kernels take it: pose, size, and focal lengths and principal point in pixels."""
-    pose = np.ascontiguousarray(camera.cam_from_world, np.float64)
-    return pose, (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
-
-
 @dataclass(frozen=True, eq=False)
 class DepthSource:
     """Where a photo's depths come from.

@@ -22,6 +22,7 @@ from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, without_crumbs
 from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
+from splatpipe.pipeline.surface.whole_file import whole_file
 from splatpipe.pipeline.survey.frames import Frame
 
 MOST_BLOCKS = 120_000  # of voxels: 0.5 GB, and about 5 million triangles before decimation; beyond it voxels are larger
@@ -52,11 +53,14 @@ class MeshTask:
     threads: int
 
 
-def make_mesh(task: MeshTask, out: Path, facts: Mapping[str, Any], report: Reporter) -> dict[str, Any]:
+def make_mesh(task: MeshTask, work: Path, out: Path, facts: Mapping[str, Any], report: Reporter) -> dict[str, Any]:
     """Write `mesh.glb`, `mesh.ply` and `georef.json`; the same bits for any number of threads.
+
+    A killed one goes on from the whole mesh before it is decimated, if it came so far.
 
     Args:
         task: What it is made from.
+        work: Folder of what is kept meanwhile.
         out: Where the files go.
         facts: What `georef.json` says besides: the uncertainty, a boundary.
         report: Told of progress.
@@ -71,7 +75,11 @@ def make_mesh(task: MeshTask, out: Path, facts: Mapping[str, Any], report: Repor
     """
     open3d()
     photos = photo_set(task.photos, task.voxel_m, task.threads)
-    mesh, voxel_m = fine_mesh(task, photos, report)
+    work.mkdir(exist_ok=True)
+    kept = work / "fine.npz"
+    if not kept.is_file():
+        _keep(kept, *fine_mesh(task, photos, report))
+    mesh, voxel_m = _kept(kept)
     report.progress(0, 1, "decimating the mesh", "meshes")
     mesh = decimated(mesh, task.most_triangles)
     report.progress(1, 1, "decimating the mesh", "meshes")
@@ -82,6 +90,16 @@ def make_mesh(task: MeshTask, out: Path, facts: Mapping[str, Any], report: Repor
         "area_m2": round(float(mesh.areas().sum()), 1),
         "voxel_m": round(voxel_m, 6),
     }
+
+
+def _keep(path: Path, mesh: TriangleMesh, voxel_m: float) -> None:
+    with whole_file(path) as aside, aside.open("wb") as file:
+        np.savez(file, vertices=mesh.vertices, triangles=mesh.triangles, voxel_m=np.float64(voxel_m))
+
+
+def _kept(path: Path) -> tuple[TriangleMesh, float]:
+    with np.load(path, allow_pickle=False) as kept:
+        return TriangleMesh(kept["vertices"], kept["triangles"]), float(kept["voxel_m"])
 
 
 def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[TriangleMesh, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,19 @@ class Tile:
     def grown(self, cells: int) -> Tile:
         """The same with so many more cells on every side."""
         return Tile(self.row - cells, self.column - cells, self.height + 2 * cells, self.width + 2 * cells)
+
+    @property
+    def cells(self) -> int:
+        """How many."""
+        return self.height * self.width
+
+    def halves(self) -> tuple[Tile, Tile]:
+        """Two parts, one after the other along the longer side: rows if they are as many as columns."""
+        if self.height >= self.width:
+            upper = self.height // 2
+            return replace(self, height=upper), replace(self, row=self.row + upper, height=self.height - upper)
+        left = self.width // 2
+        return replace(self, width=left), replace(self, column=self.column + left, width=self.width - left)
 
 
 def tiled(height: int, width: int, side: int) -> Iterator[Tile]:

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.parallel import ordered_map
@@ -22,6 +22,7 @@ from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.triangles import TriangleMesh, in_order
 
 FARTHEST_M = 1e4  # open3d asks for a limit of depths
+WIDER = 1.01  # times a block's half diagonal: what a view's sides touch is in it, however it is rounded
 
 
 def open3d() -> Any:
@@ -98,9 +99,9 @@ def _pose(camera: Camera, blocks: Blocks) -> np.ndarray:
     return pose
 
 
-def _in_view(camera: Camera, blocks: Blocks) -> Int64[np.ndarray, " n"]:
+def _in_view(camera: Camera, blocks: Blocks) -> Bool[np.ndarray, " n"]:
     """Blocks of which a part may lie in a camera's picture."""
-    reach = SIDE * blocks.voxel_m * np.sqrt(3.0) / 2.0
+    reach = WIDER * SIDE * blocks.voxel_m * np.sqrt(3.0) / 2.0
     pose = camera.cam_from_world
     x, y, depth = pose[:3, :3] @ blocks.centres() + pose[:3, 3:]
     inside = depth > -reach

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
 from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, native_camera
+from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief
 from splatpipe.pipeline.surface.tiles import Tile
 
 HALF = 0.5  # of a cell that its surface covers, where there is another one below: else edges would grow outwards

@@ -18,23 +18,26 @@ from splatpipe.pipeline.surface.facets import Facets
 from splatpipe.pipeline.survey.boundary import DIRECTIONS
 
 SEED_M, SEED_SECTORS = 1.0, 24  # of plan and of directions: facets in it that walls are looked for from
-SEED_M2 = 4.0  # of facets, of all photos together, that a search starts from at least
+SEED_M2 = 2.0  # of facets, of all photos together, that a search starts from at least
+SEED_HEIGHT_M = 1.2  # of what lies in one plane with a seed, at least; half a wall's
 SAME_WAY = math.cos(math.radians(30.0))  # of a facet's direction and its wall's: three deviations of a facet's noise
 REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # to which a wall grows, its plane taken anew each time
 BAND_M = 0.12  # about a plane: plinths and shutters are in it, and the panes of windows are not
-BAND_GSD = 4.0  # the same of coarse photos
-CLAIM_BANDS = 4.0  # about a wall, in which nothing else is looked for
+BAND_PIXELS = 4.0  # the same of coarse depths
+CLAIM_BANDS = 4.0  # about a wall, in which nothing else is looked for...
+CLAIM_COSINE = 0.5  # ...that faces nearly as it does: noise turns some of its own facets by more than ``SAME_WAY``
 BIN_M = 0.5  # along a wall
 GAP_M = 3.0  # between pieces of one wall: a tree before it, a gate
 CELL_M = 0.25  # of a wall's face, in which three facets tell that it is there
 CELL_FACETS = 3
 CLOSED_CELLS = 5  # over which openings are bridged
-LEAST_HEIGHT_M, LEAST_LENGTH_M, LEAST_M2 = 2.4, 2.0, 6.0  # of a wall; fences, cars and garden walls are lower
+LEAST_HEIGHT_M, LEAST_LENGTH_M, LEAST_M2 = 2.1, 2.0, 6.0  # of a wall that meets others: garden walls are lower
 FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
 LEAST_FLAT = 0.6  # of the facets before and behind a wall, those within its band: in hedges and trees they scatter
 CORNER_M = 0.4  # from where a wall's facets end to the plane of the next one, at most: two facets
 CORNER_COSINE = math.cos(math.radians(30.0))  # planes that meet at less than this angle make no corner
 TOP_M = 0.3  # above the last facets, which end a facet or two below the eaves
+END_SHARE = 0.4  # of a wall's usual height that is seen at its ends: what goes on beyond them is a bush or a fence
 ROUNDS = 5  # of a plane's robust fit
 
 Plan = Float64[np.ndarray, " 2"]
@@ -120,14 +123,11 @@ class _Piece:
         return float(self.line.along @ place)
 
 
-def find_walls(facets: Facets, gsd_m: float) -> list[Wall]:
-    """The walls that facets show, by size within each direction.
-
-    Args:
-        facets: Of all photos.
-        gsd_m: Of the photos at the walls, metres: coarse ones scatter more.
-    """
-    band_m = max(BAND_M, BAND_GSD * gsd_m)
+def find_walls(facets: Facets) -> list[Wall]:
+    """The walls that the facets of all photos show, by size within each direction."""
+    if not len(facets):
+        return []
+    band_m = _band(facets)
     cells = np.floor(facets.places[:, :2] / SEED_M).astype(np.int64)
     turn = np.arctan2(facets.facing[:, 1], facets.facing[:, 0]) / (2.0 * math.pi) * SEED_SECTORS
     sectors = np.floor(turn).astype(np.int64) % SEED_SECTORS
@@ -135,7 +135,7 @@ def find_walls(facets: Facets, gsd_m: float) -> list[Wall]:
     seeds = seeds.reshape(-1)
     free = np.ones(len(facets), np.bool_)
     pieces = []
-    while len(facets):
+    while True:
         weights = np.bincount(seeds[free], facets.areas[free], seeds.max() + 1)
         strongest = int(np.argmax(weights))
         if weights[strongest] < SEED_M2:
@@ -147,11 +147,16 @@ def find_walls(facets: Facets, gsd_m: float) -> list[Wall]:
             piece = _piece(facets, line, ends, band_m)
             if piece is not None:
                 pieces.append(piece)
-                free &= ~_around(facets, line, ends, CLAIM_BANDS * band_m)
+                free &= ~_around(facets, line, ends, CLAIM_BANDS * band_m, CLAIM_COSINE)
             else:
                 free &= ~_around(facets, line, ends, band_m)
         free &= ~start
     return named([_wall(piece) for piece in _cornered(pieces)])
+
+
+def _band(facets: Facets) -> float:
+    """How far before and behind a plane its facets lie: further where pixels are coarse."""
+    return max(BAND_M, BAND_PIXELS * float(np.median(facets.pixels_m)))
 
 
 def named(walls: Sequence[Wall]) -> list[Wall]:
@@ -203,6 +208,8 @@ def _grown(
         if run is None:
             return None
         ends = run
+        if np.ptp(facets.places[rows, 2]) < SEED_HEIGHT_M:
+            return None  # soon, for most seeds are those of low things
         along = facets.places[rows, :2] @ line.along
         found = _fitted(facets.select(rows[(along >= ends[0]) & (along <= ends[1])]), line, band_m)
         if found is None:
@@ -212,13 +219,15 @@ def _grown(
     return line, ends
 
 
-def _near(facets: Facets, line: _Line, band_m: float) -> Bool[np.ndarray, " n"]:
-    return np.asarray((np.abs(line.off(facets)) < band_m) & (facets.facing @ line.facing > SAME_WAY))
+def _near(facets: Facets, line: _Line, band_m: float, cosine: float = SAME_WAY) -> Bool[np.ndarray, " n"]:
+    return np.asarray((np.abs(line.off(facets)) < band_m) & (facets.facing @ line.facing > cosine))
 
 
-def _around(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> Bool[np.ndarray, " n"]:
+def _around(
+    facets: Facets, line: _Line, ends: tuple[float, float], band_m: float, cosine: float = SAME_WAY
+) -> Bool[np.ndarray, " n"]:
     along = facets.places[:, :2] @ line.along
-    return np.asarray(_near(facets, line, band_m) & (along >= ends[0]) & (along <= ends[1]))
+    return np.asarray(_near(facets, line, band_m, cosine) & (along >= ends[0]) & (along <= ends[1]))
 
 
 def _run(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float] | None:
@@ -282,9 +291,11 @@ def _face(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float)
     if sizes[best] == 0:
         return None
     kept = (inner == best) & (count[row, column] >= CELL_FACETS)
-    half = np.sqrt(some.areas[kept]) / 2.0
-    reached = (float((along[kept] - half).min()), float((along[kept] + half).max()))
-    heights = (float((up[kept] - half).min()), float((up[kept] + half).max()))
+    half = np.sqrt(some.areas) / 2.0
+    tall = ((count >= CELL_FACETS) & (parts == best)).sum(axis=0)
+    high = kept & (tall[column] >= END_SHARE * np.median(tall[tall > 0]))
+    reached = (float((along - half)[high].min()), float((along + half)[high].max()))
+    heights = (float((up - half)[kept].min()), float((up + half)[kept].max()))
     return _Face(reached, heights, float(sizes[best]) * CELL_M**2)
 
 

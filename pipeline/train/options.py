@@ -102,6 +102,6 @@ class TrainConfig(StageConfig):
 
 
 class SplatDepthsConfig(StageConfig):
-    enabled: bool = True
+    enabled: bool = False
     """Flatten a copy of the splat and render depths of all photos from it, for surface products: where photos have no
     texture it knows more than they do."""

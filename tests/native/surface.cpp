@@ -76,8 +76,9 @@ void check_mosaic(int photos, int width, int height) {
         for (std::size_t channel = 0; channel < 3; ++channel)
             colour[3 * k + channel] = static_cast<std::uint8_t>(random.below(256));
     }
+    splat::keep_best(photos, width * height, 3, cost.data(), seen.data(), seen_by.data());
     splat::compose_mosaic({photos, width, height, 1, seen.data(), colour.data(), cost.data()},
-                          {label.data(), blended.data(), seen_by.data()});
+                          {label.data(), blended.data()});
     for (std::size_t cell = 0; cell < cells; ++cell) {
         check(label[cell] >= -1 && label[cell] < photos, "a photo, or none");
         check((label[cell] < 0) == (seen_by[cell] == 0), "none where none sees");

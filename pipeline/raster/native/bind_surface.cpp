@@ -118,6 +118,20 @@ std::int64_t rate(const Camera& given, const PlaceArrays& points, double cell, c
     return SPLAT_KERNELS(sight_kernels).rate(camera, places, cell, said.data(), cost.data(), seen.data());
 }
 
+void confirm(const Plane<const float>& inverse, const Camera& given, const PlaceArrays& points,
+             const std::array<double, 4>& agreeing, const Plane<double>& sums, const Row<std::uint8_t>& votes) {
+    const splat::SurfaceCamera camera = camera_of(given);
+    const splat::Places places = places_of(points);
+    const std::size_t size = std::get<2>(points).size();
+    require(is_size(camera, inverse.shape(0), inverse.shape(1)), "depths that are not of the camera's size");
+    require(sums.shape(0) == size && sums.shape(1) == 3 && votes.size() == size, "results of another size");
+    require(all_finite(agreeing.data(), 4) && agreeing[3] > 0.0, "photos without a parallax");
+    const nb::gil_scoped_release released;
+    SPLAT_KERNELS(sight_kernels)
+        .confirm(camera, inverse.data(), places, {agreeing[0], agreeing[1], agreeing[2], agreeing[3]}, sums.data(),
+                 votes.data());
+}
+
 splat::Photo photo_of(const Picture& given) {
     const auto& [pixels, tone, camera, lens] = given;
     splat::Photo photo{};
@@ -147,17 +161,32 @@ void sample_photo(const Picture& given, const PlaceArrays& points, double cell, 
     splat::sample_photo(photo, places, cell, seen.data(), colour.data());
 }
 
-void compose_mosaic(const Stack<const std::uint8_t>& seen, const Stack<std::uint16_t>& cost, const ColourStack& colour,
-                    int parity, const Plane<std::int16_t>& label, const Cells<std::uint8_t>& blended,
-                    const Plane<std::uint8_t>& seen_by) {
-    const std::size_t photos = seen.shape(0), height = seen.shape(1), width = seen.shape(2);
-    require(photos <= INT16_MAX && height >= 1 && width >= 1 && height <= kMostCells / width,
+std::int64_t cells_of(const Stack<std::uint16_t>& cost) {
+    const std::size_t height = cost.shape(1), width = cost.shape(2);
+    require(cost.shape(0) <= INT16_MAX && height >= 1 && width >= 1 && height <= kMostCells / width,
             "too many photos or cells, or no cells");
+    return static_cast<std::int64_t>(height * width);
+}
+
+void keep_best(const Stack<std::uint8_t>& seen, const Stack<std::uint16_t>& cost, int most,
+               const Plane<std::uint8_t>& seen_by) {
+    const std::int64_t cells = cells_of(cost);
+    for (std::size_t side = 0; side < 3; ++side)
+        require(cost.shape(side) == seen.shape(side), "photos of different sizes");
+    require(seen_by.shape(0) == cost.shape(1) && seen_by.shape(1) == cost.shape(2), "a result of another size");
+    require(most >= 1 && most <= splat::kMostKept, "too many photos of a cell, or none");
+    const nb::gil_scoped_release released;
+    splat::keep_best(static_cast<int>(cost.shape(0)), cells, most, cost.data(), seen.data(), seen_by.data());
+}
+
+void compose_mosaic(const Stack<const std::uint8_t>& seen, const Stack<std::uint16_t>& cost, const ColourStack& colour,
+                    int parity, const Plane<std::int16_t>& label, const Cells<std::uint8_t>& blended) {
+    const std::size_t photos = cost.shape(0), height = cost.shape(1), width = cost.shape(2);
+    cells_of(cost);
     for (std::size_t side = 0; side < 3; ++side)
         require(cost.shape(side) == seen.shape(side) && colour.shape(side) == seen.shape(side),
                 "photos of different sizes");
-    require(label.shape(0) == height && label.shape(1) == width && seen_by.shape(0) == height &&
-                seen_by.shape(1) == width && blended.size() == 3 * height * width,
+    require(label.shape(0) == height && label.shape(1) == width && blended.size() == 3 * height * width,
             "results of another size");
     require(parity == 0 || parity == 1, "a parity that is none");
     const splat::MosaicJob job{static_cast<int>(photos),
@@ -168,7 +197,7 @@ void compose_mosaic(const Stack<const std::uint8_t>& seen, const Stack<std::uint
                                colour.data(),
                                cost.data()};
     const nb::gil_scoped_release released;
-    splat::compose_mosaic(job, {label.data(), blended.data(), seen_by.data()});
+    splat::compose_mosaic(job, {label.data(), blended.data()});
 }
 
 void add_votes(splat::CellVotes& votes, const Plane<const float>& depth, const Plane<const std::uint8_t>& confidence,
@@ -218,9 +247,12 @@ void bind_surface(nb::module_& m) {
           "said"_a.noconvert());
     m.def("rate", &rate, "camera"_a, "places"_a, "cell"_a, "said"_a.noconvert(), "cost"_a.noconvert(),
           "seen"_a.noconvert());
+    m.def("confirm", &confirm, "inverse"_a.noconvert(), "camera"_a, "places"_a, "agreeing"_a, "sums"_a.noconvert(),
+          "votes"_a.noconvert());
     m.def("sample_photo", &sample_photo, "photo"_a, "places"_a, "cell"_a, "seen"_a.noconvert(), "colour"_a.noconvert());
     m.def("compose_mosaic", &compose_mosaic, "seen"_a.noconvert(), "cost"_a.noconvert(), "colour"_a.noconvert(),
-          "parity"_a, "label"_a.noconvert(), "blended"_a.noconvert(), "seen_by"_a.noconvert());
+          "parity"_a, "label"_a.noconvert(), "blended"_a.noconvert());
+    m.def("keep_best", &keep_best, "seen"_a.noconvert(), "cost"_a.noconvert(), "most"_a, "seen_by"_a.noconvert());
     nb::class_<splat::CellVotes>(m, "CellVotes")
         .def(
             "__init__",

@@ -104,7 +104,6 @@ void Mosaic::choose() {
     std::vector<std::uint16_t> least(static_cast<std::size_t>(cells_), kNever);
     std::vector<std::int32_t> totals(static_cast<std::size_t>(job_.width));
     std::fill(out_.label, out_.label + cells_, std::int16_t{-1});
-    std::fill(out_.seen_by, out_.seen_by + cells_, std::uint8_t{0});
     for (int photo = 0; photo < job_.photos; ++photo) {
         SlidingBox box(job_.width, job_.height, kSmooth);
         for (int row = 0; row < job_.height; ++row) {
@@ -112,10 +111,6 @@ void Mosaic::choose() {
             box.row(row, job_.cost + at(photo, 0), totals.data());
             kernels.choose(totals.data(), job_.seen + here, photo, job_.width, average_.data() + here,
                            least.data() + first, out_.label + first);
-            for (int k = 0; k < job_.width; ++k) {
-                std::uint8_t& count = out_.seen_by[first + k];
-                count = static_cast<std::uint8_t>(count + (job_.seen[here + k] && count < UINT8_MAX));
-            }
         }
     }
 }
@@ -172,6 +167,17 @@ void Mosaic::blend(int row, int column) {
 }
 
 }  // namespace
+
+void keep_best(int photos, std::int64_t cells, int most, const std::uint16_t* cost, std::uint8_t* seen,
+               std::uint8_t* seen_by) {
+    const MosaicKernels& kernels = SPLAT_KERNELS(mosaic_kernels);
+    std::vector<std::uint16_t> least(static_cast<std::size_t>(most * cells), kNever);
+    std::fill(seen_by, seen_by + cells, std::uint8_t{0});
+    for (int photo = 0; photo < photos; ++photo)
+        kernels.rank(seen + photo * cells, cost + photo * cells, most, cells, least.data(), seen_by);
+    for (int photo = 0; photo < photos; ++photo)
+        kernels.drop(cost + photo * cells, least.data() + (most - 1) * cells, cells, seen + photo * cells);
+}
 
 void compose_mosaic(const MosaicJob& job, const MosaicResult& out) { Mosaic(job, out).make(); }
 

@@ -15,6 +15,7 @@ constexpr int kSweeps = 6;   // in which seams move to better places
 constexpr int kFeather = 2;  // cells on either side of a seam over which photos blend
 constexpr int kMosaicMargin = kSmooth + kSoft + 2 * kSweeps + kFeather + 1;  // cells that a cell's colour depends on
 constexpr std::uint16_t kNever = UINT16_MAX;  // averaged cost of a photo that does not see a cell: more than any other
+constexpr int kMostKept = 16;                 // photos of a cell that `keep_best` can be asked for
 constexpr int kCounted = 1 << 13;             // so that one sum holds greys and their number: of 25 greys at most
 
 struct MosaicJob {
@@ -26,9 +27,8 @@ struct MosaicJob {
 };
 
 struct MosaicResult {
-    std::int16_t* label;    // (height, width); -1: no photo sees it
-    std::uint8_t* colour;   // (height, width, 3); black there
-    std::uint8_t* seen_by;  // (height, width): how many photos see it, at most 255
+    std::int16_t* label;   // (height, width); -1: no photo sees it
+    std::uint8_t* colour;  // (height, width, 3); black there
 };
 
 // A row of all photos: softened greys, and room for numbers.
@@ -43,6 +43,12 @@ struct LikenessRow {
 };
 
 struct MosaicKernels {
+    // Puts a photo's costs among the least ones of each cell, `most` rows of them, where it sees the cell; and counts
+    // it.
+    void (*rank)(const std::uint8_t* seen, const std::uint16_t* cost, int most, std::int64_t cells,
+                 std::uint16_t* least, std::uint8_t* seen_by);
+    // Photos no longer see cells where their costs are higher than the limits.
+    void (*drop)(const std::uint16_t* cost, const std::uint16_t* limits, std::int64_t cells, std::uint8_t* seen);
     void (*grey)(const std::uint8_t* colour, std::int64_t count, std::uint8_t* grey);
     // Greys of cells that are seen, plus kCounted; 0 of others.
     void (*tag)(const std::uint8_t* grey, const std::uint8_t* seen, std::int64_t count, std::uint16_t* tagged);
@@ -58,6 +64,11 @@ struct MosaicKernels {
     void (*choose)(const std::int32_t* totals, const std::uint8_t* seen, int photo, int count, std::uint16_t* average,
                    std::uint16_t* least, std::int16_t* label);
 };
+
+// Leaves each cell the `most` photos of least cost that see it, or more where costs are the same; tells how many saw
+// it, 255 at most.
+void keep_best(int photos, std::int64_t cells, int most, const std::uint16_t* cost, std::uint8_t* seen,
+               std::uint8_t* seen_by);
 
 // Colours of a tile's cells; those within kMosaicMargin of its rim are not final.
 void compose_mosaic(const MosaicJob& job, const MosaicResult& out);

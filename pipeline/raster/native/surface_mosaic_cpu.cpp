@@ -12,6 +12,31 @@ constexpr float kOddMost = 60.0f;   // more differ by no more
 constexpr float kEvenCost = 64.0f;  // that is added to costs: the best photo does not count a hundred times
 constexpr int kRounds = 2;          // of the mean
 
+void rank(const uint8_t* seen, const uint16_t* cost, int most, int64_t cells, uint16_t* least, uint8_t* seen_by) {
+    constexpr int kPart = 512;  // cells at a time: their numbers stay in the nearest cache
+    uint16_t rest[kPart];
+    for (int64_t first = 0; first < cells; first += kPart) {
+        const int count = cells - first < kPart ? static_cast<int>(cells - first) : kPart;
+        for (int k = 0; k < count; ++k) {
+            rest[k] = seen[first + k] ? cost[first + k] : kNever;
+            seen_by[first + k] =
+                static_cast<uint8_t>(seen_by[first + k] + (seen[first + k] & (seen_by[first + k] < 255)));
+        }
+        for (int place = 0; place < most; ++place) {
+            uint16_t* held = least + place * cells + first;
+            for (int k = 0; k < count; ++k) {
+                const uint16_t low = rest[k] < held[k] ? rest[k] : held[k];
+                rest[k] = rest[k] < held[k] ? held[k] : rest[k];
+                held[k] = low;
+            }
+        }
+    }
+}
+
+void drop(const uint16_t* cost, const uint16_t* limits, int64_t cells, uint8_t* seen) {
+    for (int64_t k = 0; k < cells; ++k) seen[k] = static_cast<uint8_t>(seen[k] & (cost[k] <= limits[k]));
+}
+
 void grey(const uint8_t* colour, int64_t count, uint8_t* out) {
     for (int64_t k = 0; k < count; ++k) {  // BT.601, in parts of 16,384
         const uint8_t* pixel = colour + 3 * k;
@@ -104,7 +129,7 @@ void choose(const int32_t* totals, const uint8_t* seen, int photo, int count, ui
 
 }  // namespace
 
-extern const MosaicKernels mosaic_kernels = {grey, tag, soften, slide, across, compare, choose};
+extern const MosaicKernels mosaic_kernels = {rank, drop, grey, tag, soften, slide, across, compare, choose};
 
 }  // namespace SPLAT_ISA_NAMESPACE
 }  // namespace splat

@@ -22,6 +22,14 @@ constexpr std::uint8_t kUnknown = 8;  // it looks there, but has no depth: it ma
 
 constexpr std::uint16_t kHidden = 4000;  // cost of a photo that does not see a place; and no cost is higher
 
+// How near two photos' depths of one place have to be.
+struct Agreeing {
+    double share;     // of the depth;
+    double pixels;    // far away as much of it as moves the place so far in the other photo,
+    double loosest;   // of the depth at most
+    double parallax;  // of something one unit deep between the two photos, pixels
+};
+
 struct SightKernels {
     // What the depths say; differences of up to `least` metres are none. `sines` are of the rays' angles against the
     // surface; null: against the ground.
@@ -31,6 +39,10 @@ struct SightKernels {
     // many it sees.
     std::int64_t (*rate)(const SurfaceCamera& camera, const Places& places, double cell, const std::uint8_t* said,
                          std::uint16_t* cost, std::uint8_t* seen);
+    // Where inverse depths (0: none) put places along the camera's rays: added to `sums` (count, 3) where they agree,
+    // and a vote each.
+    void (*confirm)(const SurfaceCamera& camera, const float* inverse, const Places& places, const Agreeing& agreeing,
+                    double* sums, std::uint8_t* votes);
 };
 
 }  // namespace splat

@@ -91,9 +91,29 @@ int64_t rate(const SurfaceCamera& camera, const Places& places, double cell, con
     return count;
 }
 
+void confirm(const SurfaceCamera& camera, const float* inverse, const Places& places, const Agreeing& agreeing,
+             double* sums, uint8_t* votes) {
+    InPhoto at;
+    for (int64_t first = 0; first < places.count; first += kPlaces) {
+        project(camera, places, first, &at);
+        for (int k = 0; k < at.count; ++k) {
+            if (!at.is_in[k]) continue;
+            const int64_t pixel = static_cast<int64_t>(at.row[k]) * camera.width + static_cast<int64_t>(at.column[k]);
+            const double ratio = at.depth[k] * static_cast<double>(inverse[pixel]);  // over the depth found there
+            const double far = agreeing.pixels * at.depth[k] / agreeing.parallax;
+            const double most = smaller(greater(far, agreeing.share), agreeing.loosest), off = ratio - 1.0;
+            if (!(off < most && -off < most)) continue;
+            const double place[3] = {places.east[first + k], places.north[first + k], places.up[first + k]};
+            for (int axis = 0; axis < 3; ++axis)
+                sums[3 * (first + k) + axis] += camera.centre[axis] + (place[axis] - camera.centre[axis]) / ratio;
+            ++votes[first + k];
+        }
+    }
+}
+
 }  // namespace
 
-extern const SightKernels sight_kernels = {look, rate};
+extern const SightKernels sight_kernels = {look, rate, confirm};
 
 }  // namespace SPLAT_ISA_NAMESPACE
 }  // namespace splat

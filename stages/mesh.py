@@ -1,0 +1,32 @@
+"""mesh: triangles on the surface that the photos' depths agree on, coloured from the photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.surface.options import MeshConfig
+from splatpipe.pipeline.surface.run_sources import open_run_surface
+from splatpipe.pipeline.surface.site import load_site
+from splatpipe.pipeline.surface.surface_mesh import MeshTask, make_mesh
+
+VOXEL_GSD = 2.0  # of the photos
+
+
+def run(config: MeshConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `files/mesh/`: mesh.glb, mesh.ply and georef.json; nothing where there is no site.
+
+    Raises:
+        SplatpipeError: if there is no surface that enough photos see, or depths are broken.
+        MachineError: if open3d is not there, or the disk is full.
+    """
+    (out / "files").mkdir(exist_ok=True)
+    surveyed = load_site(inputs["dsm.site"]) if config.enabled else None
+    surface = None if surveyed is None else open_run_surface(inputs, report)
+    if surveyed is None or surface is None:
+        return {"triangles": 0}
+    folder, site = out / "files" / "mesh", surveyed[0]
+    folder.mkdir(exist_ok=True)
+    voxel_m, most = VOXEL_GSD * site.gsd_m, config.triangles
+    task = MeshTask(surface.frame, site, surface.photos, surface.area, voxel_m, most, inputs.machine.threads)
+    return make_mesh(task, out / "work", folder, {}, report)
