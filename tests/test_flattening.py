@@ -194,7 +194,7 @@ def test_stage_leaves_a_map_for_every_photo_and_goes_on_where_it_was_killed(
     once, twice = tmp_path / "once", tmp_path / "twice"
     once.mkdir()
     twice.mkdir()
-    summary = splat_depths.run(SplatDepthsConfig(), inputs_of(parts, tmp_path), once, tiny_scene.Recorder())
+    summary = splat_depths.run(SplatDepthsConfig(enabled=True), inputs_of(parts, tmp_path), once, tiny_scene.Recorder())
     views = load_views(parts["undistort.dataset"])
     assert summary["maps"] == len(views) and 0.2 < summary["found"] <= 1.0
     assert [path.name for path in once.iterdir()] == ["maps"]
@@ -208,9 +208,9 @@ def test_stage_leaves_a_map_for_every_photo_and_goes_on_where_it_was_killed(
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(splat_depths, "render_mean_depth", killed)
-        splat_depths.run(SplatDepthsConfig(), inputs_of(parts, tmp_path, 2), twice, tiny_scene.Recorder())
+        splat_depths.run(SplatDepthsConfig(enabled=True), inputs_of(parts, tmp_path, 2), twice, tiny_scene.Recorder())
     assert len(list((twice / "rendered").iterdir())) == 3
-    splat_depths.run(SplatDepthsConfig(), inputs_of(parts, tmp_path, 2), twice, tiny_scene.Recorder())
+    splat_depths.run(SplatDepthsConfig(enabled=True), inputs_of(parts, tmp_path, 2), twice, tiny_scene.Recorder())
     for first, second in zip(
         kept_depth_maps(once / "maps", views), kept_depth_maps(twice / "maps", views), strict=True
     ):
@@ -228,12 +228,12 @@ def test_without_it_there_are_no_maps_and_of_blocks_the_splat_is_taken_as_it_is(
     blocks.write_text('{"shards": 2}')
     report = tiny_scene.Recorder()
     given = inputs_of(parts | {"blocks.plan": blocks}, tmp_path)
-    assert splat_depths.run(SplatDepthsConfig(), given, tmp_path, report)["maps"] == tiny_scene.CAMERAS
+    assert splat_depths.run(SplatDepthsConfig(enabled=True), given, tmp_path, report)["maps"] == tiny_scene.CAMERAS
     assert any("blocks" in note for note in report.notes)
     for text in ("[]", "{}", '{"shards": "many"}', "no JSON"):
         blocks.write_text(text)
         with pytest.raises(StageError, match=r"blocks\.json cannot be read"):
-            splat_depths.run(SplatDepthsConfig(), given, tmp_path, report)
+            splat_depths.run(SplatDepthsConfig(enabled=True), given, tmp_path, report)
 
 
 def test_broken_exposures_are_refused(tmp_path: Path) -> None:

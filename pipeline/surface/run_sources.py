@@ -19,6 +19,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.mvs.depth_maps import KeptMap, kept_depth_maps
+from splatpipe.pipeline.mvs.filling import filled
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.undistortion import Placed, place, read_flown
@@ -108,15 +109,12 @@ def _in_metres(kept: KeptMap, filling: KeptMap | None, local_from_model: Similar
 
     def load() -> DepthMap:
         found = kept.load()
-        depth, confidence = found.depth, found.confidence
         if filling is not None:
-            other, hole = filling.load(), found.depth <= 0.0
-            if other.depth.shape != depth.shape:
-                raise StageError(f"{kept.camera.name}: depths of two sizes.", "Run again with --rerun splat_depths.")
-            depth, confidence = (
-                np.where(hole, theirs, own) for theirs, own in ((other.depth, depth), (other.confidence, confidence))
-            )
-        return MetricMap(camera, depth * np.float32(local_from_model.scale), confidence)
+            try:
+                found = filled(found, filling.load())
+            except ValueError as error:
+                raise StageError(f"{camera.name}: {error}.", "Run again with --rerun splat_depths.") from error
+        return MetricMap(camera, found.depth * np.float32(local_from_model.scale), found.confidence)
 
     return DepthSource(camera, load)
 
