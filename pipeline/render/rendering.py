@@ -23,6 +23,7 @@ from splatpipe.pipeline.splat.sh import rgb_to_dc
 
 Model = tuple[Gaussians, Panorama | None]
 SURFACE = 0.5  # least alpha of a pixel that shows one, as for the median depth
+MEAN_OFF_PX = 2.0  # on the ground, that a mean depth may be off the median: beyond, it is haze that tells
 STRIP_PIXELS = 1 << 21  # that are rendered at once: a picture of 100 megapixels takes no more memory than one of two
 
 
@@ -146,8 +147,8 @@ def render_mean_depth(
 ) -> Float[np.ndarray, "h w"]:
     """A camera's mean depth, of all that a ray meets by the light that each gives, as ``render_depth``.
 
-    Of a model that was flattened; in one that was trained for pictures alone, what shines through from behind draws it
-    far behind the surface.
+    No farther than ``MEAN_OFF_PX`` pixels on the ground from the median, which what shines through from far behind does
+    not draw behind the surface. Of a model that was flattened, the mean is the surer one of the two.
     """
     with torch.no_grad():
         return _by_strips(camera, lambda strip: _mean_depths(gaussians, strip, options.for_depths()))
@@ -155,9 +156,11 @@ def render_mean_depth(
 
 def _mean_depths(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w"]:
     rendered = rasterizer.render(gaussians, camera, options)
-    seen = rendered.alpha >= SURFACE
-    mean = torch.where(seen, rendered.depth_sum, 0.0) / torch.where(seen, rendered.alpha, 1.0)
-    return np.asarray(mean.cpu().numpy())
+    median = rendered.median_depth
+    seen = (rendered.alpha >= SURFACE) & (median > 0.0)
+    off = torch.where(seen, rendered.depth_sum, 0.0) / torch.where(seen, rendered.alpha, 1.0) - median
+    most = MEAN_OFF_PX / camera.fx * median
+    return np.asarray(torch.where(seen, median + torch.clamp(off, -most, most), 0.0).cpu().numpy())
 
 
 def render_normals(
