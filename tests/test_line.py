@@ -173,7 +173,7 @@ def test_changed_option_reruns_only_downstream(photos: Path, copy_of_run: Path) 
 def test_a_budget_is_planned_shown_and_reused(photos: Path, copy_of_run: Path) -> None:
     budgets = ("--time-budget", "8s", "--max-memory", "4G")
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK), *budgets)
-    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough", "splat_depths"]
+    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough", "depths", "splat_depths", *SURFACES]
     events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text().splitlines()]
     notes = [event["data"]["message"] for event in events if event["kind"] == "note"]
     assert any(note.startswith("plan: ") and "8 s budget, within 4.0 GB" in note for note in notes), notes
