@@ -6,6 +6,7 @@ axes. A photo that looks through a voxel counts, too: so what one photo imagines
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -32,7 +33,7 @@ def open3d() -> Any:
         MachineError: if it is not installed, or a system's library that it needs is not.
     """
     try:
-        import open3d as module
+        return importlib.import_module("open3d")
     except ModuleNotFoundError as error:
         raise MachineError(
             "The mesh is made by open3d, which is not installed.", hint="Install it: pip install 'splatpipe[mesh]'."
@@ -42,7 +43,6 @@ def open3d() -> Any:
             f"The mesh is made by open3d, which cannot be loaded: {error}.",
             hint="On Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1.",
         ) from error
-    return module
 
 
 def tsdf_mesh(photos: PhotoSet, box: Box, blocks: Blocks, threads: int, report: Reporter) -> TriangleMesh:
