@@ -9,6 +9,8 @@ from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.wording import count, length
 
 PICTURE_SIDE = 960  # pixels
+FACADE_SIDE = 480
+MOST_FACADES = 12  # with a picture; all are in the list
 QUALITY = 85
 
 Chapter = dict[str, Any]
@@ -35,7 +37,45 @@ def surfaces_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
     if ortho.get("pixels"):
         facts.insert(0, ("pixel of the orthophoto", length(ortho["pixel_m"])))
         facts.append(("exposures levelled over", f"{ortho['exposures_stops']:.1f} stops"))
-    return {"facts": facts, "pictures": _pictures(holdings) if drawn else []}
+    cloud, mesh = holdings.summary("cloud"), holdings.summary("mesh")
+    if cloud.get("points"):
+        facts.append(("points of the cloud", f"{count(cloud['points'])}, {length(cloud['spacing_m'])} apart"))
+    if mesh.get("triangles"):
+        facts.append(("triangles of the mesh", f"{count(mesh['triangles'])}, of voxels of {length(mesh['voxel_m'])}"))
+    facades = _facades(holdings, drawn=drawn)
+    return {"facts": facts, "pictures": _pictures(holdings) if drawn else [], "facades": facades}
+
+
+def _facades(holdings: Holdings, *, drawn: bool) -> list[dict[str, Any]]:
+    """Elevations, the largest first, with small pictures of the first ones."""
+    if not holdings.summary("facades").get("facades"):
+        return []
+    told = holdings.read_in_part("facades.files", "facades/facades.json")["facades"]
+    told = sorted(told, key=lambda each: -float(each["area_m2"]))
+    rows = []
+    for number, each in enumerate(told):
+        row = {"name": str(each["name"]), "area": f"{float(each['area_m2']):.1f} m²"}
+        row["known"] = f"{100.0 * float(each['share_with_depth']):.0f} %"
+        path = _file(holdings, "facades.files", f"facades/{each['picture']}")
+        rows.append(row | (_small_picture(path) if drawn and path is not None and number < MOST_FACADES else {}))
+    return rows
+
+
+def _small_picture(path: Path) -> dict[str, Any]:
+    import cv2
+    import numpy as np
+
+    from splatpipe.pipeline.app.report.pictures import jpeg
+
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        return {}
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], 255).astype(np.uint8)
+    scale = min(1.0, FACADE_SIDE / max(pixels.shape[:2]))
+    size = max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale))
+    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return {"source": jpeg(small, QUALITY), "width": size[0], "height": size[1]}
 
 
 def _pictures(holdings: Holdings) -> list[dict[str, Any]]:
