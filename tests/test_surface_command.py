@@ -1,0 +1,106 @@
+"""`splatpipe surface`: products by name, sections and volumes of a finished run."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rasterio
+
+from splatpipe.pipeline.app.surfaces import Wanted
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.quantities import parse_length
+from splatpipe.pipeline.surface.facades import parse_lines
+from splatpipe.stages.products import options_for
+
+
+def surface(out: Path, *arguments: str) -> tuple[int, dict[str, Any]]:
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "surface", str(out), *arguments, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.returncode, json.loads(done.stdout)
+
+
+def polygon(west: float, south: float, east: float, north: float) -> dict[str, Any]:
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    crs = {"type": "name", "properties": {"name": "EPSG:32633"}}
+    return {"type": "Polygon", "crs": crs, "coordinates": [ring]}
+
+
+def test_a_finished_run_is_cut_and_measured(demo_run: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(demo_run, tmp_path / "out")
+    with rasterio.open(out / "dsm.tif") as raster:
+        west, south, east, north = raster.bounds
+    x, y = (west + east) / 2, (south + north) / 2
+    (tmp_path / "heap.geojson").write_text(json.dumps(polygon(x - 12.0, y - 12.0, x + 12.0, y + 12.0)))
+    line = f"{x - 15.0},{y},{x + 15.0},{y}"
+    code, told = surface(out, "--section", line, "--volume", str(tmp_path / "heap.geojson"))
+    assert code == 0
+    assert all(stage["state"] == "reused" for stage in told["stages"])
+    (section,) = told["surface"]["sections"]
+    assert section["length_m"] == pytest.approx(30.0, abs=0.05)
+    for kind in ("csv", "dxf", "picture"):
+        assert (out / "sections" / section[kind]).stat().st_size > 500
+    (volume,) = json.loads((out / "volumes.json").read_text())["volumes"]
+    assert volume["area_m2"] == pytest.approx(576.0, rel=0.01)
+    assert 300.0 < volume["cut_m3"] < 2000.0  # the house of 13 by 9 metres, 8 high, on a lawn
+    assert volume["cut_sigma_m3"] < 0.1 * volume["cut_m3"]
+
+
+def test_a_line_beside_the_site_is_told_as_that(demo_run: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(demo_run, tmp_path / "out")
+    code, told = surface(out, "--section", "0,0,10,10")
+    assert code == 1
+    assert "crosses nothing" in told["error"]["message"]
+
+
+def test_the_report_shows_heights_and_the_orthophoto(demo_run: Path) -> None:
+    page = (demo_run / "report.html").read_text(encoding="utf-8")
+    for text in ('id="surfaces"', 'alt="orthophoto"', 'alt="surface model"', "expected deviation of a height"):
+        assert text in page
+
+
+def test_products_ask_for_what_they_are_made_from_and_keep_the_rest() -> None:
+    assert options_for(None, None, None).keys() == {"depths", "dsm", "ortho"}
+    table = options_for("cloud, facades", 0.02, "both")
+    assert table["cloud"] == {"enabled": True, "spacing_m": 0.02}
+    assert table["facades"] == {"enabled": True, "gsd_m": 0.02}
+    assert table["dsm"] == {"enabled": True}
+    assert table["splat_depths"] == {"enabled": True}
+    assert "ortho" not in table
+    assert options_for("dsm", 0.02, "splat")["depths"] == {"enabled": False}
+
+
+@pytest.mark.parametrize("products", ["", "orthos", "ortho;dsm", "dsm,../x"])
+def test_other_products_are_refused(products: str) -> None:
+    with pytest.raises(UsageError):
+        options_for(products, None, None)
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3", "1,2,3,4,5", "1,2,3,nan", "1,2,3,inf", "a,b,c,d", "1 2 3 4", "1," * 999])
+def test_other_sections_are_refused(text: str) -> None:
+    with pytest.raises(UsageError):
+        Wanted.of([text], None, "rim")
+    if text:
+        with pytest.raises(UsageError):
+            parse_lines(text)
+
+
+@pytest.mark.parametrize("base", ["", "top", "1e999", "nan"])
+def test_other_bases_are_refused(base: str) -> None:
+    with pytest.raises(UsageError):
+        Wanted.of([], None, base)
+    assert Wanted.of([], None, "512.5").base == 512.5
+
+
+@pytest.mark.parametrize(("text", "metres"), [("2cm", 0.02), ("25mm", 0.025), ("0.1m", 0.1), (" 5 cm ", 0.05)])
+def test_lengths_have_units(text: str, metres: float) -> None:
+    assert parse_length(text, "--gsd") == metres
+
+
+@pytest.mark.parametrize("text", ["", "2", "-2cm", "0cm", "2 inches", "1e3m", "9" * 30 + "m"])
+def test_other_lengths_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--gsd"):
+        parse_length(text, "--gsd")
