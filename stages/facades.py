@@ -8,8 +8,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.surface.facades import FacadesTask, make_facades, parse_lines
 from splatpipe.pipeline.surface.map_crs import open_map
 from splatpipe.pipeline.surface.options import FacadesConfig
-from splatpipe.pipeline.surface.run_sources import open_run_surface
-from splatpipe.pipeline.surface.site import load_site
+from splatpipe.pipeline.surface.run_sources import open_surveyed
 
 
 def run(config: FacadesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -20,13 +19,13 @@ def run(config: FacadesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
-    surveyed = load_site(inputs["dsm.site"]) if config.enabled else None
-    surface = None if surveyed is None else open_run_surface(inputs, report)
-    if surveyed is None or surface is None:
+    opened = open_surveyed(inputs, report) if config.enabled else None
+    if opened is None:
         return {"facades": 0}
+    surface, site, _ = opened
     folder = out / "files" / "facades"
     folder.mkdir(exist_ok=True)
-    crs, pixel_m = open_map(surface.frame), config.gsd_m or surveyed[0].gsd_m
+    crs, pixel_m = open_map(surface.frame), config.gsd_m or site.gsd_m
     lines = parse_lines(config.lines)
     task = FacadesTask(surface.photos, surface.area, crs, pixel_m, lines, inputs.machine.threads)
     facts = make_facades(task, folder, report)

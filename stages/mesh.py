@@ -6,8 +6,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.surface.options import MeshConfig
-from splatpipe.pipeline.surface.run_sources import open_run_surface
-from splatpipe.pipeline.surface.site import load_site
+from splatpipe.pipeline.surface.run_sources import open_surveyed
 from splatpipe.pipeline.surface.surface_mesh import MeshTask, make_mesh
 
 VOXEL_GSD = 2.0  # of the photos
@@ -21,11 +20,11 @@ def run(config: MeshConfig, inputs: Inputs, out: Path, report: Reporter) -> Summ
         MachineError: if open3d is not there, or the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
-    surveyed = load_site(inputs["dsm.site"]) if config.enabled else None
-    surface = None if surveyed is None else open_run_surface(inputs, report)
-    if surveyed is None or surface is None:
+    opened = open_surveyed(inputs, report) if config.enabled else None
+    if opened is None:
         return {"triangles": 0}
-    folder, site = out / "files" / "mesh", surveyed[0]
+    surface, site, _ = opened
+    folder = out / "files" / "mesh"
     folder.mkdir(exist_ok=True)
     voxel_m, most = VOXEL_GSD * site.gsd_m, config.triangles
     task = MeshTask(surface.frame, site, surface.photos, surface.area, voxel_m, most, inputs.machine.threads)

@@ -7,8 +7,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.surface.options import OrthoConfig
 from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
-from splatpipe.pipeline.surface.run_sources import open_run_surface
-from splatpipe.pipeline.surface.site import load_site
+from splatpipe.pipeline.surface.run_sources import open_surveyed
 
 
 def run(config: OrthoConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -19,11 +18,10 @@ def run(config: OrthoConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
-    surveyed = load_site(inputs["dsm.site"]) if config.enabled else None
-    surface = None if surveyed is None else open_run_surface(inputs, report)
-    if surveyed is None or surface is None:
+    opened = open_surveyed(inputs, report) if config.enabled else None
+    if opened is None:
         return {"pixels": 0}
-    site, dsm_cell_m = surveyed
+    surface, site, dsm_cell_m = opened
     dsm, gsd_m = inputs["dsm.files"] / "dsm.tif", config.gsd_m or site.gsd_m
     task = OrthoTask(surface.frame, site, surface.photos, dsm, dsm_cell_m, surface.area, gsd_m, inputs.machine.threads)
     return make_ortho(task, out / "sheets", out / "files", report)

@@ -24,6 +24,7 @@ from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.undistortion import Placed, place, read_flown
 from splatpipe.pipeline.surface.photo_samples import Lens, PhotoSource
+from splatpipe.pipeline.surface.site import Site, load_site
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 
@@ -89,6 +90,21 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
     finer = statistics.median(focal.get(name, each.camera.fx) / each.camera.fx for name, each in depths.items())
     area = read_world_area(inputs.parts.get("georef.boundary"))
     return RunSurface(frame, area, tuple(depths.values()), tuple(photos), finer)
+
+
+def open_surveyed(inputs: Inputs, report: Reporter) -> tuple[RunSurface, Site, float] | None:
+    """The same, with the site that `dsm` left and the side of its cells; None where there is no surface model.
+
+    Args:
+        inputs: Of a stage that reads `dsm.site` besides.
+        report: As above.
+
+    Raises:
+        SplatpipeError: as above.
+    """
+    surveyed = load_site(inputs["dsm.site"])
+    surface = None if surveyed is None else open_run_surface(inputs, report)
+    return None if surveyed is None or surface is None else (surface, *surveyed)
 
 
 def metric_depths(maps: Sequence[KeptMap], local_from_model: Similarity) -> list[DepthSource]:
