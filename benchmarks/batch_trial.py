@@ -28,6 +28,7 @@ PROFILES = Path(__file__).resolve().parents[1] / "configs" / "batch"
 SETS = (
     *("features.extractor=opencv-sift", "features.max_image_size=1000", "undistort.max_megapixels=0.03"),
     *("train.iterations=100", "split.every=4", "flythrough.seconds=0.2"),
+    *("depths.max_megapixels=0.01", "dsm.cell_m=0.3", "ortho.gsd_m=0.3"),
 )
 KILLED_ITERATIONS = 600  # long enough to be met in its training
 EXPECTED = {

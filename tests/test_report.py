@@ -30,7 +30,10 @@ from splatpipe.pipeline.app.report.placing import placing_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
 
-QUICK = ("features.extractor=opencv-sift", "features.max_image_size=700", "undistort.max_megapixels=0.03")
+QUICK = (
+    *("features.extractor=opencv-sift", "features.max_image_size=700", "undistort.max_megapixels=0.03"),
+    *("depths.max_megapixels=0.01", "dsm.cell_m=0.3", "ortho.gsd_m=0.3"),
+)
 HOSTILE = '<script>document.title = "taken"</script><img src="http://example.org/x.png">&"\''
 
 
