@@ -20,6 +20,7 @@ def run(config: CloudConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     (out / "files").mkdir(exist_ok=True)
     opened = open_surveyed(inputs, report) if config.enabled else None
     if opened is None:
+        report.progress(1, 1, "nothing is made", "steps")
         return {"points": 0}
     surface, site, _ = opened
     spacing_m = config.spacing_m or site.gsd_m

@@ -24,6 +24,7 @@ def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summa
     save_site(out / "site.json", None)
     surface = open_run_surface(inputs, report) if config.enabled else None
     if surface is None:
+        report.progress(1, 1, "nothing is made", "steps")
         if config.enabled:
             report.note("There are no depths in metres, so there is no surface model, and nothing made from one.")
         return {"cells": 0}

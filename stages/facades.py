@@ -21,6 +21,7 @@ def run(config: FacadesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     (out / "files").mkdir(exist_ok=True)
     opened = open_surveyed(inputs, report) if config.enabled else None
     if opened is None:
+        report.progress(1, 1, "nothing is made", "steps")
         return {"facades": 0}
     surface, site, _ = opened
     folder = out / "files" / "facades"

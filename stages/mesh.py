@@ -22,6 +22,7 @@ def run(config: MeshConfig, inputs: Inputs, out: Path, report: Reporter) -> Summ
     (out / "files").mkdir(exist_ok=True)
     opened = open_surveyed(inputs, report) if config.enabled else None
     if opened is None:
+        report.progress(1, 1, "nothing is made", "steps")
         return {"triangles": 0}
     surface, site, _ = opened
     folder = out / "files" / "mesh"

@@ -20,6 +20,7 @@ def run(config: OrthoConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     (out / "files").mkdir(exist_ok=True)
     opened = open_surveyed(inputs, report) if config.enabled else None
     if opened is None:
+        report.progress(1, 1, "nothing is made", "steps")
         return {"pixels": 0}
     surface, site, dsm_cell_m = opened
     dsm, gsd_m = inputs["dsm.files"] / "dsm.tif", config.gsd_m or site.gsd_m

@@ -41,6 +41,7 @@ def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) 
     maps, rendered = out / "maps", out / "rendered"
     shutil.rmtree(maps, ignore_errors=True)
     if not config.enabled:
+        report.progress(1, 1, "nothing is rendered", "steps")
         return keep_depth_maps(maps, [])
     gaussians, render = _model(inputs, out, report)
     options, _ = as_trained(inputs["train.rendering"], gaussians)
