@@ -83,8 +83,8 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     pixel_m = float(f"{task.pixel_m:.{DIGITS}g}")
     facets = upright_facets([photo.depths for photo in task.photos if photo.depths is not None], task.threads)
     walls = stated_walls(task.lines, facets, task.crs) if task.lines else _within(find_walls(facets), task.area)
-    report.progress(1, 1, "looking for walls")
     if not walls:
+        report.progress(1, 1, "looking for walls")
         report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
     places = facets.places[:: max(1, len(facets) // PLACES)]
     photos = Photos(task.photos, exposure_gains(task.photos, places, 2.0 * pixel_m, task.threads), task.threads)
