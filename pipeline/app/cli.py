@@ -212,7 +212,8 @@ def surface(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="What to make: ortho, dsm, facades, cloud, mesh. Without it ortho,dsm, or what the run has already.",
+            help="What to make: ortho, dsm, facades, cloud, mesh; what the run has stays. Without it ortho,dsm, for "
+            "a section or a volume dsm.",
         ),
     ] = None,
     gsd: Annotated[
@@ -248,6 +249,7 @@ def surface(
     with Ending(out, as_json) as done:
         done.notify_by(notify)
         wanted = Wanted.of(section or [], volume, base)
+        products = "dsm" if products is None and wanted.anything else products
         asked = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
         tables = [asked, *overrides(None, assignments, None).tables]
         with RunSession(existing(out, tables, device, threads), wait) as runner:

@@ -32,6 +32,7 @@ TOLERANCE = 0.01  # of the depth, within which two photos agree;
 TOLERANCE_PX = 0.5  # far away as much of it as moves the point so far in the other's photo,
 LOOSEST = 0.2  # of the depth at most
 
+Inverse = Float32[np.ndarray, "_ _"]
 Axes = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]
 
 
@@ -143,9 +144,17 @@ class DepthSearch:
         with np.load(path) as kept:
             return Depths(kept["inverse"], kept["cost"])
 
+    def inverse(self, number: int) -> Inverse | None:
+        """The inverse depths alone: what a neighbour is asked for."""
+        path = self._depths_path(number)
+        if not path.is_file():
+            return None
+        with np.load(path) as kept:
+            return np.asarray(kept["inverse"], np.float32)
+
     def agreement(self, number: int) -> Agreement | None:
         """What a photo's neighbours say of its depths; None where it has none."""
-        return agreement_of(number, self.cameras, self.near[number], self.depths)
+        return agreement_of(number, self.cameras, self.near[number], (self.depths(number), self.inverse))
 
     def _photo_path(self, number: int) -> Path:
         return self.folder / f"photo-{number}.npz"
@@ -187,7 +196,10 @@ def _save_whole(path: Path, **arrays: np.ndarray) -> None:
 
 
 def agreement_of(
-    number: int, cameras: Sequence[Camera], others: Sequence[int], depths_of: Callable[[int], Depths | None]
+    number: int,
+    cameras: Sequence[Camera],
+    others: Sequence[int],
+    depths: tuple[Depths | None, Callable[[int], Inverse | None]],
 ) -> Agreement | None:
     """What other photos say of a photo's depths; None where it has none.
 
@@ -195,22 +207,22 @@ def agreement_of(
         number: The photo's.
         cameras: Of all photos, in the grids of their depths.
         others: Numbers of those that are asked.
-        depths_of: What is known of a photo by its number; None where nothing is.
+        depths: The photo's own, and the inverse depths of another one by its number; None where there are none.
     """
-    depths = depths_of(number)
-    if depths is None:
+    own, inverse_of = depths
+    if own is None:
         return None
     camera = cameras[number]
-    rows, columns = np.nonzero(depths.inverse > 0.0)
-    inverse = depths.inverse[rows, columns].astype(np.float64)
+    rows, columns = np.nonzero(own.inverse > 0.0)
+    inverse = own.inverse[rows, columns].astype(np.float64)
     points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), 1.0 / inverse)
     total, votes = points.copy(), np.zeros(len(points), np.uint8)
     east, north, up = tuple(np.ascontiguousarray(axis) for axis in points.T)
     for other in others:
-        theirs = depths_of(other)
+        theirs = inverse_of(other)
         if theirs is not None:
-            confirm((east, north, up), camera, cameras[other], theirs.inverse, (total, votes))
-    return Agreement(rows, columns, inverse, total / (1.0 + votes)[:, None], votes, depths.cost[rows, columns])
+            confirm((east, north, up), camera, cameras[other], theirs, (total, votes))
+    return Agreement(rows, columns, inverse, total / (1.0 + votes)[:, None], votes, own.cost[rows, columns])
 
 
 def confirm(

@@ -26,4 +26,4 @@ class DepthsConfig(StageConfig):
     enabled: bool = True
     """Find depths of all photos, which surface products are made from."""
     max_megapixels: PositiveFloat = 1.2
-    """Photos are made this small before their depths are found: 15 CPU seconds a megapixel."""
+    """Photos are made this small before their depths are found: 10 to 14 CPU seconds a megapixel."""

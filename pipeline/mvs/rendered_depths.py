@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_map
-from splatpipe.pipeline.mvs.depth_search import agreement_of
+from splatpipe.pipeline.mvs.depth_search import Inverse, agreement_of
 from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
 from splatpipe.pipeline.mvs.patch_match import Depths
 
@@ -51,7 +51,9 @@ def rendered_depth_maps(
     near = neighbours(tracks, cameras, ASKED)
 
     def confirmed(number: int) -> DepthMap:
-        agreement = agreement_of(number, cameras, near[number], partial(_kept, folder))
+        inverse = _kept(folder, number)
+        own = Depths(inverse, np.zeros_like(inverse))
+        agreement = agreement_of(number, cameras, near[number], (own, partial(_kept, folder)))
         return confirmed_map(cameras[number], agreement)
 
     maps = ordered_map(confirmed, range(len(cameras)), threads)
@@ -71,6 +73,5 @@ def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
     aside.replace(path)
 
 
-def _kept(folder: Path, number: int) -> Depths:
-    inverse = np.load(folder / f"{number}.npy", allow_pickle=False)
-    return Depths(inverse, np.zeros_like(inverse))
+def _kept(folder: Path, number: int) -> Inverse:
+    return np.asarray(np.load(folder / f"{number}.npy", allow_pickle=False), np.float32)

@@ -76,9 +76,9 @@ def view_pictures(stem: Path, orientation: int) -> ViewPictures | None:
         pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
         if pixels is None:
             return None
-        shrunk = _turned(_shrunk(np.asarray(pixels, np.uint8)), orientation)
-        made.append(jpeg(shrunk, VIEW_QUALITY))
-        shape = (shrunk.shape[1], shrunk.shape[0])
+        small = _turned(shrunk(np.asarray(pixels, np.uint8), VIEW_SIDE), orientation)
+        made.append(jpeg(small, VIEW_QUALITY))
+        shape = (small.shape[1], small.shape[0])
     photo, render, error = made
     return ViewPictures(photo, render, error, *shape)
 
@@ -187,9 +187,10 @@ def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> 
     return square
 
 
-def _shrunk(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+def shrunk(pixels: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    """A picture whose longer side has so many pixels at most."""
     height, width = pixels.shape[:2]
-    factor = VIEW_SIDE / max(width, height)
+    factor = side / max(width, height)
     if factor >= 1.0:
         return pixels
     size = (max(1, round(width * factor)), max(1, round(height * factor)))

@@ -65,17 +65,15 @@ def _small_picture(path: Path) -> dict[str, Any]:
     import cv2
     import numpy as np
 
-    from splatpipe.pipeline.app.report.pictures import jpeg
+    from splatpipe.pipeline.app.report.pictures import jpeg, shrunk
 
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         return {}
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], 255).astype(np.uint8)
-    scale = min(1.0, FACADE_SIDE / max(pixels.shape[:2]))
-    size = max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale))
-    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return {"source": jpeg(small, QUALITY), "width": size[0], "height": size[1]}
+    small = shrunk(np.asarray(pixels, np.uint8), FACADE_SIDE)
+    return {"source": jpeg(small, QUALITY), "width": small.shape[1], "height": small.shape[0]}
 
 
 def _pictures(holdings: Holdings) -> list[dict[str, Any]]:
