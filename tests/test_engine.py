@@ -439,6 +439,16 @@ def test_a_run_walks_to_every_deliverable_and_no_further_than_asked(numbers: Pat
     assert [stage.name for stage in line.needed()] == ["read", "count", "tell", "add"]
 
 
+def test_a_stage_that_is_turned_off_reads_nothing_and_waits_for_nobody(numbers: Path, out: Path) -> None:
+    off = request_of(numbers, out, count={"enabled": False})
+    assert walk(off, until="count")[0].ran == ["count"]
+    assert [standing.state for standing in survey(*survey_line(off))] == ["missing", "waiting", "valid", "waiting"]
+    assert walk(off)[0].ran == ["read", "add", "tell"]
+    assert (out / "telling.txt").read_text() == "nothing of 0 parts 21"
+    changed = request_of(numbers, out, count={"enabled": False}, add={"offset": 1})
+    assert walk(changed)[0].ran == ["add", "tell"]  # another parity, which nobody counts
+
+
 def test_what_belongs_together_is_found_without_configuration_and_source(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     walk(request_of(numbers, out, add={"offset": 2}))

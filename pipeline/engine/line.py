@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from splatpipe.pipeline.engine.config import settings_of
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.lock import is_locked
-from splatpipe.pipeline.engine.stage import Shard, Stage, stage_name
+from splatpipe.pipeline.engine.stage import Shard, Stage, StageConfig, stage_name
 from splatpipe.pipeline.engine.store import Artifact, Part, StageInputs, Store
 
 State = Literal["valid", "stale", "missing", "waiting"]
@@ -57,12 +57,17 @@ class Line:
         wanted = {names[last]} if until else {names[last], *(stage.name for stage in self.stages if stage.deliverables)}
         for stage in reversed(self.stages[: last + 1]):
             if stage.name in wanted:
-                wanted |= {stage_name(part) for part in stage.reads if part not in self.source}
+                wanted |= {stage_name(part) for part in self.reads_of(stage) if part not in self.source}
         return [stage for stage in self.stages[: last + 1] if stage.name in wanted]
+
+    def reads_of(self, stage: Stage) -> tuple[str, ...]:
+        """The parts that a stage, or a shard of it, reads as it is configured."""
+        section: StageConfig = getattr(self.config, stage_name(stage.name))
+        return () if section.is_off else stage.reads
 
     def inputs_of(self, stage: Stage, parts: Mapping[str, Part]) -> StageInputs:
         """What a stage's key is made of."""
-        reads = {name: parts[name].digest for name in stage.reads}
+        reads = {name: parts[name].digest for name in self.reads_of(stage)}
         return StageInputs(stage.name, stage.version, *settings_of(self.config, stage), reads)
 
     def shards_of(self, stage: Stage, parts: Mapping[str, Part]) -> list[Job]:
@@ -132,7 +137,7 @@ def survey(line: Line, store: Store) -> Iterator[Standing]:
     """Say of every needed stage whether it is valid, and if not why, without running anything."""
     parts = dict(line.source)
     for stage in line.needed():
-        missing = [name for name in stage.reads if name not in parts]
+        missing = [name for name in line.reads_of(stage) if name not in parts]
         if missing:
             behind = sorted(set(map(stage_name, missing)))
             reason = f"waits for {', '.join(behind)}"

@@ -169,7 +169,7 @@ class Runner:
                 self.outcome.artifacts[standing.stage.name] = standing.artifact
                 parts.update(standing.artifact.parts)
         stage = next(stage for stage in self.line.stages if stage.name == name)
-        absent = {stage_name(part) for part in stage.reads if part not in parts}
+        absent = {stage_name(part) for part in self.line.reads_of(stage) if part not in parts}
         missing = [earlier for earlier in self.line.stages if earlier.name in absent]
         counts = stage_name(stage.shards.counted_by) if stage.shards else ""
         if missing and [earlier.name for earlier in missing] != [counts]:
@@ -275,7 +275,7 @@ class Runner:
             entry=stage.entry,
             config_type=f"{stage.config.__module__}:{stage.config.__qualname__}",
             config=dict(job.inputs.config),
-            parts={name: str(parts[name].path) for name in stage.reads},
+            parts={name: str(parts[name].path) for name in job.inputs.reads},
             photos_dir=str(self.line.photos_dir),
             settings=dict(job.inputs.borrowed),
             summaries={name: dict(done.summary) for name, done in self.outcome.artifacts.items()},
@@ -302,7 +302,7 @@ class Runner:
 
     def _check_source(self, stage: Stage) -> None:
         """An artifact's key says what it was made from, so that has to be what the stage read."""
-        read = [name for name in stage.reads if name in self.line.source]
+        read = [name for name in self.line.reads_of(stage) if name in self.line.source]
         if not read:
             return
         now = self.source_now()

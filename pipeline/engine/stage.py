@@ -17,7 +17,8 @@ Summary = Mapping[str, JSON]
 class StageConfig(BaseModel):
     """Base of every stage's configuration: what changes the answer. Unknown keys are refused.
 
-    The docstring under each field is its help text.
+    The docstring under each field is its help text. A field ``enabled`` turns a stage off: it reads nothing then, waits
+    for no other stage, and its body leaves its parts empty.
 
     Attributes:
         gone: Options that there were, by their dotted names, with a sentence on what takes their place.
@@ -28,6 +29,11 @@ class StageConfig(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False, strict=True
     )
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the stage is turned off."""
+        return not getattr(self, "enabled", True)
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,8 @@ class Stage:
         name: The stage's name; its parts are called ``<name>.<part>``.
         version: Raised whenever the body's answer changes for the same config and inputs.
         config: Its configuration model.
-        reads: Names of the parts it reads, e.g. ``ingest.photos``; ``source.photos`` is the user's folder.
+        reads: Names of the parts it reads unless it is turned off, e.g. ``ingest.photos``; ``source.photos`` is the
+            user's folder.
         parts: What it leaves: part name to the file or folder below the stage's own folder.
         entry: ``module:function`` of the body, a ``Body``.
         borrows: Settings of other stages that its answer depends on, e.g. ``train.time_budget_s``.
