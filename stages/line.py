@@ -236,7 +236,7 @@ FLYTHROUGH = Stage(
 
 DEPTHS = Stage(
     "depths",
-    version=1,
+    version=2,
     config=DepthsConfig,
     reads=("undistort.dataset",),
     parts={"maps": "maps"},
