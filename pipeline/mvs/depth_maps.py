@@ -1,7 +1,7 @@
 """A depth map for every photo, with how many others confirm each pixel: what surfaces are made from.
 
 Plain walls and lawns have depths as well: where two other photos found the same, a pixel is right as often as one with
-texture at hand, and without them a third of a garden is missing. Edges that are too wide are trimmed.
+texture at hand, and without them a third of a garden is missing. Edges are put where the photo has them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_search import AGREEING, Agreement, DepthSearch, SearchPlan
-from splatpipe.pipeline.mvs.edges import too_wide
+from splatpipe.pipeline.mvs.edges import pixels_behind
 from splatpipe.pipeline.photos.dataset import View
 
 LIST = "maps.json"
@@ -148,8 +148,10 @@ def find_depth_maps(
 
 def _confirmed_map(search: DepthSearch, number: int) -> DepthMap:
     found = confirmed_map(search.cameras[number], search.agreement(number))
-    wrong = too_wide(found.depth, search.colours(number))
-    return DepthMap(np.where(wrong, np.float32(0.0), found.depth), np.where(wrong, np.uint8(0), found.confidence))
+    rows, columns, depth = pixels_behind(found.depth, search.colours(number))
+    found.depth[rows, columns] = depth
+    found.confidence[rows, columns] = AGREEING
+    return found
 
 
 def confirmed_map(camera: Camera, agreement: Agreement | None) -> DepthMap:
