@@ -1,9 +1,9 @@
-"""Edges of near things in a depth map, trimmed by what the photo shows there."""
+"""Edges of near things in a depth map, put where the photo has them."""
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from splatpipe.pipeline.mvs.edges import too_wide
+from splatpipe.pipeline.mvs.edges import pixels_behind
 
 RED, GREEN = (170, 60, 50), (70, 120, 60)
 EDGE = 30  # column where the roof truly ends
@@ -20,23 +20,30 @@ def roof_over_lawn(
     return depth, np.clip(colour, 0, 255).astype(np.uint8)
 
 
-def test_what_is_too_wide_and_looks_like_what_is_behind_is_found_and_nothing_else() -> None:
-    wrong = too_wide(*roof_over_lawn(wider=3))
-    assert wrong[:, EDGE : EDGE + 3].mean() > 0.98
-    assert wrong[:, :EDGE].sum() + wrong[:, EDGE + 3 :].sum() <= 3
-    assert too_wide(*roof_over_lawn(wider=0)).sum() <= 3
+def test_what_looks_like_what_is_behind_lies_there() -> None:
+    depth, colour = roof_over_lawn(wider=3)
+    rows, columns, behind = pixels_behind(depth, colour)
+    strip = (columns >= EDGE) & (columns < EDGE + 3)
+    assert strip.sum() > 0.9 * 3 * len(depth)
+    assert (~strip).sum() <= 3
+    assert np.abs(behind - 16.0).max() < 1e-3
+    assert len(rows) == len({*zip(rows.tolist(), columns.tolist(), strict=True)})
+
+
+def test_an_edge_that_is_right_stays() -> None:
+    assert len(pixels_behind(*roof_over_lawn(wider=0))[0]) <= 3
 
 
 def test_where_both_sides_look_alike_nothing_is_said() -> None:
-    assert not too_wide(*roof_over_lawn(wider=3, lawn=RED)).any()
+    assert not len(pixels_behind(*roof_over_lawn(wider=3, lawn=RED))[0])
 
 
 def test_a_slope_is_no_edge() -> None:
-    assert not too_wide(*roof_over_lawn(wider=3, below=12.2)).any()
+    assert not len(pixels_behind(*roof_over_lawn(wider=3, below=12.2))[0])
 
 
 def test_places_without_depth_are_no_side() -> None:
     depth, colour = roof_over_lawn(wider=3)
     depth[:, EDGE + 3 :] = 0.0
-    assert not too_wide(depth, colour).any()
-    assert not too_wide(np.zeros_like(depth), colour).any()
+    assert not len(pixels_behind(depth, colour)[0])
+    assert not len(pixels_behind(np.zeros_like(depth), colour)[0])

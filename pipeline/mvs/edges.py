@@ -55,12 +55,12 @@ def pixels_behind(
     """
     reach = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
     at_edge = (depth > 0.0) & (cv2.dilate(depth, reach) > depth * (1.0 + BEHIND))
-    pixels = np.nonzero(at_edge)
-    front, back = _sides(np.where(at_edge, np.float32(0.0), depth), depth, colour, pixels)
-    seen = colour[pixels].astype(np.float32)
+    rows, columns = np.nonzero(at_edge)
+    front, back = _sides(np.where(at_edge, np.float32(0.0), depth), depth, colour, (rows, columns))
+    seen = colour[rows, columns].astype(np.float32)
     told = (front.weight > 0.0) & (back.weight > 0.0) & (_apart(front.colour, back.colour) > LEAST_APART)
     wrong = told & (_apart(seen, back.colour) < LIKER * _apart(seen, front.colour))
-    return pixels[0][wrong], pixels[1][wrong], back.depth[wrong]
+    return rows[wrong], columns[wrong], back.depth[wrong]
 
 
 def _sides(
