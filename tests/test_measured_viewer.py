@@ -1,4 +1,4 @@
-"""viewer.html with what was measured: the same bits for the same state, no less and no more than what still holds."""
+"""viewer.html and the report with what was measured: the same bits for the same state, and only what still holds."""
 
 import json
 import os
@@ -10,6 +10,8 @@ import pytest
 from splatpipe.pipeline.app import measurements
 from splatpipe.pipeline.app.measured_viewer import renew_viewer
 from splatpipe.pipeline.app.measurements import MEASURED, outdated, read_measurements, write_measurements
+from splatpipe.pipeline.app.report.holdings import open_holdings
+from splatpipe.pipeline.app.report.measures import measures
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Stage
 from splatpipe.pipeline.engine.store import Artifact, StageInputs, Store, open_store
@@ -148,6 +150,25 @@ def test_a_page_of_an_earlier_version_is_left_alone(out: Path) -> None:
     (out / "viewer.html").unlink()
     assert renew_viewer(out) == ""
     assert not (out / "viewer.html").exists()
+
+
+def test_the_report_tells_figures_to_what_they_are_known_to(out: Path) -> None:
+    surface = next(iter(Store(out).artifacts("dsm"))).parts["dsm.files"].digest
+    amounts = {"cut_m3": 12_345.678, "cut_sigma_m3": 45.6, "fill_m3": 0.123456, "fill_sigma_m3": 0.0456}
+    amounts |= {"net_m3": -3.0, "net_sigma_m3": 0.0}
+    write_measurements(out, "volumes", (surface, "any"), [{**VOLUME, **amounts}])
+    told = measures(open_holdings(out))
+    (volume,), (section,) = told["volumes"], told["sections"]
+    assert volume["cut"] == "12,346 ± 46 m³"
+    assert volume["fill"] == "0.123 ± 0.046 m³"
+    assert volume["net"] == "-3.000 ± 0.000 m³"
+    assert volume["base"] == "rim, 1.00 m"
+    assert (section["length"], section["known"], section["picture"]) == ("3.00 m", "75 %", None)
+    assert section["files"] == [("CSV", "sections/section-1.csv")]
+    assert not told["outdated"]
+    make(Store(out), DSM, {}, "newer ")
+    told = measures(open_holdings(out))
+    assert (told["sections"], told["volumes"], told["outdated"]) == ([], [], True)
 
 
 def changed(item: dict[str, Any], **members: Any) -> dict[str, Any]:
