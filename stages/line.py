@@ -196,7 +196,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=5,
+    version=6,
     config=ExportConfig,
     reads=(
         "train.model",

@@ -218,6 +218,27 @@ def test_the_finest_allowed_is_read_and_holds_what_it_should(tmp_path: Path) -> 
     assert len(drawing.polygons[0][0]) == boundary_file.MOST_VERTICES - 1 and drawing.crossing == ()
 
 
+def test_polygons_have_their_features_names(tmp_path: Path) -> None:
+    def feature(geometry: dict[str, Any], properties: Any) -> dict[str, Any]:
+        return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+    one = {"type": "Polygon", "coordinates": [ring_of(5)]}
+    two = {"type": "MultiPolygon", "coordinates": [[ring_of(5)], [ring_of(6)]]}
+    nested = {"type": "GeometryCollection", "geometries": [one]}
+    named = [
+        (one, {"name": "Heap A"}),
+        (two, {"name": " a\nb "}),
+        (one, None),
+        (one, {"name": 7}),
+        (nested, {"name": "in"}),
+    ]
+    half, long = json.loads('"\\ud800"'), "x" * 10_000
+    named += [(one, {"name": half}), (one, {"name": long})]
+    features = {"type": "FeatureCollection", "features": [feature(*pair) for pair in named]}
+    names = read_boundary(written(tmp_path, features)).names
+    assert names == ("Heap A", "a b", "a b", "", "", "in", "?", "x" * boundary_file.LONGEST_NAME)
+
+
 def test_an_outline_that_crosses_itself_is_told_where(tmp_path: Path) -> None:
     bow = np.array([[-9.0, -8.0], [9.0, 8.0], [9.0, -8.0], [-9.0, 8.0]])
     np.testing.assert_allclose(crossing_of(bow), [0.0, 0.0], atol=1e-12)

@@ -118,6 +118,18 @@ def test_what_is_delivered_only_with_an_option_is_taken_back_without_it(numbers:
     assert (out / "echo.txt").read_text() == "somebody's own"
 
 
+def test_what_was_put_into_a_delivered_file_stays_and_is_taken_back_with_it(numbers: Path, out: Path) -> None:
+    walk(request_of(numbers, out, tell={"loud": True}))
+    echo = out / "echo.txt"
+    before = echo.stat()
+    echo.write_text(echo.read_text() + ", and more")
+    os.utime(echo, ns=(before.st_atime_ns, before.st_mtime_ns))
+    walk(request_of(numbers, out, tell={"loud": True}))
+    assert echo.read_text() == "3 1 TRUE 21, and more"
+    walk(request_of(numbers, out))
+    assert not echo.exists()
+
+
 def test_a_changed_photo_reruns_but_a_touched_or_copied_one_does_not(numbers: Path, out: Path, tmp_path: Path) -> None:
     walk(request_of(numbers, out))
     os.utime(numbers / "a.txt")

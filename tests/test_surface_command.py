@@ -26,7 +26,8 @@ def surface(out: Path, *arguments: str) -> tuple[int, dict[str, Any]]:
 def polygon(west: float, south: float, east: float, north: float) -> dict[str, Any]:
     ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
     crs = {"type": "name", "properties": {"name": "EPSG:32633"}}
-    return {"type": "Polygon", "crs": crs, "coordinates": [ring]}
+    feature = {"type": "Feature", "properties": {"name": "Heap <A>"}}
+    return {**feature, "crs": crs, "geometry": {"type": "Polygon", "coordinates": [ring]}}
 
 
 def test_a_finished_run_is_cut_and_measured(demo_run: Path, tmp_path: Path) -> None:
@@ -36,24 +37,42 @@ def test_a_finished_run_is_cut_and_measured(demo_run: Path, tmp_path: Path) -> N
     x, y = (west + east) / 2, (south + north) / 2
     (tmp_path / "heap.geojson").write_text(json.dumps(polygon(x - 12.0, y - 12.0, x + 12.0, y + 12.0)))
     line = f"{x - 15.0},{y},{x + 15.0},{y}"
-    code, told = surface(out, "--section", line, "--volume", str(tmp_path / "heap.geojson"))
+    code, told = surface(
+        out, "--section", line, "--section", f"{x},{y},{x},{y + 5.0}", "--volume", str(tmp_path / "heap.geojson")
+    )
     assert code == 0
     assert all(stage["state"] == "reused" for stage in told["stages"])
-    (section,) = told["surface"]["sections"]
+    section, _ = told["surface"]["sections"]
     assert section["length_m"] == pytest.approx(30.0, abs=0.05)
     for kind in ("csv", "dxf", "picture"):
         assert (out / "sections" / section[kind]).stat().st_size > 500
+    report, viewer = ((out / name).read_text(encoding="utf-8") for name in ("report.html", "viewer.html"))
+    for text in ("30.0", 'alt="Section 2"', "Heap &lt;A&gt;", "Volumes"):
+        assert text in report
+    for text in ('"name": "Section 2"', '"name": "Heap \\u003cA>"'):
+        assert text in viewer
+    assert all('"Section 2"' not in path.read_text() for path in (out / "stages").glob("export-*/viewer/viewer.html"))
     (volume,) = json.loads((out / "volumes.json").read_text())["volumes"]
     assert volume["area_m2"] == pytest.approx(576.0, rel=0.01)
     assert 300.0 < volume["cut_m3"] < 2000.0  # the house of 13 by 9 metres, 8 high, on a lawn
     assert volume["cut_sigma_m3"] < 0.1 * volume["cut_m3"]
 
+    def files() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in [*(out / "sections").iterdir(), out / "viewer.html"]}
 
-def test_a_line_beside_the_site_is_told_as_that(demo_run: Path, tmp_path: Path) -> None:
-    out = shutil.copytree(demo_run, tmp_path / "out")
-    code, told = surface(out, "--section", "0,0,10,10")
+    before = files()
+    code, told = surface(out, "--section", line, "--section", "0,0,10,10")
     assert code == 1
     assert "crosses nothing" in told["error"]["message"]
+    assert files() == before  # nothing is half done
+    (out / "sections/notes.txt").write_text("mine")
+    assert surface(out, "--section", f"{x},{y},{x},{y + 5.0}")[0] == 0
+    after = files()
+    assert "section-2.csv" not in after
+    assert after.keys() > {"section-1.csv", "section-1.png", "notes.txt"}
+    viewer = after["viewer.html"].decode()
+    assert "Section 2" not in viewer
+    assert "Heap" in viewer  # volumes stay
 
 
 def test_the_report_shows_heights_and_the_orthophoto(demo_run: Path) -> None:

@@ -19,6 +19,7 @@ from splatpipe.pipeline.surface.section_files import unit_key, write_section
 from splatpipe.pipeline.surface.sections import Section, cut_section
 from splatpipe.pipeline.surface.sources import DepthSource
 from splatpipe.pipeline.surface.surface_file import SurfaceFile, open_surface
+from splatpipe.pipeline.surface.traces import polygon_trace, section_trace
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -92,6 +93,44 @@ def test_points_show_the_walls_below_the_eaves(tmp_path: Path) -> None:
     assert np.array_equal(across(tmp_path, sources).points, found.points)
     threaded = cut_section(house(tmp_path), line_of(*ACROSS), grid().crs, sources, threads=3)
     assert np.array_equal(threaded.points, found.points)
+
+
+def test_a_trace_lies_on_the_surface_and_keeps_peaks_and_holes(tmp_path: Path) -> None:
+    section = across(tmp_path)
+    trace = section_trace(section, grid().crs, 10_000)
+    assert trace["height"].count(None) == np.isnan(section.height).sum() > 0
+    x, y, z = (np.array(trace[name], float) for name in "xyz")
+    assert np.array_equal(np.isnan(z), np.isnan(section.height))
+    distance, height = np.array(trace["distance"], float), np.array(trace["height"], float)
+    known = np.isfinite(z)
+    assert np.abs(x - ACROSS[0])[known].max() < 5e-3
+    assert np.abs(y - ACROSS[1] - distance)[known].max() < 5e-3
+    assert np.abs(z + 512.0 - height)[known].max() < 2e-3
+    few = section_trace(section, grid().crs, 80)
+    assert len(few["distance"]) <= 80
+    assert {len(few[name]) for name in ("height", "sigma", "x", "y", "z")} == {len(few["distance"])}
+    assert few["distance"][0] == 0.0
+    assert few["distance"][-1] == pytest.approx(section.length_m, abs=1e-3)
+    assert max(filter(None, few["height"])) == max(filter(None, trace["height"]))
+    assert None in few["height"]
+
+
+def test_a_polygon_is_laid_onto_the_surface(tmp_path: Path) -> None:
+    ring = np.array([[-9.0, -7.0], [9.0, -7.0], [9.0, 7.0], [-9.0, -3.0]])  # over the house, and beside the hole
+    surface = house(tmp_path)
+    (trace,) = polygon_trace(surface, (ring,), grid().crs, 200)
+    x, y, z = (np.array(trace[name]) for name in "xyz")
+    assert len(x) <= 200
+    assert (x[0], y[0], z[0]) == (x[-1], y[-1], z[-1])
+    for corner in ring:
+        assert np.hypot(x - corner[0], y - corner[1]).min() < 2e-3
+    off = np.abs(z - true_height(x, y))
+    assert np.median(off) < 2e-3  # a step's own cells apart
+    assert z.max() > 3.0
+    (through,) = polygon_trace(surface, (np.array([[-1.0, -6.0], [1.0, -6.0], [0.0, -9.0]]),), grid().crs, 50)
+    assert np.abs(np.array(through["z"])).max() < 2e-3  # straight on over the hole
+    (nowhere,) = polygon_trace(surface, (ring + 500.0,), grid().crs, 8)
+    assert len(nowhere["z"]) == 8
 
 
 def test_files_are_read_by_others(tmp_path: Path) -> None:

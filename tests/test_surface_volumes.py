@@ -15,7 +15,7 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.surface_file import SurfaceFile, open_surface
-from splatpipe.pipeline.surface.volume_file import write_volumes
+from splatpipe.pipeline.surface.volume_file import volume_facts, write_volumes
 from splatpipe.pipeline.surface.volumes import SHARED_CELLS, measure_volume
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
@@ -168,7 +168,11 @@ def test_the_file_tells_each_polygon_in_plain_units(tmp_path: Path) -> None:
     east, north = plan_of(grid)
     surface = surface_file(tmp_path, grid, cone(east, north), 0.01)
     both = PlanArea.seen_from_above([*square(8.0).polygons, (square(1.0).polygons[0][0] + 9.5,)])
-    told = write_volumes(tmp_path / "volumes.json", surface, both, grid.crs, "lowest")
+    measured = [
+        measure_volume(surface, PlanArea.seen_from_above([polygon]), grid.crs, "lowest") for polygon in both.polygons
+    ]
+    told = [volume_facts(number, "Heap", volume) for number, volume in enumerate(measured, 1)]
+    write_volumes(tmp_path / "volumes.json", told, grid.crs)
     read = json.loads((tmp_path / "volumes.json").read_text())
     assert read["volumes"] == told
     assert [row["polygon"] for row in told] == [1, 2]

@@ -28,6 +28,7 @@ from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, read_p
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 from splatpipe.pipeline.survey.frames import Frame, Origin, Similarity, load_frame
+from splatpipe.pipeline.web.measured_page import with_measurements
 from splatpipe.pipeline.web.viewer_scene import Look, upright, viewer_scene, write_viewer
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -37,6 +38,7 @@ LIKE_OURS_DB = 25.0
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up
 RIDGE_M = np.array([[-6.35, 0.0, 9.12], [6.35, 0.0, 9.12]])  # of the demo's roof, in its plot, 10 cm from its ends
 FROM_ABOVE = "DJI_0023.JPG"
+BREAKOUT = "</script><script>document.title = 'broken'</script>"
 Opened = Callable[..., "Page"]
 
 
@@ -61,7 +63,7 @@ def view(open_page: Callable) -> Iterator[Opened]:
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the page of the tiny scene, of arbitrary scale, named to break out of its script."""
     folder = tmp_path_factory.mktemp("tiny")
-    write_tiny(folder, "</script><script>document.title = 'broken'</script>")
+    write_tiny(folder, BREAKOUT)
     return folder
 
 
@@ -255,12 +257,14 @@ def test_without_webgl_2_the_page_says_what_is_missing(tiny: Path, browser: Brow
 
 def test_names_cannot_break_out_of_the_page(tiny: Path, view: Opened) -> None:
     page = view(tiny / "viewer.html")
-    assert page.title() == "</script><script>document.title = 'broken'</script>"
+    assert page.title() == BREAKOUT
     assert page.locator("h1").inner_text() == page.title()
 
 
 def test_without_a_scale_lengths_have_no_metres(tiny: Path, view: Opened) -> None:
     page = view(tiny / "viewer.html")
+    for name in ("#results", "#results_button", "dt.for-results"):  # nothing was measured on a surface model
+        assert page.locator(name).is_hidden()
     measured = page.evaluate("() => splatpipe.measure([0, 0, 0], [3, 4, 12])")
     assert measured == {"distance": 13.0, "horizontal": 5.0, "height": 12.0}
     assert page.locator(".measured").inner_text() == "13.00 units"
@@ -395,6 +399,72 @@ def test_nothing_that_floats_over_the_model_hides_another(tiny: Path, view: Open
     for a, b in itertools.combinations(filter(None, boxes), 2):
         (left, right), (top, bottom) = [sorted((a, b), key=lambda box: box[axis]) for axis in "xy"]
         assert left["x"] + left["width"] <= right["x"] or top["y"] + top["height"] <= bottom["y"]
+
+
+def measured() -> dict:
+    """A section with a hole, three metres long, and the volume of a triangle, named to break out."""
+    profile = {"distance": [0.0, 1.0, 2.0, 2.5, 3.0], "height": [500.0, 502.0, None, 501.0, 501.5]}
+    profile |= {"sigma": [0.02, 0.02, None, None, 0.02], "point_distance": [1.1], "point_height": [499.5]}
+    profile |= {"x": [-1.5, -0.5, None, 1.0, 1.5], "y": [0.0, 0.0, None, 0.0, 0.0], "z": [0.0, 2.0, None, 1.0, 1.5]}
+    section = {"name": "Section 1", "length_m": 3.0, "share_with_height": 0.8, "height_sigma_m": 0.021}
+    amounts = {"cut_m3": 12.345, "cut_sigma_m3": 0.678, "fill_m3": 1.0, "fill_sigma_m3": 0.1, "net_m3": 1234.56}
+    volume = {"name": BREAKOUT, **amounts, "net_sigma_m3": 12.3, "area_m2": 2.0, "base": "rim"}
+    ring = {"x": [0.0, 2.0, 0.0, 0.0], "y": [0.0, 0.0, 2.0, 0.0], "z": [0.1, 0.1, 0.1, 0.1]}
+    return {"sections": [{**section, "trace": profile}], "volumes": [{**volume, "trace": [ring]}]}
+
+
+@pytest.fixture(scope="module")
+def tiny_measured(tiny: Path) -> Path:
+    path = tiny / "measured.html"
+    path.write_bytes(with_measurements((tiny / "viewer.html").read_bytes(), measured()))
+    return path
+
+
+def test_sections_and_volumes_are_lines_a_list_and_a_chart(tiny_measured: Path, view: Opened) -> None:
+    page = view(tiny_measured, 1000, 700)
+    assert page.title() == BREAKOUT
+    assert page.locator("#fold").inner_text() == "1 section, 1 volume"
+    section, volume = page.locator("#results_list button").all()
+    assert section.inner_text().splitlines() == ["Section 1", "3.00 m long · 80 % with heights", "heights ± 2.1 cm"]
+    assert volume.inner_text().splitlines()[:3] == [
+        BREAKOUT,
+        "net 1235 ± 12 m³",
+        "cut 12.35 ± 0.68 m³, fill 1.00 ± 0.10 m³",
+    ]
+    assert page.locator("#profile").is_hidden()
+    section.click()
+    wait_until(page, lambda: np.allclose([state(page)["yaw"], state(page)["pitch"]], [np.pi / 2.0, -0.45], atol=1e-9))
+    left, right = (page.evaluate("end => splatpipe.project(end).x", end) for end in ([-1.5, 0, 0], [1.5, 0, 1.5]))
+    assert page.locator("#results").bounding_box()["width"] < left < right < 1000.0  # its start is on the left
+    box = page.locator("#chart").bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.99, box["y"] + 20)
+    assert page.locator("#reading").inner_text() == "3.00 m: height 501.50 m ± 2.0 cm"
+    dot = page.evaluate("() => splatpipe.project([1.5, 0, 1.5])")
+    shown = page.locator("#labels > .dot:not([hidden])").bounding_box()
+    assert np.hypot(shown["x"] + shown["width"] / 2 - dot["x"], shown["y"] + shown["height"] / 2 - dot["y"]) < 2.0
+    page.mouse.move(box["x"] + box["width"] * 0.66, box["y"] + 20)
+    assert page.locator("#reading").inner_text() == "2.00 m: no height here"
+    volume.click()
+    assert page.locator("#profile").is_hidden()
+    with_lines = picture(page)
+    page.evaluate("() => splatpipe.showInterface(true)")
+    page.keyboard.press("v")
+    assert page.locator("#results").is_hidden()
+    assert np.abs(picture(page).astype(int) - with_lines).max() > 100
+
+
+def test_on_a_phone_the_list_is_folded_and_leaves_room(tiny_measured: Path, view: Opened) -> None:
+    page = view(tiny_measured, 390, 844, touch=True)
+    assert page.locator("#results_list").is_hidden()
+    page.locator("#fold").tap()
+    page.locator("#results_list button").first.tap()
+    box, where, tools = (page.locator(name).bounding_box() for name in ("#results", "#where", "#tools"))
+    assert page.locator("#chart").is_visible()
+    assert box["x"] + box["width"] <= tools["x"]
+    assert box["y"] + box["height"] <= where["y"]
+    wait_until(
+        page, lambda: box["y"] + box["height"] < page.evaluate("() => splatpipe.project([0, 0, 1]).y") < where["y"]
+    )
 
 
 def test_the_screenshot_is_the_picture(tiny: Path, view: Opened, tmp_path: Path) -> None:

@@ -255,8 +255,8 @@ def surface(
         with RunSession(existing(out, tables, device, threads), wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
-        if wanted.anything:
-            done.told = {"surface": measure_surface(out, wanted, threads or available_cores())}
+            if wanted.anything:
+                done.told = {"surface": measure_surface(out, wanted, threads or available_cores())}
 
 
 @app.command()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.machine import available_cores
 
 if TYPE_CHECKING:
@@ -174,4 +174,21 @@ class RunSession:
 
     def __exit__(self, *error: Any) -> bool | None:
         self._console.close()
-        return self._session.__exit__(*error)
+        try:
+            if not self._shard:
+                self._renew_viewer()
+        finally:
+            stopped = self._session.__exit__(*error)
+        return stopped
+
+    def _renew_viewer(self) -> None:
+        """Have the viewer show what was measured, while OUT is locked; what is wrong with it is told, no more."""
+        from splatpipe.pipeline.app.console import say
+        from splatpipe.pipeline.app.measured_viewer import renew_viewer
+
+        try:
+            trouble = renew_viewer(self._request.out)
+        except (OSError, SplatpipeError) as error:
+            trouble = f"viewer.html could not be renewed: {error}"
+        if trouble:
+            say(trouble)

@@ -1,20 +1,34 @@
-"""Sections and volumes of a finished run's surface model, into OUT/sections and OUT/volumes.json."""
+"""Sections and volumes of a finished run's surface model, into OUT/sections and OUT/volumes.json, and for pages."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, Items, write_measurements
+from splatpipe.pipeline.engine.durable import sync_folder
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.store import Part
 from splatpipe.stages.line import DEPTHS, DSM, GEOREF, LINE, UNDISTORT
 
-SECTIONS = "sections"
-VOLUMES = "volumes.json"
+if TYPE_CHECKING:
+    from splatpipe.pipeline.surface.map_crs import MapCrs
+    from splatpipe.pipeline.surface.surface_file import SurfaceFile
+    from splatpipe.pipeline.survey.frames import Frame
+
 MOST_SECTIONS = 100
+UNFINISHED = ".sections.making"
+SECTION_FILE = re.compile(r"section-\d+(_points)?\.(csv|dxf|png)")
+SECTION_PLACES = 2000  # that a section's trace has: more than a chart has pixels,
+ALL_PLACES = 60_000  # and those of all together: a page of 3 MB more at most,
+RING_PLACES = 400  # and a ring of a polygon,
+TRACED_VOLUMES = 200  # of which more are in volumes.json alone
 Base = Literal["rim", "lowest"] | float
 Line = tuple[float, float, float, float]
 
@@ -70,8 +84,32 @@ def _number(text: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A finished surface model, and what it was made from.
+
+    Attributes:
+        parts: By full name.
+        frame: georef's.
+        crs: Of the model.
+        model: Its heights.
+    """
+
+    parts: Mapping[str, Part]
+    frame: Frame
+    crs: MapCrs
+    model: SurfaceFile
+
+    @property
+    def digests(self) -> tuple[str, str]:
+        """Of the model and of the frame: what is measured holds for these alone."""
+        return self.parts["dsm.files"].digest, self.parts["georef.frame"].digest
+
+
 def measure_surface(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
-    """Cut sections and measure volumes.
+    """Cut sections and measure volumes; each kind takes the place of what was measured before, or nothing changes.
+
+    Only who holds the lock of OUT may call this.
 
     Args:
         out: OUT, of a run with a surface model.
@@ -83,38 +121,103 @@ def measure_surface(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
 
     Raises:
         SplatpipeError: if there is no surface model, or a line or a polygon misses it.
+        OSError: if the disk is full or not writable.
     """
+    from splatpipe.pipeline.surface.volume_file import write_volumes
+
+    surface = _open_surface(out)
+    told: dict[str, Any] = {}
+    aside = out / UNFINISHED
+    shutil.rmtree(aside, ignore_errors=True)  # of a killed command
+    try:
+        aside.mkdir()
+        sections = _sections(surface, wanted.lines, aside, threads)
+        volumes = _volumes(surface, wanted)
+        if sections:
+            write_measurements(out, "sections", surface.digests, ())  # none, should it be killed on the way
+            _publish(aside, out / SECTIONS)
+            write_measurements(out, "sections", surface.digests, sections)
+            told["sections"] = [_without_trace(item) for item in sections]
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+    if volumes:
+        told["volumes"] = [_without_trace(item) for item in volumes]
+        write_measurements(out, "volumes", surface.digests, ())
+        write_volumes(out / VOLUMES, told["volumes"], surface.crs)
+        write_measurements(out, "volumes", surface.digests, volumes)
+    return told
+
+
+def _open_surface(out: Path) -> _Surface:
+    from splatpipe.pipeline.surface.map_crs import open_map
+    from splatpipe.pipeline.surface.surface_file import open_surface
+    from splatpipe.pipeline.survey.frames import load_frame
+
+    parts = open_run_folder(out, LINE).lineage(DSM, DEPTHS, UNDISTORT, GEOREF)
+    files = parts["dsm.files"].path if "dsm.files" in parts else None
+    if files is None or not (files / "dsm.tif").is_file():
+        raise SplatpipeError("The run has no surface model.", hint=f"Make it first: splatpipe surface {out}")
+    frame = load_frame(parts["georef.frame"].path)
+    return _Surface(parts, frame, open_map(frame), open_surface(files / "dsm.tif", files / "dsm_confidence.tif"))
+
+
+def _sections(surface: _Surface, lines: Sequence[Line], folder: Path, threads: int) -> Items:
+    """Cut all of them, their files into a folder."""
     from splatpipe.pipeline.mvs.depth_maps import kept_depth_maps
     from splatpipe.pipeline.photos.dataset import load_views
-    from splatpipe.pipeline.surface.map_crs import open_map
     from splatpipe.pipeline.surface.run_sources import metric_depths
     from splatpipe.pipeline.surface.section_files import write_section
     from splatpipe.pipeline.surface.sections import cut_section
-    from splatpipe.pipeline.surface.surface_file import open_surface
-    from splatpipe.pipeline.surface.volume_file import write_volumes
+    from splatpipe.pipeline.surface.traces import section_trace
+
+    if not lines:
+        return []
+    maps = kept_depth_maps(surface.parts["depths.maps"].path, load_views(surface.parts["undistort.dataset"].path))
+    sources = metric_depths(maps, surface.frame.world_from_model)
+    most = min(SECTION_PLACES, ALL_PLACES // len(lines))
+    found = []
+    for number, line in enumerate(lines, 1):
+        section = cut_section(surface.model, line, surface.crs, sources, threads)
+        told = write_section(folder, f"section-{number}", section, surface.crs)
+        found.append({**told, "trace": section_trace(section, surface.crs, most)})
+    return found
+
+
+def _publish(aside: Path, folder: Path) -> None:
+    """Move sections to where they belong, and remove those of an earlier call."""
+    folder.mkdir(exist_ok=True)
+    made = {path.name for path in aside.iterdir()}
+    for path in sorted(aside.iterdir()):
+        path.replace(folder / path.name)
+    for path in folder.iterdir():
+        if SECTION_FILE.fullmatch(path.name) and path.name not in made:
+            path.unlink()
+    sync_folder(folder)
+
+
+def _volumes(surface: _Surface, wanted: Wanted) -> Items:
+    from splatpipe.pipeline.geometry.plan_area import PlanArea
+    from splatpipe.pipeline.surface.traces import polygon_trace
+    from splatpipe.pipeline.surface.volume_file import volume_facts
+    from splatpipe.pipeline.surface.volumes import measure_volume
     from splatpipe.pipeline.survey.boundary import placed_area
     from splatpipe.pipeline.survey.boundary_file import read_boundary
-    from splatpipe.pipeline.survey.frames import load_frame
 
-    parts = {
-        name: part.path for name, part in open_run_folder(out, LINE).lineage(DSM, DEPTHS, UNDISTORT, GEOREF).items()
-    }
-    files = parts.get("dsm.files")
-    if files is None or not (files / "dsm.tif").is_file():
-        raise SplatpipeError("The run has no surface model.", hint=f"Make it first: splatpipe surface {out}")
-    frame = load_frame(parts["georef.frame"])
-    crs, model = open_map(frame), open_surface(files / "dsm.tif", files / "dsm_confidence.tif")
-    told: dict[str, Any] = {}
-    if wanted.lines:
-        folder = out / SECTIONS
-        folder.mkdir(exist_ok=True)
-        maps = kept_depth_maps(parts["depths.maps"], load_views(parts["undistort.dataset"]))
-        sources = metric_depths(maps, frame.world_from_model)
-        told["sections"] = [
-            write_section(folder, f"section-{number}", cut_section(model, line, crs, sources, threads), crs)
-            for number, line in enumerate(wanted.lines, 1)
-        ]
-    if wanted.polygons is not None:
-        area = placed_area(read_boundary(wanted.polygons), frame)
-        told["volumes"] = write_volumes(out / VOLUMES, model, area, crs, wanted.base)
-    return told
+    if wanted.polygons is None:
+        return []
+    drawing = read_boundary(wanted.polygons)
+    area = placed_area(drawing, surface.frame)
+    rings = sum(len(polygon) for polygon in area.polygons[:TRACED_VOLUMES])
+    most = max(4, min(RING_PLACES, ALL_PLACES // rings))
+    found: Items = []
+    for number, (polygon, name) in enumerate(zip(area.polygons, drawing.names, strict=True), 1):
+        volume = measure_volume(surface.model, PlanArea(area.axes, (polygon,)), surface.crs, wanted.base)
+        facts = volume_facts(number, name, volume)
+        if number <= TRACED_VOLUMES:
+            facts["trace"] = polygon_trace(surface.model, polygon, surface.crs, most)
+        found.append(facts)
+    return found
+
+
+def _without_trace(item: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in item.items() if key != "trace"}

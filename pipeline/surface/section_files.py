@@ -45,7 +45,8 @@ def write_section(folder: Path, name: str, section: Section, crs: MapCrs) -> dic
         crs: Of its coordinates.
 
     Returns:
-        What is told of it: ``name``, ``line``, ``length_m``, ``share_with_height``, ``points``, and its files.
+        What is told of it: ``name``, ``line``, ``length_m``, ``share_with_height``, ``height_sigma_m`` (the middle one;
+        None where none is told), ``points``, and its files.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -59,11 +60,13 @@ def write_section(folder: Path, name: str, section: Section, crs: MapCrs) -> dic
     write_dxf_drawing(folder / files["dxf"], drawing)
     write_png_drawing(folder / files["picture"], drawing)
     known = np.isfinite(section.height)
+    sigma_m = section.sigma_m[known & np.isfinite(section.sigma_m)]
     return {
         "name": name,
         "line": [round(float(number), DIGITS) for number in section.line],
         "length_m": round(section.length_m, DIGITS),
         "share_with_height": round(float(known.mean()), DIGITS),
+        "height_sigma_m": round(float(np.median(sigma_m)), DIGITS) if len(sigma_m) else None,
         "points": len(section.points),
         **files,
     }

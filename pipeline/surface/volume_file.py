@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.json_file import json_text
-from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.map_crs import MapCrs
-from splatpipe.pipeline.surface.surface_file import SurfaceFile
-from splatpipe.pipeline.surface.volumes import Amount, Kind, Volume, measure_volume
+from splatpipe.pipeline.surface.volumes import Amount, Volume
 from splatpipe.pipeline.surface.whole_file import whole_file
 
 FORMAT = 1
@@ -21,48 +20,42 @@ HOW = (
 )
 
 
-def write_volumes(
-    path: Path, surface: SurfaceFile, area: PlanArea, crs: MapCrs, base: Kind | float, datum_sigma_m: float = 0.0
-) -> list[dict[str, Any]]:
-    """Measure the volume in each polygon, and write them.
+def write_volumes(path: Path, facts: Sequence[Mapping[str, Any]], crs: MapCrs) -> None:
+    """Write what was measured.
 
     Args:
         path: Where.
-        surface: The model.
-        area: The polygons, local metres; each by itself.
+        facts: Of each polygon, as ``volume_facts`` tells them.
         crs: The model's.
-        base: ``rim``, ``lowest``, or a height in the CRS's unit.
-        datum_sigma_m: As ``measure_volume`` takes it.
-
-    Returns:
-        What the file tells of each.
 
     Raises:
-        SplatpipeError: as ``measure_volume``.
         OSError: if the disk is full or not writable.
     """
-    facts = []
-    for number, polygon in enumerate(area.polygons, 1):
-        volume = measure_volume(surface, PlanArea(area.axes, (polygon,)), crs, base, datum_sigma_m)
-        facts.append({"polygon": number, **volume_facts(volume)})
     value = {"format": FORMAT, "crs": crs.horizontal.name, "heights": crs.described_heights(), "uncertainty": HOW}
     with whole_file(path) as aside:
-        aside.write_text(json_text({**value, "volumes": facts}), encoding="utf-8")
-    return facts
+        aside.write_text(json_text({**value, "volumes": list(facts)}), encoding="utf-8")
 
 
-def volume_facts(volume: Volume) -> dict[str, Any]:
-    """A volume as JSON; the base's height is told in metres of the CRS's datum, at a place in the CRS's unit."""
+def volume_facts(number: int, name: str, volume: Volume) -> dict[str, Any]:
+    """A volume as JSON; the base's height is told in metres of the CRS's datum, at a place in the CRS's unit.
+
+    Args:
+        number: Of the polygon in its file, from 1 on.
+        name: The polygon's; empty for none.
+        volume: What lies in it.
+    """
     base = volume.base
     kinds = {"cut": volume.cut, "fill": volume.fill, "net": volume.net}
     return {
-        **{key: number for kind, amount in kinds.items() for key, number in _numbers(kind, amount).items()},
+        "polygon": number,
+        "name": name,
+        **{key: value for kind, amount in kinds.items() for key, value in _numbers(kind, amount).items()},
         "area_m2": round(volume.area_m2, DIGITS),
         "area_without_height_m2": round(volume.area_m2 - volume.known_m2, DIGITS),
         "share_without_height": round(1.0 - volume.known_m2 / volume.area_m2, DIGITS),
         "base": {
             "kind": base.kind,
-            "place": [round(float(number), DIGITS) for number in base.middle],
+            "place": [round(float(value), DIGITS) for value in base.middle],
             "height_m": round(float(base.terms[0]), DIGITS),
             "height_sigma_m": round(float(base.covariance[0, 0]) ** 0.5, DIGITS),
             "rise_to_east_percent": round(100.0 * float(base.terms[1]), DIGITS),

@@ -22,6 +22,7 @@ from splatpipe.pipeline.geometry.plan_area import Polygon, Ring, signed_area
 LARGEST_FILE = 8 << 20  # bytes: a hundred times what a detailed outline takes
 MOST_VERTICES = 20_000  # of all rings: finer than any boundary that was drawn or measured
 DEEPEST = 8  # collections within collections
+LONGEST_NAME = 80  # characters of a feature's name: what a label has room for
 LARGEST = 1e9  # of a coordinate: beyond it there is no earth
 EXPECTED = "Draw it as a polygon in QGIS or geojson.io, and save it as GeoJSON."
 WGS84 = "EPSG:4326"
@@ -44,6 +45,7 @@ class Drawing:
     Attributes:
         name: The file's, for messages.
         polygons: As they are stated: east (or longitude), north (or latitude).
+        names: Of the features that they are of, one each; empty where a feature has none.
         crs: As ``parse_crs`` takes it; empty where the file names none.
         passed_over: Points and lines in it, which bound nothing.
         crossing: Where an outline crosses itself; empty where none does.
@@ -51,6 +53,7 @@ class Drawing:
 
     name: str
     polygons: tuple[Polygon, ...]
+    names: tuple[str, ...]
     crs: str
     passed_over: int
     crossing: tuple[float, ...]
@@ -67,15 +70,16 @@ def read_boundary(path: Path) -> Drawing:
     """
     value = _value(path)
     try:
-        geometries = list(_geometries(value, 0))
-        polygons = tuple(_polygons(geometries))
+        geometries = list(_geometries(value, 0, ""))
+        named = list(_polygons(geometries))
     except _BrokenError as error:
         raise SplatpipeError(f"The boundary {path.name} {error}.", EXPECTED) from error
-    if not polygons:
+    if not named:
         raise SplatpipeError(f"The boundary {path.name} has no polygon.", EXPECTED)
+    polygons, names = tuple(polygon for polygon, _ in named), tuple(name for _, name in named)
     crossing = next((place for polygon in polygons for ring in polygon if (place := crossing_of(ring))), ())
-    others = sum(geometry["type"] not in ("Polygon", "MultiPolygon") for geometry in geometries)
-    return Drawing(path.name, polygons, _crs(value, path.name), others, crossing)
+    others = sum(geometry["type"] not in ("Polygon", "MultiPolygon") for geometry, _ in geometries)
+    return Drawing(path.name, polygons, names, _crs(value, path.name), others, crossing)
 
 
 class _BrokenError(ValueError):
@@ -100,8 +104,8 @@ def _no_number(text: str) -> float:
     raise ValueError(f"{text} is no number")
 
 
-def _geometries(value: Any, depth: int) -> Iterator[dict[str, Any]]:
-    """The geometries of an object that has some, collections taken apart."""
+def _geometries(value: Any, depth: int, name: str) -> Iterator[tuple[dict[str, Any], str]]:
+    """The geometries of an object that has some, collections taken apart; each with its feature's name."""
     if depth > DEEPEST:
         raise _BrokenError(f"has collections within collections, more than {DEEPEST} deep")
     kind = value.get("type") if isinstance(value, dict) else None
@@ -111,20 +115,28 @@ def _geometries(value: Any, depth: int) -> Iterator[dict[str, Any]]:
         parts = value.get("geometries")
     elif kind == "Feature":
         parts = [] if value.get("geometry") is None else [value["geometry"]]  # a row of a table without a place
+        name = _name(value.get("properties"))
     elif kind in ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon"):
-        yield value
+        yield value, name
         return
     else:
         raise _BrokenError("is no GeoJSON: something in it has no type that is known")
     if not isinstance(parts, list):
         raise _BrokenError(f"has a {kind} that is no list")
     for part in parts:
-        yield from _geometries(part, depth + 1)
+        yield from _geometries(part, depth + 1, name)
 
 
-def _polygons(geometries: list[dict[str, Any]]) -> Iterator[Polygon]:
+def _name(properties: Any) -> str:
+    """What a feature is called, in one line of valid text."""
+    stated = properties.get("name") if isinstance(properties, dict) else None
+    text = " ".join(stated.split()) if isinstance(stated, str) else ""
+    return text[:LONGEST_NAME].encode("utf-8", "replace").decode("utf-8")  # JSON may hold halves of a character
+
+
+def _polygons(geometries: list[tuple[dict[str, Any], str]]) -> Iterator[tuple[Polygon, str]]:
     left = MOST_VERTICES
-    for geometry in geometries:
+    for geometry, name in geometries:
         if geometry["type"] not in ("Polygon", "MultiPolygon"):
             continue
         stated = geometry.get("coordinates")
@@ -136,7 +148,7 @@ def _polygons(geometries: list[dict[str, Any]]) -> Iterator[Polygon]:
                     raise _BrokenError(f"has more than {MOST_VERTICES:,} vertices")
                 polygon.append(_ring(ring))
             if polygon:  # an empty one is valid, and nothing
-                yield tuple(polygon)
+                yield tuple(polygon), name
 
 
 def _listed(value: Any) -> list[Any]:

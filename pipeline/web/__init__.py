@@ -21,3 +21,8 @@ def asset(name: str) -> str:
         raise MachineError(
             f"This installation of splatpipe lacks {name}.", hint="Build it again: make, or pip install of the sources."
         ) from error
+
+
+def script_safe(text: str) -> str:
+    """JSON that cannot end the script element that it stands in."""
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

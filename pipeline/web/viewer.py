@@ -17,7 +17,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.panorama import FULL_FROM_DEG, NOTHING_UP_TO_DEG
 from splatpipe.pipeline.survey.crs import UNKNOWN
 from splatpipe.pipeline.survey.local_crs import LocalCrs
-from splatpipe.pipeline.web import asset
+from splatpipe.pipeline.web import asset, script_safe
 
 TEMPLATE = Path(__file__).resolve().parent / "viewer.html"
 POLICY = (
@@ -122,7 +122,7 @@ def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
         note=scene.note,
         north=scene.metres and scene.placed,
         style=Markup(asset("viewer.css")),
-        facts=Markup(_script_safe(json.dumps(facts, ensure_ascii=False, allow_nan=False))),
+        facts=Markup(script_safe(json.dumps(facts, ensure_ascii=False, allow_nan=False))),
         splat=Markup(carried),
         script=Markup(asset("viewer.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")),
     )
@@ -207,8 +207,3 @@ def _crs_line(scene: ViewerScene) -> str:
 
 def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
-
-
-def _script_safe(text: str) -> str:
-    """JSON that cannot end the script element that it stands in."""
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -25,9 +25,10 @@ from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.georeference import scene_box
 from splatpipe.pipeline.survey.local_crs import local_crs
 from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.web.measured_page import PAGE
 from splatpipe.pipeline.web.viewer import ViewerCamera, ViewerScene, ViewerSky, viewer_page
 
-PAGE, SPLAT = "viewer.html", "splat.spz"
+SPLAT = "splat.spz"
 THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows; of more photos than the next, less
 MOST_LARGE_THUMBS = 300
 JPEG_QUALITY = 74

@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.measures import measures
 from splatpipe.pipeline.app.report.wording import count, length
 
 PICTURE_SIDE = 960  # pixels
 FACADE_SIDE = 480
 MOST_FACADES = 12  # with a picture; all are in the list
+SECTION_SIDE = 720
+MOST_SECTIONS = 12  # likewise
 QUALITY = 85
 
 Chapter = dict[str, Any]
@@ -43,7 +46,17 @@ def surfaces_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
     if mesh.get("triangles"):
         facts.append(("triangles of the mesh", f"{count(mesh['triangles'])}, of voxels of {length(mesh['voxel_m'])}"))
     facades = _facades(holdings, drawn=drawn)
-    return {"facts": facts, "pictures": _pictures(holdings) if drawn else [], "facades": facades}
+    chapter = {"facts": facts, "pictures": _pictures(holdings) if drawn else [], "facades": facades}
+    return {**chapter, "measured": _measured(holdings, drawn=drawn)}
+
+
+def _measured(holdings: Holdings, *, drawn: bool) -> dict[str, Any]:
+    """Sections and volumes, with small pictures of the first sections."""
+    told = measures(holdings)
+    for number, row in enumerate(told["sections"]):
+        path = row.pop("picture")
+        row |= _small_picture(path, SECTION_SIDE) if drawn and path is not None and number < MOST_SECTIONS else {}
+    return told
 
 
 def _facades(holdings: Holdings, *, drawn: bool) -> list[dict[str, Any]]:
@@ -57,11 +70,13 @@ def _facades(holdings: Holdings, *, drawn: bool) -> list[dict[str, Any]]:
         row = {"name": str(each["name"]), "area": f"{float(each['area_m2']):.1f} m²"}
         row["known"] = f"{100.0 * float(each['share_with_depth']):.0f} %"
         path = _file(holdings, "facades.files", f"facades/{each['picture']}")
-        rows.append(row | (_small_picture(path) if drawn and path is not None and number < MOST_FACADES else {}))
+        rows.append(
+            row | (_small_picture(path, FACADE_SIDE) if drawn and path is not None and number < MOST_FACADES else {})
+        )
     return rows
 
 
-def _small_picture(path: Path) -> dict[str, Any]:
+def _small_picture(path: Path, side: int) -> dict[str, Any]:
     import cv2
     import numpy as np
 
@@ -72,7 +87,7 @@ def _small_picture(path: Path) -> dict[str, Any]:
         return {}
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], 255).astype(np.uint8)
-    small = shrunk(np.asarray(pixels, np.uint8), FACADE_SIDE)
+    small = shrunk(np.asarray(pixels, np.uint8), side)
     return {"source": jpeg(small, QUALITY), "width": small.shape[1], "height": small.shape[0]}
 
 

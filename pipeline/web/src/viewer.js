@@ -14,20 +14,22 @@
 //   picture()             a promise: the present view as a PNG data URL
 //   facts                 what the page was made with
 
-import { Vector3 } from "three";
+import { Box3, Vector3 } from "three";
 import { fillStrip, Frusta, frustumDepth } from "./viewer/cameras.js";
 import { told, toCrs } from "./viewer/crs.js";
 import { Measuring } from "./viewer/measure.js";
 import { Navigation } from "./viewer/navigation.js";
-import { bytesOf, LoadError, readFacts, readSplat } from "./viewer/page.js";
+import { bytesOf, LoadError, readFacts, readMeasurements, readSplat } from "./viewer/page.js";
 import { makePoints, nearestPoint } from "./viewer/points.js";
 import { RayCaster } from "./viewer/ray.js";
+import { Results } from "./viewer/results.js";
 import { makeSky } from "./viewer/sky.js";
 import { Stage } from "./viewer/stage.js";
 import { View } from "./viewer/view.js";
 
 const FAR_PER_SIZE = 1e4; // of the scene: what is behind everything else must not be cut off
 const HOVER_MS = 60;
+const FILLED = 0.85; // of the free part of the window, by what one goes to
 
 const $ = (id) => document.getElementById(id);
 const array = (vector) => [vector.x, vector.y, vector.z];
@@ -55,6 +57,7 @@ class Viewer {
     };
     this.frusta = new Frusta(this.photos, frustumDepth(this.photos), () => this.stage.invalidate());
     this.measuring = new Measuring($("labels"), $("lines"), facts, () => this.stage.invalidate());
+    this.results = this.makeResults();
     this.stage.scene.add(this.frusta.group);
     this.stage.beforeDraw = () => this.beforeDraw();
     this.stage.failed = (error) => tell(`Drawing failed: ${error.message}`, "Reload this page, or try another browser.");
@@ -65,6 +68,19 @@ class Viewer {
     this.controls();
     const bytes = this.given ?? (await readSplat(facts, progress));
     await this.show(bytes);
+  }
+
+  /** Sections and volumes; null where none were measured. */
+  makeResults() {
+    const measured = readMeasurements();
+    for (const element of document.querySelectorAll(".for-results")) element.hidden = !measured;
+    if (!measured) return null;
+    const results = new Results(measured, {
+      changed: () => this.stage.invalidate(),
+      look: (...there) => this.lookAt(...there),
+    });
+    this.stage.scene.add(results.traces.group);
+    return results;
   }
 
   async addSmallParts() {
@@ -89,6 +105,7 @@ class Viewer {
     view.apply(stage.camera);
     this.frusta.update(view);
     this.measuring.update(view);
+    this.results?.traces.update(view);
     $("north").style.transform = `rotate(${view.yaw - Math.PI / 2}rad)`;
   }
 
@@ -109,6 +126,7 @@ class Viewer {
       fly: () => this.setFlying(!this.navigation.flying),
       points: () => this.showPoints(!this.points.visible),
       cameras: () => this.showCameras(!this.frusta.group.visible),
+      results_button: () => this.results?.show(!this.results.shown),
       distance: () => this.use("distance"),
       height: () => this.use("height"),
       undo: () => {
@@ -118,7 +136,7 @@ class Viewer {
       screenshot: () => this.screenshot(),
       help_button: () => ($("help").open ? $("help").close() : $("help").showModal()),
     };
-    const keys = { h: "home", f: "fly", p: "points", c: "cameras", m: "distance", t: "height", x: "screenshot", "?": "help_button", Backspace: "undo", Delete: "undo" };
+    const keys = { h: "home", f: "fly", p: "points", c: "cameras", v: "results_button", m: "distance", t: "height", x: "screenshot", "?": "help_button", Backspace: "undo", Delete: "undo" };
     for (const [name, action] of Object.entries(actions)) $(name)?.addEventListener("click", action);
     $("close").addEventListener("click", () => $("help").close());
     addEventListener("keydown", (event) => {
@@ -146,6 +164,39 @@ class Viewer {
       this.choose?.(photo);
     });
     return true;
+  }
+
+  /** Where to turn to from here: with a photo's lens. */
+  pose() {
+    return this.view.poseOf(this.view.lens.rotation ? this.view.lens : this.photos[this.facts.start]);
+  }
+
+  /**
+   * Go to where all of some places are seen.
+   *
+   * @param {Vector3[]} places
+   * @param {Vector3 | null} forward Level; null: as one looks now.
+   * @param {number} pitch Radians.
+   * @param {{x: number, y: number, width: number, height: number}} free The part of the window that they are to fill, by
+   *   its middle and its size, CSS pixels.
+   */
+  lookAt(places, forward, pitch, free) {
+    const to = this.pose();
+    to.size = this.view.size;
+    Object.assign(to, { yaw: forward ? Math.atan2(forward.y, forward.x) : this.view.yaw, pitch, roll: 0 });
+    const box = new Box3().setFromPoints(places);
+    const middle = box.getCenter(new Vector3());
+    const { fx, fy, cx, cy } = to.intrinsics();
+    const { right, up, forward: ahead } = to.axes();
+    let away = 0;
+    for (const place of places) {
+      const from = place.clone().sub(middle);
+      const [across, high, near] = [Math.abs(from.dot(right)), Math.abs(from.dot(up)), from.dot(ahead)];
+      away = Math.max(away, (2 * across * fx) / (FILLED * free.width) - near, (2 * high * fy) / (FILLED * free.height) - near);
+    }
+    to.position = middle.addScaledVector(ahead, -away);
+    to.position.addScaledVector(right, ((cx - free.x) * away) / fx).addScaledVector(up, ((free.y - cy) * away) / fy);
+    this.view.travel(to);
   }
 
   pick(x, y) {
@@ -264,7 +315,7 @@ class Viewer {
         return { position: array(position), yaw, pitch, roll, ...this.view.intrinsics(), ...size, photo: this.photo?.name ?? null };
       },
       setCamera: ({ position, target, yaw, pitch, roll = 0 }) => {
-        const to = this.view.poseOf(this.view.lens.rotation ? this.view.lens : this.photos[this.facts.start]);
+        const to = this.pose();
         to.position = vector(position);
         if (target) to.face(vector(target).sub(to.position).normalize(), this.view.axes().right);
         if (target) to.roll = 0;

@@ -139,12 +139,12 @@ export class Measuring {
     context.font = "600 13px system-ui, sans-serif";
     context.textAlign = "center";
     context.textBaseline = "middle";
-    for (const element of this.layer.querySelectorAll(".measured:not([hidden])")) {
+    for (const element of this.layer.querySelectorAll(".measured:not([hidden]), .named:not([hidden])")) {
       const box = element.getBoundingClientRect();
       context.fillStyle = "rgba(15, 20, 26, 0.85)";
       context.fillRect(box.left, box.top, box.width, box.height);
       context.fillStyle = "#fff";
-      context.fillText(element.textContent, box.left + box.width / 2, box.top + box.height / 2);
+      context.fillText(element.textContent, box.left + box.width / 2, box.top + box.height / 2, box.width);
     }
   }
 }

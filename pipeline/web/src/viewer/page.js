@@ -15,6 +15,11 @@ export function readFacts() {
   return JSON.parse(document.getElementById("scene").textContent);
 }
 
+/** What measured_viewer.py put into the page; null where nothing was measured. */
+export function readMeasurements() {
+  return JSON.parse(document.getElementById("measurements").textContent);
+}
+
 /** Bytes of base64 text, without holding up the page for long. */
 export async function bytesOf(text, progress = () => {}) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);

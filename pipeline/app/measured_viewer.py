@@ -1,0 +1,104 @@
+"""OUT/viewer.html with what was measured on the surface model.
+
+The stage `export` makes the page before there is a surface model, and sections are cut on finished runs, at any time.
+So what was measured is put into the page as it lies in OUT; the artifact that it is a copy of stays as it is. The page
+keeps its time, by which the store takes it for that copy still (``is_copy``), and the same state gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from splatpipe.pipeline.app.measurements import any_measured, is_number, read_measurements, title_of
+from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.web.measured_page import PAGE, with_measurements
+from splatpipe.stages.line import DSM, EXPORT, LINE
+
+SECTION_FIGURES = ("length_m", "share_with_height")
+VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
+PLACES = ("x", "y", "z")
+PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
+
+
+def renew_viewer(out: Path) -> str:
+    """Let OUT/viewer.html show what was measured and still holds, no less and no more.
+
+    Only who holds the lock of OUT may call this.
+
+    Args:
+        out: OUT.
+
+    Returns:
+        What the user should know; empty where all is well, or there is nothing to do.
+
+    Raises:
+        OSError: if the disk is full or not writable; the page is as before.
+    """
+    path = out / PAGE
+    if not path.is_file() or not any_measured(out):
+        return ""
+    page = path.read_bytes()
+    try:
+        renewed = with_measurements(page, shown_measurements(out))
+    except ValueError:
+        return f"{PAGE} is of an earlier version and cannot show what was measured: splatpipe stage export {out}"
+    if renewed != page:
+        stamp = path.stat()
+
+        def fill(file: IO[bytes]) -> None:
+            file.write(renewed)
+            file.flush()  # what is written later would change its time
+            os.utime(file.fileno(), ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+
+        write_durably(path, fill)
+    return ""
+
+
+def shown_measurements(out: Path) -> dict[str, Any] | None:
+    """What the page is to show: of the present surface model, and in the frame of the page. None for nothing."""
+    run = open_run_folder(out, LINE)
+    of_surface, of_page = run.lineage(DSM), run.lineage(EXPORT)
+    surface, frame = of_surface.get("dsm.files"), of_page.get("georef.frame")
+    if surface is None or frame is None:
+        return None
+    sections = read_measurements(out, "sections", surface.digest, frame.digest)
+    volumes = read_measurements(out, "volumes", surface.digest, frame.digest)
+    told = {
+        "sections": [_section(item) for item in sections if _is_section_trace(item.get("trace"))],
+        "volumes": [_volume(item) for item in volumes if _is_polygon_trace(item.get("trace"))],
+    }
+    return told if any(told.values()) else None
+
+
+def _section(item: Mapping[str, Any]) -> dict[str, Any]:
+    sigma_m = item.get("height_sigma_m")
+    figures = {key: item[key] for key in SECTION_FIGURES}
+    figures["height_sigma_m"] = sigma_m if is_number(sigma_m) else None
+    return {"name": title_of(item), **figures, "trace": item["trace"]}
+
+
+def _volume(item: Mapping[str, Any]) -> dict[str, Any]:
+    figures = {key: item[key] for key in VOLUME_FIGURES}
+    return {"name": title_of(item), "base": str(item["base"].get("kind")), **figures, "trace": item["trace"]}
+
+
+def _is_section_trace(trace: Any) -> bool:
+    """Whether the page can draw it: a damaged one may not cost people the rest."""
+    return _has_columns(trace, PROFILE) and _has_columns(trace, POINTS)
+
+
+def _is_polygon_trace(trace: Any) -> bool:
+    return isinstance(trace, list) and all(_has_columns(ring, PLACES) for ring in trace)
+
+
+def _has_columns(trace: Any, names: Sequence[str]) -> bool:
+    """Whether these are there, equally long, and of numbers or None."""
+    if not isinstance(trace, dict) or not all(isinstance(trace.get(name), list) for name in names):
+        return False
+    if not all(value is None or is_number(value) for name in names for value in trace[name]):
+        return False
+    return len({len(trace[name]) for name in names}) == 1

@@ -1,0 +1,119 @@
+"""What was measured on a run's surface model, kept so that later commands can show it: `stages/measured.json`.
+
+`OUT/sections` and `OUT/volumes.json` are for people and their programs. This file has the same figures, and where all
+of it lies in the world frame; with the digests of the surface model and of the frame that it was measured in, for on
+others it would be wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from splatpipe.pipeline.app.page_file import shown
+from splatpipe.pipeline.engine.durable import write_durably
+
+MEASURED = Path("stages/measured.json")
+SECTIONS = "sections"  # the folder in OUT
+VOLUMES = "volumes.json"
+FORMAT = 1
+LARGEST_FILE = 64 << 20  # bytes: ten times the largest that is written
+Kind = Literal["sections", "volumes"]
+Items = list[dict[str, Any]]
+FIGURES: Mapping[Kind, Sequence[str]] = {
+    "sections": ("length_m", "share_with_height"),
+    "volumes": (
+        "polygon",
+        *(f"{kind}_{figure}" for kind in ("cut", "fill", "net") for figure in ("m3", "sigma_m3")),
+        *("area_m2", "share_without_height"),
+    ),
+}
+
+
+def read_measurements(out: Path, kind: Kind, surface: str, frame: str = "") -> Items:
+    """Sections or volumes that belong to a surface model, and whose files have not been removed since.
+
+    Args:
+        out: OUT.
+        kind: Which.
+        surface: Digest of the surface model.
+        frame: Digest of the frame that they are to be shown in; empty for any.
+
+    Returns:
+        Figures of each, with its ``trace``; none where the file is not there, is damaged, or tells of another model.
+    """
+    kept = _kept(out).get(kind)
+    if not isinstance(kept, dict) or not surface or kept.get("surface") != surface:
+        return []
+    if frame and kept.get("frame") != frame:
+        return []
+    items = kept.get("items")
+    if not isinstance(items, list) or not all(_is_whole(item, kind) for item in items):
+        return []
+    if kind == "volumes":
+        return items if (out / VOLUMES).is_file() else []
+    return [item for item in items if (out / SECTIONS / str(item.get("csv"))).is_file()]
+
+
+def any_measured(out: Path) -> bool:
+    """Whether anything was measured, on whatever surface model."""
+    return bool(_kept(out))
+
+
+def outdated(out: Path, surface: str) -> bool:
+    """Whether what was measured lies in OUT still, and is of another surface model."""
+    kept = {kind: found for kind, found in _kept(out).items() if isinstance(found, dict)}
+    there = [kind for kind, name in (("sections", SECTIONS), ("volumes", VOLUMES)) if (out / name).exists()]
+    return any(kept[kind].get("items") and kept[kind].get("surface") != surface for kind in there if kind in kept)
+
+
+def title_of(item: Mapping[str, Any]) -> str:
+    """What pages call a section or a volume."""
+    if "polygon" in item:
+        return shown(item["name"]) or f"Volume {item['polygon']}"
+    return shown(item["name"]).replace("-", " ").capitalize()
+
+
+def write_measurements(out: Path, kind: Kind, digests: tuple[str, str], items: Sequence[Mapping[str, Any]]) -> None:
+    """Keep what was measured in place of what was kept of its kind. Only who holds the lock of OUT may call this.
+
+    Args:
+        out: OUT.
+        kind: Which.
+        digests: Of the surface model, and of the frame.
+        items: As ``read_measurements`` returns them.
+
+    Raises:
+        OSError: if the disk is full or not writable.
+    """
+    value = {**_kept(out), "format": FORMAT, kind: {"surface": digests[0], "frame": digests[1], "items": list(items)}}
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=True)
+    write_durably(out / MEASURED, text)
+
+
+def _is_whole(item: Any, kind: Kind) -> bool:
+    """Whether it has all figures that pages show."""
+    if not isinstance(item, dict) or not isinstance(item.get("name"), str):
+        return False
+    if kind == "volumes" and not isinstance(item.get("base"), dict):
+        return False
+    return all(is_number(item.get(name)) for name in FIGURES[kind])
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a number that a page can show."""
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _kept(out: Path) -> dict[str, Any]:
+    path = out / MEASURED
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            return {}
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) and value.get("format") == FORMAT else {}

@@ -1,0 +1,139 @@
+// What was measured on the surface model: sections and volumes as a list, as lines in place, and a section as a chart.
+// measured_viewer.py puts it into the page.
+
+import { Vector3 } from "three";
+import { Chart } from "./chart.js";
+import { placesOf, Traces } from "./traces.js";
+
+const SECTION_PITCH_RAD = -0.45; // a section is seen from aside, a volume from rather above
+const VOLUME_PITCH_RAD = -0.9;
+const NARROW = "(max-width: 640px), (max-height: 520px)"; // as in viewer.css: there the list waits folded
+
+const $ = (id) => document.getElementById(id);
+
+/** A figure with as many digits as its deviation has a meaning in: that one's first two. */
+function withSigma(value, sigma) {
+  const digits = sigma > 0 ? Math.min(3, Math.max(0, 1 - Math.floor(Math.log10(sigma)))) : 1;
+  return `${value.toFixed(digits)} ± ${sigma.toFixed(digits)}`;
+}
+
+function length(metres) {
+  return metres < 0.1 ? `${(100 * metres).toFixed(1)} cm` : `${metres.toFixed(2)} m`;
+}
+
+function sectionLines({ length_m, share_with_height, height_sigma_m }) {
+  const known = share_with_height < 0.995 ? ` · ${(100 * share_with_height).toFixed(0)} % with heights` : "";
+  return [`${length_m.toFixed(2)} m long${known}`, ...(height_sigma_m === null ? [] : [`heights ± ${length(height_sigma_m)}`])];
+}
+
+function volumeLines(facts) {
+  const told = (kind) => `${withSigma(facts[`${kind}_m3`], facts[`${kind}_sigma_m3`])} m³`;
+  const base = { rim: "the plane through the rim", lowest: "the lowest of the rim", stated: "a stated height" }[facts.base];
+  return [`net ${told("net")}`, `cut ${told("cut")}, fill ${told("fill")}`, `${facts.area_m2.toFixed(1)} m², over ${base ?? "a base"}`];
+}
+
+/** What of the window the list and the photos leave free, CSS pixels. */
+function freeWindow() {
+  const [list, photos, tools] = ["results", "bottom", "tools"].map((id) => $(id).getBoundingClientRect());
+  const aside = list.right < innerWidth / 2;
+  const [left, top] = aside ? [list.right, 0] : [0, list.bottom];
+  const right = aside ? tools.left : innerWidth;
+  return { x: (left + right) / 2, y: (top + photos.top) / 2, width: right - left, height: Math.max(1, photos.top - top) };
+}
+
+export class Results {
+  /**
+   * @param {{sections: object[], volumes: object[]}} measured
+   * @param {{changed: () => void, look: (places: Vector3[], forward: Vector3 | null, pitch: number,
+   *   free: object) => void}} viewer
+   */
+  constructor(measured, viewer) {
+    this.viewer = viewer;
+    this.items = [
+      ...measured.sections.map((facts) => ({ kind: "section", ...facts, lines: sectionLines(facts), traces: [facts.trace] })),
+      ...measured.volumes.map((facts) => ({ kind: "volume", ...facts, lines: volumeLines(facts), traces: facts.trace })),
+    ].filter(({ traces }) => placesOf(traces).length > 1);
+    this.traces = new Traces($("labels"), this.items, viewer.changed);
+    this.chart = new Chart($("chart"), (index) => this.point(index));
+    this.buttons = this.items.map((item, index) => this.button(item, index));
+    this.chosen = null;
+    $("fold").addEventListener("click", () => this.unfold($("fold").getAttribute("aria-expanded") !== "true"));
+    $("fold").textContent = this.title();
+    this.show(this.items.length > 0);
+    $("results_button").hidden = !this.items.length;
+    this.unfold(!matchMedia(NARROW).matches);
+  }
+
+  title() {
+    const count = (kind) => this.items.filter((item) => item.kind === kind).length;
+    const told = (number, one) => (number ? [`${number} ${one}${number === 1 ? "" : "s"}`] : []);
+    return [...told(count("section"), "section"), ...told(count("volume"), "volume")].join(", ");
+  }
+
+  button({ kind, name, lines }, index) {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.className = kind;
+    const title = document.createElement("b");
+    title.textContent = name;
+    const rest = lines.map((text) => Object.assign(document.createElement("span"), { textContent: text }));
+    button.append(title, ...rest);
+    button.addEventListener("click", () => this.choose(index === this.chosen ? null : index));
+    const item = document.createElement("li");
+    item.append(button);
+    $("results_list").append(item);
+    return { button, item };
+  }
+
+  /** Go there, and show its chart if it has one; null: nothing is chosen any more. */
+  choose(index) {
+    this.chosen = index;
+    this.traces.choose(index);
+    this.traces.point(null);
+    this.buttons.forEach(({ button }, i) => button.setAttribute("aria-pressed", String(i === index)));
+    const found = index === null ? null : this.items[index];
+    $("profile").hidden = found?.kind !== "section";
+    if (!found) return;
+    if (found.kind === "section") {
+      this.buttons[index].item.append($("profile"));
+      this.chart.show(found.trace);
+    }
+    const places = placesOf(found.traces);
+    const [start, end] = [places[0], places.at(-1)];
+    const aside = found.kind === "section" ? new Vector3(start.y - end.y, end.x - start.x, 0) : null; // start on the left
+    this.viewer.look(places, aside, aside ? SECTION_PITCH_RAD : VOLUME_PITCH_RAD, freeWindow());
+    this.buttons[index].item.scrollIntoView({ block: "nearest" });
+  }
+
+  /** Tell of a place of the chosen section. */
+  point(index) {
+    const trace = this.items[this.chosen]?.trace;
+    const reading = $("reading");
+    if (index === null || !trace) {
+      reading.textContent = `Metres; heights ${this.chart.enlarged.toFixed(1)} times enlarged. Point at the chart to read it.`;
+      this.traces.point(null);
+      return;
+    }
+    const [height, sigma] = [trace.height[index], trace.sigma[index]];
+    const told = height === null ? "no height here" : `height ${height.toFixed(2)} m${sigma === null ? "" : ` ± ${length(sigma)}`}`;
+    reading.textContent = `${trace.distance[index].toFixed(2)} m: ${told}`;
+    this.traces.point(height === null ? null : new Vector3(trace.x[index], trace.y[index], trace.z[index]));
+  }
+
+  unfold(open) {
+    $("fold").setAttribute("aria-expanded", String(open));
+    $("results_list").hidden = !open;
+  }
+
+  get shown() {
+    return this.traces.group.visible;
+  }
+
+  /** The lines and the list, or neither. */
+  show(shown) {
+    if (!this.items.length) return;
+    this.traces.show(shown);
+    $("results").hidden = !shown;
+    $("results_button").setAttribute("aria-pressed", String(shown));
+  }
+}
