@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
@@ -68,9 +69,8 @@ def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
         return
     depth = render()
     there = np.isfinite(depth) & (depth > 0.0)
-    aside = path.with_suffix(".part.npy")
-    np.save(aside, np.where(there, 1.0 / np.where(there, depth, 1.0), 0.0).astype(np.float32))
-    aside.replace(path)
+    inverse = np.where(there, 1.0 / np.where(there, depth, 1.0), 0.0).astype(np.float32)
+    write_durably(path, partial(np.save, arr=inverse))
 
 
 def _kept(folder: Path, number: int) -> Inverse:

@@ -13,6 +13,7 @@ import numpy as np
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.surface.fusion import FusedPoints, finest_of_cubes, fused, joined
 from splatpipe.pipeline.surface.grid import make_grid
 from splatpipe.pipeline.surface.lattice import Lattice
@@ -23,7 +24,6 @@ from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.sources import Relief
 from splatpipe.pipeline.surface.tiles import Tile, tiled
-from splatpipe.pipeline.surface.whole_file import whole_file
 from splatpipe.pipeline.survey.frames import Frame
 
 SIDE = 2048  # cells of a part of the plan, in which each photo is read once: some 6 million points, 0.4 GB
@@ -79,8 +79,7 @@ def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict
         if not path.is_file():
             photos = photos or photo_set(task.photos, task.spacing_m, task.threads)
             chunk = _part(task, photos, (lattice, relief), part)
-            with whole_file(path) as aside, aside.open("wb") as file:
-                np.savez(file, **vars(chunk))
+            save_arrays(path, **vars(chunk))
         report.progress(done + 1, len(parts), "dense cloud", "parts")
     count = write_cloud(out / "cloud.laz", _kept(work, len(parts)), grid, UNDATED)
     return {"points": count, "spacing_m": task.spacing_m, "crs": grid.crs.horizontal.name}

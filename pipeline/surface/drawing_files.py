@@ -35,7 +35,7 @@ from splatpipe.pipeline.surface.drawing import (
     Drawing,
     Stroke,
 )
-from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.surface.whole_file import whole_file, write_whole_text
 
 DXF_VERSION = "R2000"  # the oldest with a drawing's unit and pictures, and so read by the most programs
 METRES = 6  # of $INSUNITS
@@ -174,8 +174,7 @@ def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "
             f'<text x="{x:.2f}" y="{y:.2f}" font-family="sans-serif" font-size="{label.size_mm * 1.4:.2f}"'
             f' text-anchor="{label.anchor}">{escape(label.text)}</text>'
         )
-    with whole_file(path) as aside:
-        aside.write_text("\n".join([*parts, "</svg>\n"]), encoding="utf-8")
+    write_whole_text(path, "\n".join([*parts, "</svg>\n"]))
 
 
 def _svg_path(stroke: Stroke, line: np.ndarray) -> str:

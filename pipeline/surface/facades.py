@@ -31,7 +31,7 @@ from splatpipe.pipeline.surface.grid import DIGITS
 from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.walls import Wall, find_walls, named, stated_wall
-from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.surface.whole_file import write_whole_text
 
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
@@ -163,5 +163,4 @@ def _write(folder: Path, elevation: Elevation, crs: MapCrs) -> None:
     write_picture(folder / files["picture"], elevation)
     write_dxf_drawing(folder / files["dxf"], drawing)
     write_svg_drawing(folder / files["svg"], drawing, elevation.colour, f"Façade {name}")
-    with whole_file(folder / f"{name}.json") as aside:
-        aside.write_text(json_text(elevation_facts(elevation, crs, files)), encoding="utf-8")
+    write_whole_text(folder / f"{name}.json", json_text(elevation_facts(elevation, crs, files)))

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.surface.blocks import Box, surface_blocks
 from splatpipe.pipeline.surface.mesh_files import write_mesh
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
@@ -22,7 +23,6 @@ from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, without_crumbs
 from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
-from splatpipe.pipeline.surface.whole_file import whole_file
 from splatpipe.pipeline.survey.frames import Frame
 
 MOST_BLOCKS = 120_000  # of voxels: 0.5 GB, and about 5 million triangles before decimation; beyond it voxels are larger
@@ -93,8 +93,7 @@ def make_mesh(task: MeshTask, work: Path, out: Path, facts: Mapping[str, Any], r
 
 
 def _keep(path: Path, mesh: TriangleMesh, voxel_m: float) -> None:
-    with whole_file(path) as aside, aside.open("wb") as file:
-        np.savez(file, vertices=mesh.vertices, triangles=mesh.triangles, voxel_m=np.float64(voxel_m))
+    save_arrays(path, vertices=mesh.vertices, triangles=mesh.triangles, voxel_m=np.array(voxel_m))
 
 
 def _kept(path: Path) -> tuple[TriangleMesh, float]:

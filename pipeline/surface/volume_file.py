@@ -10,7 +10,7 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.surface_file import SurfaceFile
 from splatpipe.pipeline.surface.volumes import Amount, Kind, Volume, measure_volume
-from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.surface.whole_file import write_whole_text
 
 FORMAT = 1
 DIGITS = 4
@@ -46,8 +46,7 @@ def write_volumes(
         volume = measure_volume(surface, PlanArea(area.axes, (polygon,)), crs, base, datum_sigma_m)
         facts.append({"polygon": number, **volume_facts(volume)})
     value = {"format": FORMAT, "crs": crs.horizontal.name, "heights": crs.described_heights(), "uncertainty": HOW}
-    with whole_file(path) as aside:
-        aside.write_text(json_text({**value, "volumes": facts}), encoding="utf-8")
+    write_whole_text(path, json_text({**value, "volumes": facts}))
     return facts
 
 
