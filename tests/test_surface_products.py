@@ -188,7 +188,9 @@ def test_sheets_of_a_grid_agree_where_they_meet() -> None:
     whole = np.full((grid.height, grid.width), np.nan)
     for sheet in grid_sheets(grid, low, high, side=25):
         plane, part = sheet.sheet, sheet.part
-        moved = Capture(plane.depths(sources()), plane.lattice, plane.relief, Shelf(1 << 30))
+        moved = Capture(
+            [plane.moved_depths(source) for source in sources()], plane.lattice, plane.relief, Shelf(1 << 30)
+        )
         found = tile_heights(moved, Tile(0, 0, part.height, part.width))
         heights = sheet.heights(found.tile, found.height)
         whole[part.row : part.row + part.height, part.column : part.column + part.width] = heights

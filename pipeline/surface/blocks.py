@@ -11,12 +11,11 @@ from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.photo_set import PhotoSet, place_of
-from splatpipe.pipeline.surface.sources import DepthMap
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap
 
 SIDE = 8  # voxels of a block: a surface fills smaller blocks better than open3d's usual 16
 BAND = 3.0  # voxels on either side of a surface that know how far off it is
 LEAST_PHOTOS = 2  # that have to see a surface in a block: each of their depths is confirmed by others already
-LEAST_CONFIDENCE = 2  # other photos that confirm a depth
 EVERY = 3  # pixels, of which one is looked at: blocks are wider
 LEAST_GROWTH = 1.05  # of voxels that were too small
 BITS = 21  # of a block's number along an axis: two million
@@ -43,7 +42,7 @@ class Box:
 
 def depths_in(box: Box, found: DepthMap) -> Float32[np.ndarray, "h w"]:
     """Depths of a photo that others confirm and that lie in a box; 0 elsewhere."""
-    sure = (found.confidence >= LEAST_CONFIDENCE) & (found.depth > 0.0)
+    sure = (found.confidence >= LEAST_CONFIRMED) & (found.depth > 0.0)
     row, column = np.nonzero(sure)
     xyz = _places(found, row, column)
     inside = ((xyz >= box.low[:, None]) & (xyz < box.high[:, None])).all(axis=0)

@@ -79,7 +79,7 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
     making = SheetWork(sheets, task.site, task.area, TILE, work, report, "surface model")
 
     def heights(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
-        sources = sheet.sheet.depths(task.sources)
+        sources = [sheet.sheet.moved_depths(source) for source in task.sources]
         capture = Capture(sources, sheet.sheet.lattice, sheet.sheet.relief, Shelf(HELD_BYTES))
         for part in surface_heights(capture, tiles, task.threads):
             sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))

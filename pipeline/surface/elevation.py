@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -22,7 +22,7 @@ from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import Sheet
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf
+from splatpipe.pipeline.surface.sources import DepthMap, Relief, Shelf
 from splatpipe.pipeline.surface.walls import Wall
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sills and cornices; balconies do not
@@ -157,10 +157,4 @@ def _before(sheet: Sheet, photos: Photos) -> tuple[list[PhotoSource], Float64[np
     rows = [
         row for row, source in enumerate(photos.sources) if sheet.place(source.camera.centre())[2] > sheet.relief.high_m
     ]
-    moved = [_moved(sheet, photos.sources[row]) for row in rows]
-    return moved, photos.gains[rows]
-
-
-def _moved(sheet: Sheet, source: PhotoSource) -> PhotoSource:
-    depths: DepthSource | None = None if source.depths is None else sheet.depths([source.depths])[0]
-    return replace(source, camera=sheet.moved(source.camera), depths=depths)
+    return [sheet.moved_photo(photos.sources[row]) for row in rows], photos.gains[rows]

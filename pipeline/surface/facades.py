@@ -25,7 +25,7 @@ from splatpipe.pipeline.surface.elevation_files import (
     write_facades,
     write_picture,
 )
-from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
 from splatpipe.pipeline.surface.facets import Facets, upright_facets
 from splatpipe.pipeline.surface.grid import DIGITS
 from splatpipe.pipeline.surface.map_crs import MapCrs
@@ -35,7 +35,6 @@ from splatpipe.pipeline.surface.whole_file import write_whole_text
 
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
-PLACES = 4000  # that photos' exposures are compared at
 LONGEST_TEXT = 10_000  # characters of stated lines
 Line = tuple[float, float, float, float]
 
@@ -86,7 +85,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     if not walls:
         report.progress(1, 1, "looking for walls")
         report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
-    places = facets.places[:: max(1, len(facets) // PLACES)]
+    places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
     photos = Photos(task.photos, exposure_gains(task.photos, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
     for number, wall in enumerate(walls):

@@ -78,15 +78,7 @@ class Capture:
 
     def depths(self, number: int) -> DepthMap:
         """A photo's depths, loaded if they are not at hand."""
-        return self.shelf.get(number, partial(_loaded, self.sources[number]))
-
-
-def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
-    found = source.load()
-    shape = (found.camera.height, found.camera.width)
-    if found.depth.shape != shape or found.confidence.shape != shape:
-        raise ValueError(f"{found.camera.name}: depths of {found.depth.shape} for a camera of {shape}")
-    return found, found.depth.nbytes + found.confidence.nbytes
+        return self.shelf.get(number, self.sources[number].loaded)
 
 
 def surface_heights(capture: Capture, tiles: Sequence[Tile], threads: int) -> Iterator[Heights]:

@@ -16,7 +16,7 @@ from rasterio.windows import Window
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.dsm import HELD_BYTES, height_range
-from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
 from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.height_field import HeightField
@@ -33,7 +33,6 @@ from splatpipe.pipeline.survey.frames import Frame
 
 PIXEL_BYTES = 1 << 30  # of decoded photos in memory; all together lie on the disk where they are more
 AROUND = 3  # cells of the surface model more than the pixels drawn need: heights between cells
-COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +110,7 @@ def _colours(
 ) -> Iterator[tuple[Tile, Arrays]]:
     """The colours of a sheet's tiles."""
     plane = sheet.sheet
-    moved = iter(plane.depths([photo.depths for photo in task.photos if photo.depths is not None]))
-    photos = [
-        replace(photo, camera=plane.moved(photo.camera), depths=photo.depths and next(moved)) for photo in task.photos
-    ]
+    photos = [plane.moved_photo(photo) for photo in task.photos]
     surface = _surface(sheet, task.dsm, heights)
     album = Album(photos, surface, plane.lattice, plane.relief, gains, pixels, Shelf(HELD_BYTES))
     for part in orthophotos(album, tiles, task.threads):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter
@@ -25,25 +25,10 @@ from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.undistortion import Placed, place, read_flown
 from splatpipe.pipeline.surface.photo_samples import Lens, PhotoSource
 from splatpipe.pipeline.surface.site import Site, load_site
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, MetricMap
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 
 LENS_STEP = 8.0  # pixels
-
-
-@dataclass(frozen=True, eq=False)
-class MetricMap:
-    """A depth map in local metres.
-
-    Attributes:
-        camera: In the map's grid.
-        depth: Along the camera's z, metres; 0 where none is known.
-        confidence: How many other photos confirm it.
-    """
-
-    camera: Camera
-    depth: Float32[np.ndarray, "h w"]
-    confidence: UInt8[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)

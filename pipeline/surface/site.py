@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthSource
 
 SAMPLES = 3000  # depths of a photo, evenly
 CELL_GSD = 100.0  # ground sample distances of a plan cell: so many samples of a photo lie in each that it sees
@@ -30,7 +30,6 @@ LEAST_PART = 0.02  # of what is seen: smaller parts that lie by themselves are l
 NOISE = 0.001  # of the samples, the lowest and the highest, that may be wrong
 MARGIN = 0.1  # of the relief, below and above, for what samples missed,
 LEAST_MARGIN_M = 3.0  # and at least so much: a mast or a well
-CONFIRMED = 2  # photos that confirm a depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +153,7 @@ def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
     row, column = (grid.ravel() for grid in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
-    sure = (found.depth[row, column] > 0.0) & (found.confidence[row, column] >= CONFIRMED)
+    sure = (found.depth[row, column] > 0.0) & (found.confidence[row, column] >= LEAST_CONFIRMED)
     row, column = row[sure], column[sure]
     depth = found.depth[row, column].astype(np.float64)
     points = camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), depth)
