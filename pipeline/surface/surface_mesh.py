@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.mvs.array_file import save_arrays
-from splatpipe.pipeline.surface.blocks import Box, surface_blocks
+from splatpipe.pipeline.surface.blocks import surface_blocks
 from splatpipe.pipeline.surface.mesh_files import write_mesh
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet
@@ -103,7 +103,7 @@ def _kept(path: Path) -> tuple[TriangleMesh, float]:
 
 def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[TriangleMesh, float]:
     """The mesh before it is decimated, and the side of its voxels, metres."""
-    box = Box(*task.site.box)
+    box = task.site.box
     blocks = surface_blocks(photos, box, task.voxel_m, MOST_BLOCKS, task.threads)
     if blocks.voxel_m > task.voxel_m:
         report.note(f"The mesh has voxels of {blocks.voxel_m:.3g} m, not {task.voxel_m:.3g} m: the site is large.")
