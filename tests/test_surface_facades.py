@@ -31,6 +31,7 @@ from splatpipe.pipeline.surface.walls import LEAST_HEIGHT_M, Wall, find_walls
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from house_photos import run_surface
 from house_site import EAVES_M, RIDGE_M, ROOF, WALLS, ExactDepths, depths_of, photo_camera, photo_of
 
 PIXEL_M = 0.04
@@ -268,7 +269,7 @@ class Quiet:
 
 
 def task(*lines: tuple[float, float, float, float], area: PlanArea | None = None) -> FacadesTask:
-    return FacadesTask(photos(), area, crs(), PIXEL_M, lines, threads=1)
+    return FacadesTask(run_surface(FRAME, photos(), area), PIXEL_M, lines, threads=1)
 
 
 @cache

@@ -26,6 +26,7 @@ from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from house_photos import run_surface
 from house_site import cameras, depths_of, edge_distance, photo_of, true_height, true_orthophoto
 
 FRAME = Frame("arbitrary", Similarity.identity(), metres=True)
@@ -61,6 +62,10 @@ def sources() -> tuple[DepthSource, ...]:
     return tuple(DepthSource(each.camera, lambda each=each: each) for each in found)
 
 
+def photos() -> list[PhotoSource]:
+    return [PhotoSource(source.camera, lambda source=source: photo_of(source.camera), source) for source in sources()]
+
+
 @cache
 def site() -> Site:
     found = survey_site(sources(), 1.0, None, 1)
@@ -69,13 +74,12 @@ def site() -> Site:
 
 
 def dsm(folder: Path, area: PlanArea | None = HOUSE, report: Any = None) -> dict[str, Any]:
-    task = DsmTask(FRAME, site(), sources(), area, CELL_M, 1)
+    task = DsmTask(run_surface(FRAME, photos(), area), site(), CELL_M, 1)
     return make_dsm(task, folder / "work", folder, report or Told())
 
 
 def ortho(folder: Path, report: Any = None) -> dict[str, Any]:
-    photos = [PhotoSource(source.camera, lambda source=source: photo_of(source.camera), source) for source in sources()]
-    task = OrthoTask(FRAME, site(), photos, folder / "dsm.tif", CELL_M, HOUSE, CELL_M / 2, 1)
+    task = OrthoTask(run_surface(FRAME, photos(), HOUSE), site(), folder / "dsm.tif", CELL_M, CELL_M / 2, 1)
     return make_ortho(task, folder / "ortho_work", folder, report or Told())
 
 

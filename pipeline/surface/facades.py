@@ -28,8 +28,8 @@ from splatpipe.pipeline.surface.elevation_files import (
 from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
 from splatpipe.pipeline.surface.facets import Facets, upright_facets
 from splatpipe.pipeline.surface.grid import DIGITS
-from splatpipe.pipeline.surface.map_crs import MapCrs
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
+from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.walls import Wall, find_walls, named, stated_wall
 from splatpipe.pipeline.surface.whole_file import write_whole_text
 
@@ -44,18 +44,14 @@ class FacadesTask:
     """What façades are made from.
 
     Attributes:
-        photos: With their depths, local metres, always in the same order.
-        area: Walls whose middles lie outside of it are not drawn; None for all.
-        crs: Of corners and lines.
+        surface: The run's photos and depths; walls whose middles lie outside of its area are not drawn.
         pixel_m: Side of a pixel of the elevations; what it becomes has three digits.
         lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
             found.
         threads: Tiles at a time.
     """
 
-    photos: Sequence[PhotoSource]
-    area: PlanArea | None
-    crs: MapCrs
+    surface: RunSurface
     pixel_m: float
     lines: Sequence[Line]
     threads: int
@@ -79,14 +75,15 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         MachineError, OSError: if the disk is full or not writable.
     """
     report.progress(0, 1, "looking for walls")
+    crs, sources = open_map(task.surface.frame), task.surface.photos
     pixel_m = float(f"{task.pixel_m:.{DIGITS}g}")
-    facets = upright_facets([photo.depths for photo in task.photos if photo.depths is not None], task.threads)
-    walls = stated_walls(task.lines, facets, task.crs) if task.lines else _within(find_walls(facets), task.area)
+    facets = upright_facets(task.surface.depths, task.threads)
+    walls = stated_walls(task.lines, facets, crs) if task.lines else _within(find_walls(facets), task.surface.area)
     if not walls:
         report.progress(1, 1, "looking for walls")
         report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
     places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
-    photos = Photos(task.photos, exposure_gains(task.photos, places, 2.0 * pixel_m, task.threads), task.threads)
+    photos = Photos(sources, exposure_gains(sources, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
     for number, wall in enumerate(walls):
 
@@ -95,9 +92,9 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
 
         own = out / f"{wall.name}.json"
         if not own.is_file():
-            _write(out, draw_elevation(wall, pixel_m, photos, progress), task.crs)
+            _write(out, draw_elevation(wall, pixel_m, photos, progress), crs)
         facts.append(json.loads(own.read_text(encoding="utf-8")))
-    write_facades(out / LIST, facts, task.crs)
+    write_facades(out / LIST, facts, crs)
     return facts
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from splatpipe.pipeline.surface.photo_samples import linear
 from splatpipe.pipeline.surface.triangles import ColouredMesh
 from splatpipe.pipeline.surface.whole_file import whole_file
 from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.georeference import georeference
-from splatpipe.pipeline.survey.handover import ply_comments
+from splatpipe.pipeline.survey.handover import georef_facts, ply_comments
 from splatpipe.pipeline.survey.sparse_scene import GLTF_FROM_WORLD
 
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125  # glTF's component types
@@ -31,14 +30,14 @@ MOST_SHORT = 65535
 UNLIT = "KHR_materials_unlit"
 
 
-def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, facts: Mapping[str, Any]) -> None:
+def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, boundary: Path | None) -> None:
     """Write `mesh.glb`, `mesh.ply` and `georef.json`, which places them, into a folder.
 
     Args:
         folder: Where.
         made: In the frame's local metres.
         frame: georef's.
-        facts: What `georef.json` says besides: the uncertainty, a boundary.
+        boundary: `georef.boundary`; None where the run has no such part.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -49,7 +48,7 @@ def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, facts: Mapping[st
         _write_ply(file, made, ply_comments(frame, antialias=False))
     vertices = made.mesh.vertices
     box = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
-    write_json(folder / "georef.json", {**georeference(frame, box), **facts})
+    write_json(folder / "georef.json", georef_facts(frame, box, boundary))
 
 
 def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
