@@ -82,6 +82,8 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     if not walls:
         report.progress(1, 1, "looking for walls")
         report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
+        write_facades(out / LIST, [], crs)
+        return []
     places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
     photos = Photos(sources, exposure_gains(sources, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
@@ -112,8 +114,10 @@ def parse_lines(text: str) -> list[Line]:
     Raises:
         UsageError: if it is anything else.
     """
+    if len(text) > LONGEST_TEXT:
+        raise UsageError(f"{len(text):,} characters of lines are too many.", hint="Draw them in several runs.")
     lines: list[Line] = []
-    for part in text[:LONGEST_TEXT].split(";") if text.strip() else ():
+    for part in text.split(";") if text.strip() else ():
         try:
             x1, y1, x2, y2 = (float(number) for number in part.split(","))
         except ValueError:
