@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
@@ -21,7 +21,7 @@ from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import grid_sheets
 from splatpipe.pipeline.surface.site import Site, load_site, save_site, survey_site
-from splatpipe.pipeline.surface.sources import DepthSource, Shelf
+from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, Shelf
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
@@ -115,6 +115,15 @@ def test_a_site_ends_at_its_boundary() -> None:
     found = survey_site(sources(), 1.0, HOUSE, 1)
     assert found is not None
     assert np.abs(found.reach).max() <= 5.5
+
+
+def test_depths_that_reach_too_far_for_a_site_are_refused() -> None:
+    found = sources()[0].load()
+    pose = found.camera.cam_from_world.copy()
+    pose[:3, 3] -= pose[:3, :3] @ [100_000.0, 100_000.0, 0.0]
+    away = MetricMap(replace(found.camera, cam_from_world=pose), found.depth, found.confidence)
+    with pytest.raises(SplatpipeError, match="too far"):
+        survey_site([sources()[0], DepthSource(away.camera, lambda: away)], 1.0, None, 1)
 
 
 def test_a_site_is_read_as_it_was_written(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthS
 
 SAMPLES = 3000  # depths of a photo, evenly
 CELL_GSD = 100.0  # ground sample distances of a plan cell: so many samples of a photo lie in each that it sees
+MOST_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
 LEAST_PHOTOS = 3  # that see a place
 FARTHEST = 4.0  # pixels on the ground so many times the usual are of the far land, which no product shows
 LEAST_PART = 0.02  # of what is seen: smaller parts that lie by themselves are left out
@@ -99,7 +100,7 @@ def load_site(path: Path) -> tuple[Site, float] | None:
         if told is None:
             return None
         shape = int(told["rows"]), int(told["columns"])
-        bits = np.unpackbits(np.frombuffer(bytes.fromhex(told["covered"]), np.uint8), count=shape[0] * shape[1])
+        bits = np.unpackbits(np.frombuffer(bytes.fromhex(told["covered"]), np.uint8))[: shape[0] * shape[1]]
         gsd, low, high, cell, dsm_cell = (
             float(told[name]) for name in ("gsd_m", "low_m", "high_m", "cell_m", "dsm_cell_m")
         )
@@ -166,7 +167,7 @@ def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
 def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "rows columns"]:
     """Cells that enough photos see and that are not off by themselves."""
     columns, rows = cell.max(axis=0) + 1
-    if rows * columns > 1 << 28:
+    if rows * columns > MOST_CELLS:
         raise SplatpipeError("The photos' depths reach too far for a surface.", "Set a --boundary.")
     place = cell[:, 1] * columns + cell[:, 0]
     pairs = np.unique(np.stack([place, number], axis=1), axis=0)
