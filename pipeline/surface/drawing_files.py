@@ -133,7 +133,7 @@ def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "
     Args:
         path: Where.
         drawing: What.
-        colours: The picture that it places; None without one.
+        colours: The picture that it places, transparent where its last channel is 0; None without one.
         title: For readers of the file.
 
     Raises:
@@ -187,9 +187,7 @@ def _svg_path(stroke: Stroke, line: np.ndarray) -> str:
 
 def _embedded(colours: UInt8[np.ndarray, "h w 4"]) -> str:
     """A picture as a data URL: JPEG on white, which is a fifth of a PNG."""
-    picture = Image.fromarray(colours)
-    white = Image.new("RGBA", picture.size, (255, 255, 255, 255))
-    flat = Image.alpha_composite(white, picture).convert("RGB")
+    flat = Image.fromarray(np.where(colours[..., 3:] > 0, colours[..., :3], np.uint8(255)))
     flat.thumbnail((MOST_EMBEDDED, MOST_EMBEDDED))
     kept = io.BytesIO()
     flat.save(kept, "JPEG", quality=JPEG_QUALITY)
