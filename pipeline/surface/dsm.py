@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
@@ -83,17 +84,9 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
             yield part.tile, {"height": over, "confidence": confidence}
 
     making.run(heights)
-    with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
-        for part, arrays in making.finished():
-            file.write(part, arrays["height"])
-    known, total, sigmas = 0, 0, np.zeros(MOST_MILLIMETRES + 1, np.int64)
-    with raster_file(out / "dsm_confidence.tif", grid, CONFIDENCE) as file:
-        for part, arrays in making.finished():
-            file.write(part, np.moveaxis(arrays["confidence"], -1, 0))
-            counts = np.bincount(arrays["confidence"][..., 1].ravel(), minlength=len(sigmas))
-            known, total = known + int(counts[1:].sum()), total + int(counts.sum())
-            sigmas[1:] += counts[1:]
+    sigmas = _write_rasters(making, out, grid)
     _write_contours(out, grid, report)
+    known = int(sigmas.sum())
     typical = int(np.searchsorted(np.cumsum(sigmas), known / 2)) / MILLIMETRES if known else None
     return {
         "cell": grid.cell,
@@ -107,6 +100,20 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
         "crs": grid.crs.horizontal.name,
         "heights": grid.crs.described_heights(),
     }
+
+
+def _write_rasters(making: SheetWork, out: Path, grid: Grid) -> Int64[np.ndarray, " 65536"]:
+    """Write both rasters; how many cells have an expected deviation of so many millimetres, none of 0."""
+    with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
+        for part, arrays in making.finished():
+            file.write(part, arrays["height"])
+    sigmas = np.zeros(MOST_MILLIMETRES + 1, np.int64)
+    with raster_file(out / "dsm_confidence.tif", grid, CONFIDENCE) as file:
+        for part, arrays in making.finished():
+            file.write(part, np.moveaxis(arrays["confidence"], -1, 0))
+            sigmas += np.bincount(arrays["confidence"][..., 1].ravel(), minlength=len(sigmas))
+    sigmas[0] = 0  # where there is no height
+    return sigmas
 
 
 def _write_contours(out: Path, grid: Grid, report: Reporter) -> None:

@@ -11,7 +11,7 @@ import json
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -56,9 +56,22 @@ def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
     light = np.round(linear(made.colours / 255.0) * MOST_SHORT).astype("<u2")
     colours = np.column_stack([light, np.full(len(light), MOST_SHORT, "<u2")])  # 8 bytes a vertex: aligned
     triangles = made.mesh.triangles.astype("<u4")
+    arrays = (positions, colours, triangles)
+    text = json.dumps(_scene(*arrays), separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    length = sum(each.nbytes for each in arrays)
+    size = 12 + 8 + len(text) + 8 + length  # whole multiples of 4, all of them
+    file.write(struct.pack("<III", MAGIC, 2, size) + struct.pack("<II", len(text), JSON_CHUNK) + text)
+    file.write(struct.pack("<II", length, BINARY_CHUNK))
+    for each in arrays:
+        file.write(np.ascontiguousarray(each).data)
+
+
+def _scene(positions: np.ndarray, colours: np.ndarray, triangles: np.ndarray) -> dict[str, Any]:
+    """glTF's description of a mesh whose arrays follow each other in one buffer."""
     lengths = [each.nbytes for each in (positions, colours, triangles)]
     starts = np.concatenate([[0], np.cumsum(lengths)]).tolist()
-    scene = {
+    return {
         "asset": {"version": "2.0", "generator": "splatpipe"},
         "extensionsUsed": [UNLIT],
         "scene": 0,
@@ -98,13 +111,6 @@ def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
         ],
         "buffers": [{"byteLength": starts[-1]}],
     }
-    text = json.dumps(scene, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + starts[-1]  # whole multiples of 4, all of them
-    file.write(struct.pack("<III", MAGIC, 2, size) + struct.pack("<II", len(text), JSON_CHUNK) + text)
-    file.write(struct.pack("<II", starts[-1], BINARY_CHUNK))
-    for each in (positions, colours, triangles):
-        file.write(np.ascontiguousarray(each).data)
 
 
 def _write_ply(file: BinaryIO, made: ColouredMesh, comments: Sequence[str]) -> None:
