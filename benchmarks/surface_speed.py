@@ -25,8 +25,7 @@ from splatpipe.pipeline.surface.heights import Capture, surface_heights
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.run_sources import MetricMap
-from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
+from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, Relief, Shelf
 
 GSD_M = 0.028  # of the original photos, at the house
 HALF_M = 9.0  # of the part's side
@@ -54,8 +53,7 @@ def heights_of(sources: list[DepthSource], lattice: Lattice) -> HeightField:
     height = np.full((lattice.height, lattice.width), np.nan, np.float32)
     capture = Capture(sources, lattice, RELIEF, Shelf(HELD_BYTES))
     for part in surface_heights(capture, list(lattice.tiles(HEIGHTS_TILE)), threads=1):
-        rows, columns = slice(part.tile.row, None), slice(part.tile.column, None)
-        height[rows, columns][: part.tile.height, : part.tile.width] = part.height
+        height[part.tile.slices] = part.height
     return HeightField(lattice, height)
 
 

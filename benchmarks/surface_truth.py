@@ -38,7 +38,6 @@ from triangle_distances import areas, spread, surface_of
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 
 CRS = "EPSG:32633"  # of the demo, where no product tells another
-MESH_PLACES_A_GSD = 1.0  # spread over a mesh, a square of the GSD
 MOST_MESH_PLACES = 4_000_000
 PRODUCTS = ("dsm", "ortho", "facades", "cloud", "mesh")
 

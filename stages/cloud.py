@@ -18,11 +18,9 @@ def run(config: CloudConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
-    opened = open_surveyed(inputs, report) if config.enabled else None
+    opened = open_surveyed(config.enabled, inputs, report)
     if opened is None:
-        report.progress(1, 1, "nothing is made", "steps")
         return {"points": 0}
     surface, site, _ = opened
-    spacing_m = config.spacing_m or site.gsd_m
-    task = CloudTask(surface.frame, site, surface.photos, surface.area, spacing_m, inputs.machine.threads)
+    task = CloudTask(surface, site, config.spacing_m or site.gsd_m, inputs.machine.threads)
     return make_cloud(task, out / "parts", out / "files", report)

@@ -34,5 +34,5 @@ def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summa
         return {"cells": 0}
     cell_m = config.cell_m or max(CELL_GSD, surface.finer) * site.gsd_m
     save_site(out / "site.json", site, cell_m)
-    task = DsmTask(surface.frame, site, surface.depths, surface.area, cell_m, inputs.machine.threads)
+    task = DsmTask(surface, site, cell_m, inputs.machine.threads)
     return {**make_dsm(task, out / "sheets", out / "files", report), "gsd_m": round(site.gsd_m, 5)}

@@ -25,11 +25,11 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.georeference import georeference, scene_box, told_in_a_line
+from splatpipe.pipeline.survey.georeference import scene_box, told_in_a_line
 from splatpipe.pipeline.survey.handover import (
-    boundary_facts,
     bounded_comments,
     cameras_json,
+    georef_facts,
     in_world,
     inside_first,
     ply_comments,
@@ -75,9 +75,8 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))
     centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
     box = scene_box(frame.world_from_model.apply(points.xyz), centres)
-    placed = georeference(frame, box)
-    bounded = {} if area is None else {"boundary": boundary_facts(area, inputs["georef.boundary"])}
-    write_json(out / "georef.json", {**placed, "uncertainty": frame.residuals.get("uncertainty"), **bounded})
+    placed = georef_facts(frame, box, inputs.parts.get("georef.boundary"))
+    write_json(out / "georef.json", placed)
     if frame.origin is not None:
         report.note(told_in_a_line(placed))
     report.progress(2, 4, "collecting the figures", "files")

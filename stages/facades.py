@@ -6,7 +6,6 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.surface.facades import FacadesTask, make_facades, parse_lines
-from splatpipe.pipeline.surface.map_crs import open_map
 from splatpipe.pipeline.surface.options import FacadesConfig
 from splatpipe.pipeline.surface.run_sources import open_surveyed
 
@@ -19,15 +18,13 @@ def run(config: FacadesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
-    opened = open_surveyed(inputs, report) if config.enabled else None
+    opened = open_surveyed(config.enabled, inputs, report)
     if opened is None:
-        report.progress(1, 1, "nothing is made", "steps")
         return {"facades": 0}
     surface, site, _ = opened
     folder = out / "files" / "facades"
     folder.mkdir(exist_ok=True)
-    crs, pixel_m = open_map(surface.frame), config.gsd_m or site.gsd_m
-    lines = parse_lines(config.lines)
-    task = FacadesTask(surface.photos, surface.area, crs, pixel_m, lines, inputs.machine.threads)
+    pixel_m = config.gsd_m or site.gsd_m
+    task = FacadesTask(surface, pixel_m, parse_lines(config.lines), inputs.machine.threads)
     facts = make_facades(task, folder, report)
     return {"facades": len(facts), "names": [each["name"] for each in facts], "pixel_m": round(pixel_m, 6)}

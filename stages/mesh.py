@@ -20,13 +20,11 @@ def run(config: MeshConfig, inputs: Inputs, out: Path, report: Reporter) -> Summ
         MachineError: if open3d is not there, or the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
-    opened = open_surveyed(inputs, report) if config.enabled else None
+    opened = open_surveyed(config.enabled, inputs, report)
     if opened is None:
-        report.progress(1, 1, "nothing is made", "steps")
         return {"triangles": 0}
     surface, site, _ = opened
     folder = out / "files" / "mesh"
     folder.mkdir(exist_ok=True)
-    voxel_m, most = VOXEL_GSD * site.gsd_m, config.triangles
-    task = MeshTask(surface.frame, site, surface.photos, surface.area, voxel_m, most, inputs.machine.threads)
-    return make_mesh(task, out / "work", folder, {}, report)
+    task = MeshTask(surface, site, VOXEL_GSD * site.gsd_m, config.triangles, inputs.machine.threads)
+    return make_mesh(task, out / "work", folder, report)

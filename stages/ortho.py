@@ -18,11 +18,10 @@ def run(config: OrthoConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
-    opened = open_surveyed(inputs, report) if config.enabled else None
+    opened = open_surveyed(config.enabled, inputs, report)
     if opened is None:
-        report.progress(1, 1, "nothing is made", "steps")
         return {"pixels": 0}
     surface, site, dsm_cell_m = opened
     dsm, gsd_m = inputs["dsm.files"] / "dsm.tif", config.gsd_m or site.gsd_m
-    task = OrthoTask(surface.frame, site, surface.photos, dsm, dsm_cell_m, surface.area, gsd_m, inputs.machine.threads)
+    task = OrthoTask(surface, site, dsm, dsm_cell_m, gsd_m, inputs.machine.threads)
     return make_ortho(task, out / "sheets", out / "files", report)

@@ -152,16 +152,6 @@ def test_geojson_is_in_longitude_and_latitude_of_proj(tmp_path: Path) -> None:
     assert "crs" not in text and text["heights"] == "EPSG:7837 (DHHN2016 height), metre"
 
 
-def test_geojson_in_the_crs_names_it(tmp_path: Path) -> None:
-    grid = hill_grid()
-    found = traced(tmp_path / "dsm.tif", grid)
-    write_geojson(tmp_path / "contours.geojson", found, grid, in_crs=True)
-    meta, lines, _ = read_lines(tmp_path / "contours.geojson")
-    assert meta["crs"] == "EPSG:25832"
-    for contour, line in zip(found.lines, lines, strict=True):
-        np.testing.assert_allclose(line[: len(contour.line)], contour.line, rtol=0.0, atol=1e-4)
-
-
 def test_dxf_has_layers_elevations_and_coordinates_of_the_crs(tmp_path: Path) -> None:
     grid = hill_grid()
     found = traced(tmp_path / "dsm.tif", grid)
@@ -186,8 +176,6 @@ def test_dxf_in_feet_says_so(tmp_path: Path) -> None:
     write_dxf(tmp_path / "contours.dxf", found, grid.crs)
     header = (tmp_path / "contours.dxf").read_text(encoding="cp1252").split("ENDSEC")[0].split()
     assert header[header.index("$INSUNITS") + 2] == "21"
-    with pytest.raises(SplatpipeError, match="its code"):
-        write_geojson(tmp_path / "contours.geojson", found, grid, in_crs=True)
 
 
 def test_frame_without_a_place_has_a_dxf_and_no_longitudes(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from splatpipe.pipeline.survey.frames import Frame
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 
-from house_photos import GSD_M, Recorder, house_site, photos, surface_distances
+from house_photos import GSD_M, Recorder, house_site, photos, run_surface, surface_distances
 
 FRAME = Frame("arbitrary", Similarity.identity(), metres=True)
 LATTICE = Lattice(-5.0, 5.0, GSD_M, 100, 100)
@@ -93,7 +93,7 @@ def test_tiles_and_threads_change_no_point(tmp_path: Path, monkeypatch: pytest.M
     made = []
     for name, threads in (("one", 1), ("three", 3)):
         (tmp_path / name).mkdir()
-        task = CloudTask(FRAME, house_site(), few, None, GSD_M, threads)
+        task = CloudTask(run_surface(FRAME, few), house_site(), GSD_M, threads)
         make_cloud(task, tmp_path / name / "work", tmp_path / name, Recorder())
         made.append((tmp_path / name / "cloud.laz").read_bytes())
     assert made[0] == made[1]
@@ -108,11 +108,12 @@ def test_tiles_and_threads_change_no_point(tmp_path: Path, monkeypatch: pytest.M
 
 def test_nothing_lies_outside_of_the_boundary(tmp_path: Path) -> None:
     ring = np.array([[-2.0, -2.0], [2.0, -2.0], [0.0, 2.0]])
-    task = CloudTask(FRAME, house_site(), photos()[::3], PlanArea.seen_from_above([(ring,)]), 2.0 * GSD_M, 1)
+    area = PlanArea.seen_from_above([(ring,)])
+    task = CloudTask(run_surface(FRAME, photos()[::3], area), house_site(), 2.0 * GSD_M, 1)
     told = make_cloud(task, tmp_path / "work", tmp_path, Recorder())
     cloud = laspy.read(tmp_path / "cloud.laz")
     assert told["points"] == len(cloud.xyz) > 100
-    assert task.area is not None and task.area.contains(np.asarray(cloud.xyz)).mean() > 0.99  # millimetres of rounding
+    assert area.contains(np.asarray(cloud.xyz)).mean() > 0.99  # millimetres of rounding
 
 
 def test_photos_without_depths_and_places_without_photos_give_no_points() -> None:

@@ -107,6 +107,12 @@ def test_other_sections_are_refused(text: str) -> None:
             parse_lines(text)
 
 
+def test_lines_are_taken_whole_or_not_at_all() -> None:
+    assert len(parse_lines(";".join(["388700,5299700,388710.5,5299710.5"] * 200))) == 200
+    with pytest.raises(UsageError, match="too many"):
+        parse_lines(";".join(["388700,5299700,388710.5,5299710.5"] * 400))
+
+
 @pytest.mark.parametrize("base", ["", "top", "1e999", "nan"])
 def test_other_bases_are_refused(base: str) -> None:
     with pytest.raises(UsageError):

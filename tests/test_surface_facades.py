@@ -31,6 +31,7 @@ from splatpipe.pipeline.surface.walls import LEAST_HEIGHT_M, Wall, find_walls
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from house_photos import run_surface
 from house_site import EAVES_M, RIDGE_M, ROOF, WALLS, ExactDepths, depths_of, photo_camera, photo_of
 
 PIXEL_M = 0.04
@@ -170,6 +171,8 @@ def test_fences_cars_and_crowns_are_no_walls() -> None:
     crown = Facets(places, np.column_stack([np.cos(turn), np.sin(turn)]), np.full(4000, 0.04), np.full(4000, 0.03))
     hedge = panel((0, -9), (12, -9), 0, 3.0, spread=0.4)
     assert find_walls(joined(fence, van, crown, hedge)) == []
+    clipped = joined(panel((0, 0), (12, 0), 0, 2.3, spread=0.06), panel((12, 0), (12, 9), 0, 2.3, spread=0.06))
+    assert find_walls(clipped) == []  # low hedges that meet, of one height and as even as a gardener cuts them
     low = joined(panel((0, 9), (4.5, 9), 0.0, LEAST_HEIGHT_M + 0.3), panel((4.5, 9), (4.5, 13), 0.0, 3.0))
     assert [wall.name for wall in find_walls(low)] == ["east", "south"]  # a low one that belongs to a house
     assert find_walls(fence.select(np.zeros(0, np.int64))) == []
@@ -268,7 +271,7 @@ class Quiet:
 
 
 def task(*lines: tuple[float, float, float, float], area: PlanArea | None = None) -> FacadesTask:
-    return FacadesTask(photos(), area, crs(), PIXEL_M, lines, threads=1)
+    return FacadesTask(run_surface(FRAME, photos(), area), PIXEL_M, lines, threads=1)
 
 
 @cache

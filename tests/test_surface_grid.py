@@ -54,6 +54,16 @@ def test_centre_of_a_cell_is_where_pyproj_has_it() -> None:
     assert abs(float((there - origin) @ up) - centre[2]) < LATTICE_M
 
 
+def test_places_that_are_not_known_stay_unknown_and_change_no_other() -> None:
+    grid = make_grid(placed(), box(1500.0, 1500.0, -20.0, 60.0), 0.03)
+    points = local(box(1500.0, 1500.0, -20.0, 60.0), 50)
+    with_holes = points.copy()
+    with_holes[::7] = np.nan
+    found, whole = grid.cells_from_local(with_holes), grid.cells_from_local(points)
+    hole = np.isnan(with_holes).any(axis=1)
+    assert np.isnan(found[hole]).all() and np.array_equal(found[~hole], whole[~hole])
+
+
 def test_lines_of_grids_of_one_cell_are_the_same_lines() -> None:
     one, other = (make_grid(placed(), box(half, half), 0.03) for half in (10.0, 17.77))
     for grid in (one, other):

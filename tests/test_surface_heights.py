@@ -135,7 +135,7 @@ def test_a_turned_sheet_gives_the_same_surface() -> None:
     turn[:2, :2] = [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]
     turn[:3, 3] = [0.5, -0.2, -2.0]
     sheet = Sheet(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), Relief(-3.0, 6.0))
-    sources = sheet.depths([DepthSource(found.camera, lambda found=found: found) for found in exact()])
+    sources = [sheet.moved_depths(DepthSource(found.camera, lambda found=found: found)) for found in exact()]
     made = tile_heights(Capture(sources, sheet.lattice, sheet.relief, Shelf(1 << 30)), Tile(0, 0, 50, 60))
     places = np.concatenate([sheet.lattice.centres(made.tile), made.height[..., None]], axis=-1)
     east, north, up = np.moveaxis(sheet.local(places), -1, 0)

@@ -13,8 +13,9 @@ import pytest
 import trimesh
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface.blocks import SIDE, Box, blocks_of, keys_of, surface_blocks
+from splatpipe.pipeline.surface.blocks import SIDE, blocks_of, keys_of, surface_blocks
 from splatpipe.pipeline.surface.mesh_files import write_mesh
 from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.point_colours import photo_set
@@ -24,11 +25,11 @@ from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 
-from house_photos import GSD_M, Recorder, house_site, photos, surface_distances
+from house_photos import GSD_M, Recorder, house_site, photos, run_surface, surface_distances
 from house_site import true_height
 
 FRAME = Frame("enu", Similarity.identity(), Origin(47.8412, 13.5127, 512.0), "ellipsoidal", crs="EPSG:32633")
-BOX = Box(*house_site().box)
+BOX = house_site().box
 
 
 @cache
@@ -89,7 +90,7 @@ def test_blocks_cover_the_surface_and_little_else() -> None:
     east, north = (axis.ravel() for axis in np.meshgrid(np.arange(-4.9, 5.0, 0.3), np.arange(-4.9, 5.0, 0.3)))
     off_walls = (np.abs(np.abs(east) - 4.25) > 0.3) & (np.abs(np.abs(north) - 3.25) > 0.3)  # below the eaves few see
     places = np.stack([east, north, true_height(east, north)])[:, off_walls]
-    there = keys_of(np.floor((places - BOX.low[:, None]) / side).astype(np.int64))
+    there = keys_of(np.floor((places - BOX[0][:, None]) / side).astype(np.int64))
     assert np.isin(there, keys_of(blocks.places)).all()
     east, north, up = blocks.centres()
     assert not ((np.abs(east) < 2.0) & (np.abs(north) < 1.5) & (up < 2.0)).any()  # within the house
@@ -103,10 +104,8 @@ def test_voxels_grow_where_blocks_would_be_too_many() -> None:
     assert 100 < blocks.places.shape[1] <= 200 and blocks.voxel_m > 0.1
 
 
-def test_a_box_without_a_size_is_refused() -> None:
-    for high in (0.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="a box"):
-            Box(np.zeros(3), np.array([1.0, high, 1.0]))
+def test_a_box_without_a_size_has_no_blocks() -> None:
+    assert not surface_blocks(exact_photos(), np.stack([BOX[0], BOX[0]]), 0.2, 10_000, 1).places.size
 
 
 def test_vertices_have_the_photos_colours_and_hidden_ones_their_neighbours() -> None:
@@ -123,7 +122,13 @@ def test_vertices_have_the_photos_colours_and_hidden_ones_their_neighbours() -> 
 def test_files_are_read_by_others_where_they_lie(tmp_path: Path) -> None:
     mesh = sheet(3.0, 2, height=7.0)
     colours = np.arange(27, dtype=np.uint8).reshape(9, 3) * 9
-    write_mesh(tmp_path, ColouredMesh(mesh, colours), FRAME, {"uncertainty": None})
+    uncertain = replace(FRAME, residuals={"uncertainty": {"horizontal_m": 0.02}})
+    ring = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
+    facts = PlanArea.seen_from_above([(ring,)]).facts()
+    degrees = [[[[13.5, 47.8], [13.6, 47.8], [13.6, 47.9], [13.5, 47.9]]]]
+    (tmp_path / "boundary.json").write_text(json.dumps({"world": facts, "degrees": degrees}))
+    write_mesh(tmp_path, ColouredMesh(mesh, colours), uncertain, tmp_path / "boundary.json")
+    (tmp_path / "boundary.json").unlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["georef.json", "mesh.glb", "mesh.ply"]
     glb = trimesh.load(tmp_path / "mesh.glb", force="mesh", process=False)
     np.testing.assert_allclose(glb.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0], mesh.vertices)  # y up
@@ -135,13 +140,15 @@ def test_files_are_read_by_others_where_they_lie(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.stack(ply["face"]["vertex_indices"]), mesh.triangles)
     assert "frame: local east north up, metres" in ply.comments
     placed = json.loads((tmp_path / "georef.json").read_text())
-    assert placed["origin"]["latitude"] == 47.8412 and placed["uncertainty"] is None
+    assert placed["origin"]["latitude"] == 47.8412 and placed["uncertainty"] == {"horizontal_m": 0.02}
     assert placed["crs_from_local_tangent"]["over_box_m"] == [[3.0, 0.0, 7.0], [3.5, 0.5, 7.0]]
+    assert placed["boundary"]["area_m2"] == 100.0
+    assert placed["boundary"]["wgs84"]["coordinates"] == [[[*degrees[0][0], degrees[0][0][0]]]]
 
 
 def test_glb_says_light_in_sixteen_bits_and_no_lamp(tmp_path: Path) -> None:
     colours = np.tile(np.array([[0, 30, 255]], np.uint8), (9, 1))
-    write_mesh(tmp_path, ColouredMesh(sheet(0.0, 2), colours), FRAME, {})
+    write_mesh(tmp_path, ColouredMesh(sheet(0.0, 2), colours), FRAME, None)
     data = (tmp_path / "mesh.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     scene, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -159,14 +166,14 @@ def test_few_triangles_are_left_as_they_are() -> None:
 
 def test_the_whole_mesh_or_how_to_get_it(tmp_path: Path) -> None:
     """open3d is an extra: where it is not installed, it is said how it is; nothing else of this file needs it."""
-    task = MeshTask(FRAME, house_site(), photos(noise_px=0.1, wild=0.03), None, 2.0 * GSD_M, 4000, 1)
+    task = MeshTask(run_surface(FRAME, photos(noise_px=0.1, wild=0.03)), house_site(), 2.0 * GSD_M, 4000, 1)
     if find_spec("open3d") is None:
         with pytest.raises(MachineError) as refused:
-            make_mesh(task, tmp_path / "work", tmp_path, {}, Recorder())
+            make_mesh(task, tmp_path / "work", tmp_path, Recorder())
         assert "open3d" in refused.value.message and "splatpipe[mesh]" in refused.value.hint
         assert not list(tmp_path.iterdir())
         return
-    told = make_mesh(task, tmp_path / "work", tmp_path, {}, Recorder())
+    told = make_mesh(task, tmp_path / "work", tmp_path, Recorder())
     mesh = trimesh.load(tmp_path / "mesh.ply", process=False)
     assert 3000 < told["triangles"] == len(mesh.faces) <= 4000
     places, _ = trimesh.sample.sample_surface(mesh, 20_000, seed=1)
@@ -177,12 +184,12 @@ def test_the_whole_mesh_or_how_to_get_it(tmp_path: Path) -> None:
     assert (off < 2.0 * GSD_M)[~eaves].mean() > 0.999 and (off < 4.0 * GSD_M).mean() > 0.99
     assert told["area_m2"] > 0.95 * (100.0 + 2.0 * 9.0 * 4.03 + 28.0 * 3.0 - 56.0)
     made = (tmp_path / "mesh.glb").read_bytes()
-    make_mesh(replace(task, threads=2), tmp_path / "other", tmp_path, {}, Recorder())
+    make_mesh(replace(task, threads=2), tmp_path / "other", tmp_path, Recorder())
     assert (tmp_path / "mesh.glb").read_bytes() == made
     (tmp_path / "mesh.glb").unlink()
     again = Recorder()
-    make_mesh(task, tmp_path / "work", tmp_path, {}, again)  # as after a kill while it was decimated
+    make_mesh(task, tmp_path / "work", tmp_path, again)  # as after a kill while it was decimated
     assert (tmp_path / "mesh.glb").read_bytes() == made and again.steps == [(0, 1), (1, 1)]
     empty = replace(task, site=replace(house_site(), reach=(500.0, 500.0, 510.0, 510.0)))
     with pytest.raises(SplatpipeError, match="no surface"):
-        make_mesh(empty, tmp_path / "empty", tmp_path, {}, Recorder())
+        make_mesh(empty, tmp_path / "empty", tmp_path, Recorder())

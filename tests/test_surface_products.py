@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
@@ -21,11 +21,12 @@ from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import grid_sheets
 from splatpipe.pipeline.surface.site import Site, load_site, save_site, survey_site
-from splatpipe.pipeline.surface.sources import DepthSource, Shelf
+from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, Shelf
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from house_photos import run_surface
 from house_site import cameras, depths_of, edge_distance, photo_of, true_height, true_orthophoto
 
 FRAME = Frame("arbitrary", Similarity.identity(), metres=True)
@@ -61,6 +62,10 @@ def sources() -> tuple[DepthSource, ...]:
     return tuple(DepthSource(each.camera, lambda each=each: each) for each in found)
 
 
+def photos() -> list[PhotoSource]:
+    return [PhotoSource(source.camera, lambda source=source: photo_of(source.camera), source) for source in sources()]
+
+
 @cache
 def site() -> Site:
     found = survey_site(sources(), 1.0, None, 1)
@@ -69,13 +74,12 @@ def site() -> Site:
 
 
 def dsm(folder: Path, area: PlanArea | None = HOUSE, report: Any = None) -> dict[str, Any]:
-    task = DsmTask(FRAME, site(), sources(), area, CELL_M, 1)
+    task = DsmTask(run_surface(FRAME, photos(), area), site(), CELL_M, 1)
     return make_dsm(task, folder / "work", folder, report or Told())
 
 
 def ortho(folder: Path, report: Any = None) -> dict[str, Any]:
-    photos = [PhotoSource(source.camera, lambda source=source: photo_of(source.camera), source) for source in sources()]
-    task = OrthoTask(FRAME, site(), photos, folder / "dsm.tif", CELL_M, HOUSE, CELL_M / 2, 1)
+    task = OrthoTask(run_surface(FRAME, photos(), HOUSE), site(), folder / "dsm.tif", CELL_M, CELL_M / 2, 1)
     return make_ortho(task, folder / "ortho_work", folder, report or Told())
 
 
@@ -111,6 +115,15 @@ def test_a_site_ends_at_its_boundary() -> None:
     found = survey_site(sources(), 1.0, HOUSE, 1)
     assert found is not None
     assert np.abs(found.reach).max() <= 5.5
+
+
+def test_depths_that_reach_too_far_for_a_site_are_refused() -> None:
+    found = sources()[0].load()
+    pose = found.camera.cam_from_world.copy()
+    pose[:3, 3] -= pose[:3, :3] @ [100_000.0, 100_000.0, 0.0]
+    away = MetricMap(replace(found.camera, cam_from_world=pose), found.depth, found.confidence)
+    with pytest.raises(SplatpipeError, match="too far"):
+        survey_site([sources()[0], DepthSource(away.camera, lambda: away)], 1.0, None, 1)
 
 
 def test_a_site_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -188,7 +201,9 @@ def test_sheets_of_a_grid_agree_where_they_meet() -> None:
     whole = np.full((grid.height, grid.width), np.nan)
     for sheet in grid_sheets(grid, low, high, side=25):
         plane, part = sheet.sheet, sheet.part
-        moved = Capture(plane.depths(sources()), plane.lattice, plane.relief, Shelf(1 << 30))
+        moved = Capture(
+            [plane.moved_depths(source) for source in sources()], plane.lattice, plane.relief, Shelf(1 << 30)
+        )
         found = tile_heights(moved, Tile(0, 0, part.height, part.width))
         heights = sheet.heights(found.tile, found.height)
         whole[part.row : part.row + part.height, part.column : part.column + part.width] = heights

@@ -161,6 +161,9 @@ def test_a_base_that_nobody_knows_is_refused(tmp_path: Path) -> None:
     away = PlanArea.seen_from_above([(square(4.0).polygons[0][0] + 100.0,)])
     with pytest.raises(SplatpipeError, match="no heights inside"):
         measure_volume(surface, away, grid.crs, 0.0)
+    for base in ("rim", 0.0):
+        with pytest.raises(SplatpipeError, match="far too long"):
+            measure_volume(surface, square(1e7), grid.crs, base)
 
 
 def test_the_file_tells_each_polygon_in_plain_units(tmp_path: Path) -> None:

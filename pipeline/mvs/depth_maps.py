@@ -7,9 +7,8 @@ texture at hand, and without them a third of a garden is missing. Edges are put 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -63,9 +62,9 @@ class KeptMap:
             StageError: if it is no map of that grid.
         """
         try:
-            with np.load(self.path, allow_pickle=False) as kept:
+            with self.path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
                 found = DepthMap(np.asarray(kept["depth"], np.float32), np.asarray(kept["confidence"], np.uint8))
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
+        except (OSError, EOFError, ValueError, TypeError, KeyError, BadZipFile) as error:
             raise _unreadable(self.path.name) from error
         if not found.depth.shape == found.confidence.shape == (self.camera.height, self.camera.width):
             raise _unreadable(self.path.name)
@@ -140,27 +139,37 @@ def find_depth_maps(
     plan = SearchPlan(megapixels, WIDER, True, COMPARED, ASKED)
     search = DepthSearch.begin(dataset, views, folder, plan)
     search.run(threads, report)
-    maps = ordered_map(partial(_confirmed_map, search), range(len(views)), threads)
-    for done, (camera, found) in enumerate(zip(search.cameras, maps, strict=True), start=1):
-        yield camera, found
-        report.progress(done, len(views), "comparing depths", "photos")
+    maps = confirmed_maps(search.cameras, search.agreement, threads, report)
+    yield from ordered_map(partial(_with_edges, search), enumerate(maps), threads)
 
 
-def _confirmed_map(search: DepthSearch, number: int) -> DepthMap:
-    found = confirmed_map(search.cameras[number], search.agreement(number))
+def _with_edges(search: DepthSearch, numbered: tuple[int, tuple[Camera, DepthMap]]) -> tuple[Camera, DepthMap]:
+    """A map whose edges lie where its photo has them."""
+    number, (camera, found) = numbered
     rows, columns, depth = pixels_behind(found.depth, search.colours(number))
     found.depth[rows, columns] = depth
     found.confidence[rows, columns] = AGREEING
-    return found
+    return camera, found
 
 
-def confirmed_map(camera: Camera, agreement: Agreement | None) -> DepthMap:
-    """A photo's depths that enough others found, too; a map without any where there is no agreement.
+def confirmed_maps(
+    cameras: Sequence[Camera], agreement: Callable[[int], Agreement | None], threads: int, report: Reporter
+) -> Iterator[tuple[Camera, DepthMap]]:
+    """Photos' depths that enough others found, too, in the order of the cameras.
 
     Args:
-        camera: In the map's grid.
-        agreement: Of the same photo.
+        cameras: In the grids of the maps.
+        agreement: What others say of a photo's depths, by its number; None for a map without any.
+        threads: Photos at a time.
+        report: Told of progress.
     """
+    maps = ordered_map(lambda number: _confirmed_map(cameras[number], agreement(number)), range(len(cameras)), threads)
+    for done, (camera, found) in enumerate(zip(cameras, maps, strict=True), start=1):
+        yield camera, found
+        report.progress(done, len(cameras), "comparing depths", "photos")
+
+
+def _confirmed_map(camera: Camera, agreement: Agreement | None) -> DepthMap:
     depth = np.zeros((camera.height, camera.width), np.float32)
     confidence = np.zeros(depth.shape, np.uint8)
     if agreement is not None:

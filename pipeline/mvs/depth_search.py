@@ -17,6 +17,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, load_tracks, neighbours
 from splatpipe.pipeline.mvs.patch_match import Depths, find_depths
 from splatpipe.pipeline.mvs.picture import Picture
@@ -168,7 +169,7 @@ class DepthSearch:
             return
         _, colour, mask = small_view(self.views[number], self.plan.megapixels)
         counts = np.ones(colour.shape[:2], np.bool_) if mask is None else mask
-        _save_whole(self._photo_path(number), colour=colour, counts=counts)
+        save_arrays(self._photo_path(number), colour=colour, counts=counts)
 
     def _keep_depths(self, number: int) -> None:
         """Look at one photo and keep what it found."""
@@ -180,19 +181,12 @@ class DepthSearch:
             return
         pictures = [self._picture(other) for other in others]
         found = find_depths(self._picture(number), pictures, bounds, number, self.plan.plain)
-        _save_whole(self._depths_path(number), inverse=found.inverse, cost=found.cost)
+        save_arrays(self._depths_path(number), inverse=found.inverse, cost=found.cost)
 
     def _picture(self, number: int) -> Picture:
         with np.load(self._photo_path(number)) as kept:
             grey = np.asarray(cv2.cvtColor(kept["colour"], cv2.COLOR_RGB2GRAY), np.uint8)
             return Picture(self.cameras[number], grey, kept["counts"])
-
-
-def _save_whole(path: Path, **arrays: np.ndarray) -> None:
-    """A file that is there whole or not at all, however a process ends."""
-    aside = path.with_suffix(".part.npz")
-    np.savez(aside, **arrays)  # type: ignore[arg-type]
-    aside.replace(path)
 
 
 def agreement_of(

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_map
-from splatpipe.pipeline.mvs.depth_search import Inverse, agreement_of
+from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_maps
+from splatpipe.pipeline.mvs.depth_search import Agreement, Inverse, agreement_of
 from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
 from splatpipe.pipeline.mvs.patch_match import Depths
 
@@ -50,16 +50,12 @@ def rendered_depth_maps(
     tracks = load_tracks(dataset, [camera.name for camera in cameras])
     near = neighbours(tracks, cameras, ASKED)
 
-    def confirmed(number: int) -> DepthMap:
+    def agreement(number: int) -> Agreement | None:
         inverse = _kept(folder, number)
         own = Depths(inverse, np.zeros_like(inverse))
-        agreement = agreement_of(number, cameras, near[number], (own, partial(_kept, folder)))
-        return confirmed_map(cameras[number], agreement)
+        return agreement_of(number, cameras, near[number], (own, partial(_kept, folder)))
 
-    maps = ordered_map(confirmed, range(len(cameras)), threads)
-    for done, (camera, found) in enumerate(zip(cameras, maps, strict=True), start=1):
-        yield camera, found
-        report.progress(done, len(cameras), "comparing depths", "photos")
+    yield from confirmed_maps(cameras, agreement, threads, report)
 
 
 def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
@@ -68,9 +64,8 @@ def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
         return
     depth = render()
     there = np.isfinite(depth) & (depth > 0.0)
-    aside = path.with_suffix(".part.npy")
-    np.save(aside, np.where(there, 1.0 / np.where(there, depth, 1.0), 0.0).astype(np.float32))
-    aside.replace(path)
+    inverse = np.where(there, 1.0 / np.where(there, depth, 1.0), 0.0).astype(np.float32)
+    write_durably(path, partial(np.save, arr=inverse))
 
 
 def _kept(folder: Path, number: int) -> Inverse:

@@ -11,42 +11,25 @@ from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.photo_set import PhotoSet, place_of
-from splatpipe.pipeline.surface.sources import DepthMap
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap
 
 SIDE = 8  # voxels of a block: a surface fills smaller blocks better than open3d's usual 16
 BAND = 3.0  # voxels on either side of a surface that know how far off it is
 LEAST_PHOTOS = 2  # that have to see a surface in a block: each of their depths is confirmed by others already
-LEAST_CONFIDENCE = 2  # other photos that confirm a depth
 EVERY = 3  # pixels, of which one is looked at: blocks are wider
 LEAST_GROWTH = 1.05  # of voxels that were too small
 BITS = 21  # of a block's number along an axis: two million
 
 Keys = Int64[np.ndarray, " n"]
-
-
-@dataclass(frozen=True, eq=False)
-class Box:
-    """What part of the world a mesh is made of.
-
-    Attributes:
-        low: Least east, north, up, metres.
-        high: Most.
-    """
-
-    low: Float64[np.ndarray, " 3"]
-    high: Float64[np.ndarray, " 3"]
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite([self.low, self.high]).all() and (self.low < self.high).all()):
-            raise ValueError(f"a box from {self.low} to {self.high}")
+Box = Float64[np.ndarray, "2 3"]  # least and largest east, north, up, metres: the part of the world that counts
 
 
 def depths_in(box: Box, found: DepthMap) -> Float32[np.ndarray, "h w"]:
     """Depths of a photo that others confirm and that lie in a box; 0 elsewhere."""
-    sure = (found.confidence >= LEAST_CONFIDENCE) & (found.depth > 0.0)
+    sure = (found.confidence >= LEAST_CONFIRMED) & (found.depth > 0.0)
     row, column = np.nonzero(sure)
     xyz = _places(found, row, column)
-    inside = ((xyz >= box.low[:, None]) & (xyz < box.high[:, None])).all(axis=0)
+    inside = ((xyz >= box[0][:, None]) & (xyz < box[1][:, None])).all(axis=0)
     depth = np.zeros_like(found.depth)
     depth[row[inside], column[inside]] = found.depth[row[inside], column[inside]]
     return depth
@@ -95,7 +78,7 @@ def surface_blocks(photos: PhotoSet, box: Box, voxel_m: float, most: int, thread
             seen = np.bincount(place, count, len(keys)).astype(np.int64)
         kept = keys[seen >= LEAST_PHOTOS]
         if len(kept) <= most:
-            return Blocks(box.low, voxel_m, blocks_of(kept))
+            return Blocks(box[0], voxel_m, blocks_of(kept))
         voxel_m *= max(LEAST_GROWTH, float(np.sqrt(len(kept) / most)))  # blocks of a surface go with its area
 
 
@@ -107,7 +90,7 @@ def seen_blocks(box: Box, voxel_m: float, found: DepthMap) -> Keys:
     """Keys of the blocks in which a photo sees a surface, or the band around it, in order."""
     depth = depths_in(box, found)
     row, column = np.nonzero(depth[::EVERY, ::EVERY])
-    xyz = (_places(found, row * EVERY, column * EVERY) - box.low[:, None]) / voxel_m
+    xyz = (_places(found, row * EVERY, column * EVERY) - box[0][:, None]) / voxel_m
     corners = [
         keys_of(np.floor((xyz + BAND * np.array(signs)[:, None]) / SIDE).astype(np.int64))
         for signs in product((-1.0, 1.0), repeat=3)

@@ -2,8 +2,7 @@
 
 GeoJSON is in WGS 84 longitude and latitude (RFC 7946 knows no other CRS, and web maps read no other); heights are a
 property, as a third coordinate would be taken for an ellipsoidal one. Between WGS 84 and an older datum programs choose
-transformations of their own, metres apart: so there is GeoJSON in the run's CRS, too, with the `crs` member of the
-format of 2008, which GDAL and QGIS still read. DXF is in the run's CRS, heights in the drawing's unit. It is of AutoCAD
+transformations of their own, metres apart: the DXF is in the run's CRS, heights in the drawing's unit. It is of AutoCAD
 2000: the oldest with a drawing's unit and polylines of an elevation, and so read by the most programs.
 """
 
@@ -11,7 +10,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from ezdxf.filemanagement import new as new_drawing
@@ -33,36 +31,32 @@ DEGREE_DIGITS = 9  # a tenth of a millimetre
 UNIT_DIGITS = 4  # the same, of metres and feet
 
 
-def write_geojson(path: Path, contours: Contours, grid: Grid, in_crs: bool = False) -> None:
+def write_geojson(path: Path, contours: Contours, grid: Grid) -> None:
     """Write contours as GeoJSON; a closed one's last position is its first.
 
     Args:
         path: Where.
         contours: In the grid's CRS.
         grid: The grid that they were made in.
-        in_crs: In the CRS rather than in longitude and latitude.
 
     Raises:
-        SplatpipeError: if the frame lies nowhere on the earth, or the CRS has no code to name it by.
+        SplatpipeError: if the frame lies nowhere on the earth.
     """
-    header: dict[str, Any] = {"type": "FeatureCollection", "heights": grid.crs.described_heights()}
-    if in_crs:
-        header["crs"] = {"type": "name", "properties": {"name": _urn(grid.crs)}}
-    elif grid.crs.world is None:
+    if grid.crs.world is None:
         raise SplatpipeError(
             "The reconstruction lies nowhere on the earth, so its contours have no longitude and latitude.",
             "Take the DXF, or place it: give photos with positions, or a gcp_list.txt.",
         )
+    header = {"type": "FeatureCollection", "heights": grid.crs.described_heights()}
     with whole_file(path) as aside, aside.open("w", encoding="utf-8") as file:
         file.write(json.dumps(header)[:-1] + ',\n"features": [')
         for number, contour in enumerate(contours.lines):
             line = np.concatenate([contour.line, contour.line[:1]]) if contour.closed else contour.line
-            digits = UNIT_DIGITS if in_crs else DEGREE_DIGITS
-            shown = line if in_crs else _degrees(line, contour.height, grid)
+            degrees = np.round(_degrees(line, contour.height, grid), DEGREE_DIGITS)
             feature = {
                 "type": "Feature",
                 "properties": {"height": contour.height, "index": contour.is_index},
-                "geometry": {"type": "LineString", "coordinates": np.round(shown, digits).tolist()},
+                "geometry": {"type": "LineString", "coordinates": degrees.tolist()},
             }
             file.write(("," if number else "") + "\n" + json.dumps(feature))
         file.write("\n]}\n")
@@ -100,10 +94,3 @@ def _degrees(line: Float64[np.ndarray, "n 2"], height: float, grid: Grid) -> Flo
     assert grid.crs.world is not None
     local = grid.local_from_crs(np.column_stack([line, np.full(len(line), height)]))
     return np.asarray(grid.crs.world.origin.geodetic_from_enu(local)[:, 1::-1])
-
-
-def _urn(crs: MapCrs) -> str:
-    authority = crs.horizontal.to_authority(min_confidence=100)
-    if authority is None:
-        raise SplatpipeError("GeoJSON names a CRS by its code, which this one has not.", "Take the DXF.")
-    return f"urn:ogc:def:crs:{authority[0]}::{authority[1]}"

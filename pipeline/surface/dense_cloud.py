@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,19 +12,17 @@ import numpy as np
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.surface.fusion import FusedPoints, finest_of_cubes, fused, joined
 from splatpipe.pipeline.surface.grid import make_grid
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.point_cloud import UNDATED, CloudChunk, write_cloud
 from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
+from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.sources import Relief
 from splatpipe.pipeline.surface.tiles import Tile, tiled
-from splatpipe.pipeline.surface.whole_file import whole_file
-from splatpipe.pipeline.survey.frames import Frame
 
 SIDE = 2048  # cells of a part of the plan, in which each photo is read once: some 6 million points, 0.4 GB
 TILE = 256  # cells of a tile, in which depths are compared
@@ -36,18 +34,14 @@ class CloudTask:
     """What a cloud is made from.
 
     Attributes:
-        frame: The run's.
-        site: What its photos show.
-        photos: Local metres, with their depths.
-        area: Nothing outside of it is shown; None for all.
+        surface: The run's photos and depths.
+        site: What they show.
         spacing_m: A cube of that side holds one point at most; the photos' GSD.
         threads: Tiles or photos at a time.
     """
 
-    frame: Frame
+    surface: RunSurface
     site: Site
-    photos: Sequence[PhotoSource]
-    area: PlanArea | None
     spacing_m: float
     threads: int
 
@@ -69,7 +63,7 @@ def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict
         ValueError: if depths or pixels do not fit their camera.
         MachineError: if the disk is full.
     """
-    grid = make_grid(task.frame, task.site.box, task.spacing_m)
+    grid = make_grid(task.surface.frame, task.site.box, task.spacing_m)
     lattice, relief = _lattice(task), Relief(task.site.low_m, task.site.high_m)
     work.mkdir(exist_ok=True)
     parts = [part for part in tiled(lattice.height, lattice.width, SIDE) if _tiles(task, lattice, part)]
@@ -77,10 +71,9 @@ def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict
     for done, part in enumerate(parts):
         path = work / f"{done:06d}.npz"
         if not path.is_file():
-            photos = photos or photo_set(task.photos, task.spacing_m, task.threads)
+            photos = photos or photo_set(task.surface.photos, task.spacing_m, task.threads)
             chunk = _part(task, photos, (lattice, relief), part)
-            with whole_file(path) as aside, aside.open("wb") as file:
-                np.savez(file, **vars(chunk))
+            save_arrays(path, **vars(chunk))
         report.progress(done + 1, len(parts), "dense cloud", "parts")
     count = write_cloud(out / "cloud.laz", _kept(work, len(parts)), grid, UNDATED)
     return {"points": count, "spacing_m": task.spacing_m, "crs": grid.crs.horizontal.name}
@@ -107,8 +100,8 @@ def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, Relief], part
     """The cloud of a part of the plan."""
     tiles = _tiles(task, space[0], part)
     points = joined(list(ordered_map(partial(tile_cloud, photos, *space), tiles, task.threads)))
-    if task.area is not None:
-        points = points.select(task.area.contains(points.pieces.xyz.T))
+    if task.surface.area is not None:
+        points = points.select(task.surface.area.contains(points.pieces.xyz.T))
     colours, known = point_colours(photos, points.pieces, task.spacing_m, task.threads)
     points = points.select(known)  # one that moved to where no photo sees it is none
     positions, normals = (np.ascontiguousarray(each.T) for each in (points.pieces.xyz, points.pieces.normal))

@@ -35,7 +35,7 @@ from splatpipe.pipeline.surface.drawing import (
     Drawing,
     Stroke,
 )
-from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.surface.whole_file import whole_file, write_whole_text
 
 DXF_VERSION = "R2000"  # the oldest with a drawing's unit and pictures, and so read by the most programs
 METRES = 6  # of $INSUNITS
@@ -133,7 +133,7 @@ def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "
     Args:
         path: Where.
         drawing: What.
-        colours: The picture that it places; None without one.
+        colours: The picture that it places, transparent where its last channel is 0; None without one.
         title: For readers of the file.
 
     Raises:
@@ -174,8 +174,7 @@ def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "
             f'<text x="{x:.2f}" y="{y:.2f}" font-family="sans-serif" font-size="{label.size_mm * 1.4:.2f}"'
             f' text-anchor="{label.anchor}">{escape(label.text)}</text>'
         )
-    with whole_file(path) as aside:
-        aside.write_text("\n".join([*parts, "</svg>\n"]), encoding="utf-8")
+    write_whole_text(path, "\n".join([*parts, "</svg>\n"]))
 
 
 def _svg_path(stroke: Stroke, line: np.ndarray) -> str:
@@ -188,9 +187,7 @@ def _svg_path(stroke: Stroke, line: np.ndarray) -> str:
 
 def _embedded(colours: UInt8[np.ndarray, "h w 4"]) -> str:
     """A picture as a data URL: JPEG on white, which is a fifth of a PNG."""
-    picture = Image.fromarray(colours)
-    white = Image.new("RGBA", picture.size, (255, 255, 255, 255))
-    flat = Image.alpha_composite(white, picture).convert("RGB")
+    flat = Image.fromarray(np.where(colours[..., 3:] > 0, colours[..., :3], np.uint8(255)))
     flat.thumbnail((MOST_EMBEDDED, MOST_EMBEDDED))
     kept = io.BytesIO()
     flat.save(kept, "JPEG", quality=JPEG_QUALITY)

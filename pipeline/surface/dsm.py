@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.contour_files import write_dxf, write_geojson
 from splatpipe.pipeline.surface.contours import trace_contours
 from splatpipe.pipeline.surface.geotiff import CONFIDENCE, HEIGHTS, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.heights import TILE, Capture, surface_heights
+from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.sheet import GridSheet, grid_sheets
 from splatpipe.pipeline.surface.sheet_work import Arrays, SheetWork
 from splatpipe.pipeline.surface.site import Site
-from splatpipe.pipeline.surface.sources import DepthSource, Shelf
+from splatpipe.pipeline.surface.sources import Shelf
 from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.survey.frames import Frame
 
 HELD_BYTES = 512 << 20  # of depths in memory
 MILLIMETRES = 1000.0
@@ -34,18 +34,14 @@ class DsmTask:
     """What a surface model is made from.
 
     Attributes:
-        frame: The run's.
-        site: What its photos show.
-        sources: Their depths, local metres.
-        area: Nothing outside of it is shown; None for all.
+        surface: The run's photos and depths.
+        site: What they show.
         cell_m: Side of a cell on the ground.
         threads: Tiles at a time.
     """
 
-    frame: Frame
+    surface: RunSurface
     site: Site
-    sources: Sequence[DepthSource]
-    area: PlanArea | None
     cell_m: float
     threads: int
 
@@ -74,12 +70,12 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
         SplatpipeError: if the grid would be absurdly large.
         MachineError: if the disk is full.
     """
-    grid = make_grid(task.frame, task.site.box, task.cell_m)
+    grid = make_grid(task.surface.frame, task.site.box, task.cell_m)
     sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
-    making = SheetWork(sheets, task.site, task.area, TILE, work, report, "surface model")
+    making = SheetWork(sheets, task.site, task.surface.area, TILE, work, report, "surface model")
 
     def heights(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
-        sources = sheet.sheet.depths(task.sources)
+        sources = [sheet.sheet.moved_depths(source) for source in task.surface.depths]
         capture = Capture(sources, sheet.sheet.lattice, sheet.sheet.relief, Shelf(HELD_BYTES))
         for part in surface_heights(capture, tiles, task.threads):
             sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))
@@ -88,17 +84,9 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
             yield part.tile, {"height": over, "confidence": confidence}
 
     making.run(heights)
-    with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
-        for part, arrays in making.finished():
-            file.write(part, arrays["height"])
-    known, total, sigmas = 0, 0, np.zeros(MOST_MILLIMETRES + 1, np.int64)
-    with raster_file(out / "dsm_confidence.tif", grid, CONFIDENCE) as file:
-        for part, arrays in making.finished():
-            file.write(part, np.moveaxis(arrays["confidence"], -1, 0))
-            counts = np.bincount(arrays["confidence"][..., 1].ravel(), minlength=len(sigmas))
-            known, total = known + int(counts[1:].sum()), total + int(counts.sum())
-            sigmas[1:] += counts[1:]
+    sigmas = _write_rasters(making, out, grid)
     _write_contours(out, grid, report)
+    known = int(sigmas.sum())
     typical = int(np.searchsorted(np.cumsum(sigmas), known / 2)) / MILLIMETRES if known else None
     return {
         "cell": grid.cell,
@@ -112,6 +100,20 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
         "crs": grid.crs.horizontal.name,
         "heights": grid.crs.described_heights(),
     }
+
+
+def _write_rasters(making: SheetWork, out: Path, grid: Grid) -> Int64[np.ndarray, " 65536"]:
+    """Write both rasters; how many cells have an expected deviation of so many millimetres, none of 0."""
+    with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
+        for part, arrays in making.finished():
+            file.write(part, arrays["height"])
+    sigmas = np.zeros(MOST_MILLIMETRES + 1, np.int64)
+    with raster_file(out / "dsm_confidence.tif", grid, CONFIDENCE) as file:
+        for part, arrays in making.finished():
+            file.write(part, np.moveaxis(arrays["confidence"], -1, 0))
+            sigmas += np.bincount(arrays["confidence"][..., 1].ravel(), minlength=len(sigmas))
+    sigmas[0] = 0  # where there is no height
+    return sigmas
 
 
 def _write_contours(out: Path, grid: Grid, report: Reporter) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -22,7 +22,7 @@ from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import Sheet
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf
+from splatpipe.pipeline.surface.sources import DepthMap, Relief, Shelf
 from splatpipe.pipeline.surface.walls import Wall
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sills and cornices; balconies do not
@@ -42,7 +42,6 @@ class Elevation:
         sheet: Its frame: x from the wall's left end, y up as heights of the local frame, z towards the viewer, metres.
         depth: Metres before the plane, nan where not known.
         sigma: Expected deviation of each, metres.
-        photos: How many photos agree on each depth.
         colour: Red, green, blue, alpha: 0 where there is no colour.
     """
 
@@ -50,7 +49,6 @@ class Elevation:
     sheet: Sheet
     depth: Float32[np.ndarray, "h w"]
     sigma: Float32[np.ndarray, "h w"]
-    photos: UInt8[np.ndarray, "h w"]
     colour: UInt8[np.ndarray, "h w 4"]
 
     def corners(self) -> Float64[np.ndarray, "4 3"]:
@@ -119,13 +117,13 @@ def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress
     sources, gains = _before(sheet, photos)
     shape = sheet.lattice.height, sheet.lattice.width
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
-    agreeing, colour = np.zeros(shape, np.uint8), np.zeros((*shape, 4), np.uint8)
+    colour = np.zeros((*shape, 4), np.uint8)
     shelf: Shelf[DepthMap] = Shelf(SHELF_BYTES)
     known = [source.depths for source in sources if source.depths is not None]
     capture = Capture(known, sheet.lattice, sheet.relief, shelf, upright=True)
     for done, part in enumerate(surface_heights(capture, depths_tiles, photos.threads), 1):
         cut = part.tile.slices
-        depth[cut], sigma[cut], agreeing[cut] = part.height, part.sigma, part.photos
+        depth[cut], sigma[cut] = part.height, part.sigma
         progress(done, total)
     depth = without_specks(depth)
     surface = HeightField(sheet.lattice, depth)
@@ -135,7 +133,7 @@ def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress
         colour[(*cut, slice(0, 3))] = drawn.colour
         colour[(*cut, 3)] = np.where(drawn.known, np.uint8(255), np.uint8(0))
         progress(done, total)
-    return Elevation(wall, sheet, depth, sigma, agreeing, colour)
+    return Elevation(wall, sheet, depth, sigma, colour)
 
 
 def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -157,10 +155,4 @@ def _before(sheet: Sheet, photos: Photos) -> tuple[list[PhotoSource], Float64[np
     rows = [
         row for row, source in enumerate(photos.sources) if sheet.place(source.camera.centre())[2] > sheet.relief.high_m
     ]
-    moved = [_moved(sheet, photos.sources[row]) for row in rows]
-    return moved, photos.gains[rows]
-
-
-def _moved(sheet: Sheet, source: PhotoSource) -> PhotoSource:
-    depths: DepthSource | None = None if source.depths is None else sheet.depths([source.depths])[0]
-    return replace(source, camera=sheet.moved(source.camera), depths=depths)
+    return [sheet.moved_photo(photos.sources[row]) for row in rows], photos.gains[rows]

@@ -22,7 +22,7 @@ from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.surface.elevation import Elevation
 from splatpipe.pipeline.surface.geotiff import GDAL_ERRORS, NODATA_HEIGHT, gdal
 from splatpipe.pipeline.surface.map_crs import MapCrs
-from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.surface.whole_file import whole_file, write_whole_text
 
 FORMAT = 1
 METRE_DIGITS = 4  # of lengths and coordinates in the JSON: a tenth of a millimetre
@@ -124,8 +124,7 @@ def write_facades(path: Path, facts: Sequence[dict[str, Any]], crs: MapCrs) -> N
         "depths": "metres before the plane, towards the viewer",
         "facades": list(facts),
     }
-    with whole_file(path) as aside:
-        aside.write_text(json_text(value), encoding="utf-8")
+    write_whole_text(path, json_text(value))
 
 
 def _plane(elevation: Elevation, crs: MapCrs) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, linear, loaded, sampled
 from splatpipe.pipeline.surface.sight import Points, place_in, sight
 
+COMPARED_AT = 4000  # places that all photos together are compared at: no matter of a capture's size
 MOST_GAIN = 2.0  # and one over it: more is not exposure
 DARKEST, LIGHTEST = 8, 247  # values that are not cut off
 REST = 3.0  # places' worth with which a photo keeps to its own exposure

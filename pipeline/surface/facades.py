@@ -25,17 +25,16 @@ from splatpipe.pipeline.surface.elevation_files import (
     write_facades,
     write_picture,
 )
-from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
 from splatpipe.pipeline.surface.facets import Facets, upright_facets
 from splatpipe.pipeline.surface.grid import DIGITS
-from splatpipe.pipeline.surface.map_crs import MapCrs
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
+from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.walls import Wall, find_walls, named, stated_wall
-from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.surface.whole_file import write_whole_text
 
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
-PLACES = 4000  # that photos' exposures are compared at
 LONGEST_TEXT = 10_000  # characters of stated lines
 Line = tuple[float, float, float, float]
 
@@ -45,18 +44,14 @@ class FacadesTask:
     """What façades are made from.
 
     Attributes:
-        photos: With their depths, local metres, always in the same order.
-        area: Walls whose middles lie outside of it are not drawn; None for all.
-        crs: Of corners and lines.
+        surface: The run's photos and depths; walls whose middles lie outside of its area are not drawn.
         pixel_m: Side of a pixel of the elevations; what it becomes has three digits.
         lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
             found.
         threads: Tiles at a time.
     """
 
-    photos: Sequence[PhotoSource]
-    area: PlanArea | None
-    crs: MapCrs
+    surface: RunSurface
     pixel_m: float
     lines: Sequence[Line]
     threads: int
@@ -80,14 +75,17 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         MachineError, OSError: if the disk is full or not writable.
     """
     report.progress(0, 1, "looking for walls")
+    crs, sources = open_map(task.surface.frame), task.surface.photos
     pixel_m = float(f"{task.pixel_m:.{DIGITS}g}")
-    facets = upright_facets([photo.depths for photo in task.photos if photo.depths is not None], task.threads)
-    walls = stated_walls(task.lines, facets, task.crs) if task.lines else _within(find_walls(facets), task.area)
+    facets = upright_facets(task.surface.depths, task.threads)
+    walls = stated_walls(task.lines, facets, crs) if task.lines else _within(find_walls(facets), task.surface.area)
     if not walls:
         report.progress(1, 1, "looking for walls")
         report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
-    places = facets.places[:: max(1, len(facets) // PLACES)]
-    photos = Photos(task.photos, exposure_gains(task.photos, places, 2.0 * pixel_m, task.threads), task.threads)
+        write_facades(out / LIST, [], crs)
+        return []
+    places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
+    photos = Photos(sources, exposure_gains(sources, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
     for number, wall in enumerate(walls):
 
@@ -96,9 +94,9 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
 
         own = out / f"{wall.name}.json"
         if not own.is_file():
-            _write(out, draw_elevation(wall, pixel_m, photos, progress), task.crs)
+            _write(out, draw_elevation(wall, pixel_m, photos, progress), crs)
         facts.append(json.loads(own.read_text(encoding="utf-8")))
-    write_facades(out / LIST, facts, task.crs)
+    write_facades(out / LIST, facts, crs)
     return facts
 
 
@@ -116,8 +114,10 @@ def parse_lines(text: str) -> list[Line]:
     Raises:
         UsageError: if it is anything else.
     """
+    if len(text) > LONGEST_TEXT:
+        raise UsageError(f"{len(text):,} characters of lines are too many.", hint="Draw them in several runs.")
     lines: list[Line] = []
-    for part in text[:LONGEST_TEXT].split(";") if text.strip() else ():
+    for part in text.split(";") if text.strip() else ():
         try:
             x1, y1, x2, y2 = (float(number) for number in part.split(","))
         except ValueError:
@@ -163,5 +163,4 @@ def _write(folder: Path, elevation: Elevation, crs: MapCrs) -> None:
     write_picture(folder / files["picture"], elevation)
     write_dxf_drawing(folder / files["dxf"], drawing)
     write_svg_drawing(folder / files["svg"], drawing, elevation.colour, f"Façade {name}")
-    with whole_file(folder / f"{name}.json") as aside:
-        aside.write_text(json_text(elevation_facts(elevation, crs, files)), encoding="utf-8")
+    write_whole_text(folder / f"{name}.json", json_text(elevation_facts(elevation, crs, files)))

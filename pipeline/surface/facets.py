@@ -11,11 +11,10 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthSource
 
 BLOCKS_A_PHOTO = 20_000  # of pixels, that a plane is laid through each: 20 cm of a wall in photos of a GSD of 3 cm
 LEAST_BLOCK = 6  # pixels a side: a smaller one's slope is noise
-LEAST_CONFIRMED = 2  # other photos, of a pixel that counts
 LEAST_SHARE = 0.6  # of a block's pixels that count
 ROUGH_PX = 3.0  # pixels' widths that a block's depths may scatter by about its plane: more are two surfaces
 UPRIGHT = 0.35  # upward part of a normal, at most: 20°, three deviations of a small block's

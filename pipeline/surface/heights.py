@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.holes import filled
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sight import sight
+from splatpipe.pipeline.surface.sight import Sight, sight
 from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, undecided
@@ -78,15 +78,7 @@ class Capture:
 
     def depths(self, number: int) -> DepthMap:
         """A photo's depths, loaded if they are not at hand."""
-        return self.shelf.get(number, partial(_loaded, self.sources[number]))
-
-
-def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
-    found = source.load()
-    shape = (found.camera.height, found.camera.width)
-    if found.depth.shape != shape or found.confidence.shape != shape:
-        raise ValueError(f"{found.camera.name}: depths of {found.depth.shape} for a camera of {shape}")
-    return found, found.depth.nbytes + found.confidence.nbytes
+        return self.shelf.get(number, self.sources[number].loaded)
 
 
 def surface_heights(capture: Capture, tiles: Sequence[Tile], threads: int) -> Iterator[Heights]:
@@ -164,11 +156,24 @@ def _may_see(
 ) -> Int64[np.ndarray, " a"]:
     """How many photos see places, or look there and have no depth."""
     count = np.zeros(len(asked), np.int64)
-    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
-    for number in reversed(numbers) if asked.size else ():
-        view = sight(capture.depths(number), (east, north, height), capture.lattice.cell_m)
+    for _, view in _views(capture, tile, asked, height[None], numbers):
         count += view.seen | view.unknown
     return count
+
+
+def _views(
+    capture: Capture,
+    tile: Tile,
+    asked: Int64[np.ndarray, " a"],
+    heights: Float64[np.ndarray, "l a"],
+    numbers: Sequence[int],
+) -> Iterator[tuple[int, Sight]]:
+    """What each photo says of places in some of a tile's cells, layer by layer, with the layer's number."""
+    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
+    for number in reversed(numbers) if asked.size else ():  # the last ones are still at hand
+        found = capture.depths(number)
+        for layer, height in enumerate(heights):
+            yield layer, sight(found, (east, north, height), capture.lattice.cell_m)
 
 
 def _joined(tile: Tile, halves: Sequence[Heights]) -> Heights:
@@ -208,13 +213,7 @@ def _balance(
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
     """How many more photos see a surface than ``BEHIND`` times those that look through it."""
-    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
     balance = np.zeros(heights.shape, np.int64)
-    if not asked.size:
-        return balance
-    for number in reversed(numbers):  # the last ones are still at hand; whole numbers add up in any order
-        found = capture.depths(number)
-        for layer, height in enumerate(heights):
-            view = sight(found, (east, north, height), capture.lattice.cell_m)
-            balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)
+    for layer, view in _views(capture, tile, asked, heights, numbers):  # whole numbers add up in any order
+        balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)
     return balance

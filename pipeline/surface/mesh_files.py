@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,8 +20,7 @@ from splatpipe.pipeline.surface.photo_samples import linear
 from splatpipe.pipeline.surface.triangles import ColouredMesh
 from splatpipe.pipeline.surface.whole_file import whole_file
 from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.georeference import georeference
-from splatpipe.pipeline.survey.handover import ply_comments
+from splatpipe.pipeline.survey.handover import georef_facts, ply_comments
 from splatpipe.pipeline.survey.sparse_scene import GLTF_FROM_WORLD
 
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125  # glTF's component types
@@ -31,14 +30,14 @@ MOST_SHORT = 65535
 UNLIT = "KHR_materials_unlit"
 
 
-def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, facts: Mapping[str, Any]) -> None:
+def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, boundary: Path | None) -> None:
     """Write `mesh.glb`, `mesh.ply` and `georef.json`, which places them, into a folder.
 
     Args:
         folder: Where.
         made: In the frame's local metres.
         frame: georef's.
-        facts: What `georef.json` says besides: the uncertainty, a boundary.
+        boundary: `georef.boundary`; None where the run has no such part.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -49,7 +48,7 @@ def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, facts: Mapping[st
         _write_ply(file, made, ply_comments(frame, antialias=False))
     vertices = made.mesh.vertices
     box = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
-    write_json(folder / "georef.json", {**georeference(frame, box), **facts})
+    write_json(folder / "georef.json", georef_facts(frame, box, boundary))
 
 
 def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
@@ -57,9 +56,22 @@ def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
     light = np.round(linear(made.colours / 255.0) * MOST_SHORT).astype("<u2")
     colours = np.column_stack([light, np.full(len(light), MOST_SHORT, "<u2")])  # 8 bytes a vertex: aligned
     triangles = made.mesh.triangles.astype("<u4")
+    arrays = (positions, colours, triangles)
+    text = json.dumps(_scene(*arrays), separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    length = sum(each.nbytes for each in arrays)
+    size = 12 + 8 + len(text) + 8 + length  # whole multiples of 4, all of them
+    file.write(struct.pack("<III", MAGIC, 2, size) + struct.pack("<II", len(text), JSON_CHUNK) + text)
+    file.write(struct.pack("<II", length, BINARY_CHUNK))
+    for each in arrays:
+        file.write(np.ascontiguousarray(each).data)
+
+
+def _scene(positions: np.ndarray, colours: np.ndarray, triangles: np.ndarray) -> dict[str, Any]:
+    """glTF's description of a mesh whose arrays follow each other in one buffer."""
     lengths = [each.nbytes for each in (positions, colours, triangles)]
     starts = np.concatenate([[0], np.cumsum(lengths)]).tolist()
-    scene = {
+    return {
         "asset": {"version": "2.0", "generator": "splatpipe"},
         "extensionsUsed": [UNLIT],
         "scene": 0,
@@ -99,13 +111,6 @@ def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
         ],
         "buffers": [{"byteLength": starts[-1]}],
     }
-    text = json.dumps(scene, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + starts[-1]  # whole multiples of 4, all of them
-    file.write(struct.pack("<III", MAGIC, 2, size) + struct.pack("<II", len(text), JSON_CHUNK) + text)
-    file.write(struct.pack("<II", starts[-1], BINARY_CHUNK))
-    for each in (positions, colours, triangles):
-        file.write(np.ascontiguousarray(each).data)
 
 
 def _write_ply(file: BinaryIO, made: ColouredMesh, comments: Sequence[str]) -> None:

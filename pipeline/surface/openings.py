@@ -97,7 +97,7 @@ def _level_rectangle(own: Bool[np.ndarray, "h w"]) -> Ring:
 
 def _traced(own: Bool[np.ndarray, "h w"]) -> Ring:
     """The outline of a part, few corners; cells are doubled, so that it lies on their borders, not their centres."""
-    fine = np.pad(np.kron(own, np.ones((2, 2), np.uint8)), 1).astype(np.uint8)
+    fine = np.pad(np.kron(own.view(np.uint8), np.ones((2, 2), np.uint8)), 1)
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(found, key=len)
     corners = np.asarray(cv2.approxPolyDP(longest, 2.0 * STRAIGHT_CELLS, True)).reshape(-1, 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,8 @@ from jaxtyping import Float64, UInt8
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.dsm import HELD_BYTES, height_range
-from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
 from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.height_field import HeightField
@@ -24,16 +23,15 @@ from splatpipe.pipeline.surface.mosaic import MARGIN
 from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, Album, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.pixel_file import pixels_on_disk
+from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.sheet import GridSheet, grid_sheets
 from splatpipe.pipeline.surface.sheet_work import Arrays, SheetWork
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.sources import Shelf
 from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.survey.frames import Frame
 
 PIXEL_BYTES = 1 << 30  # of decoded photos in memory; all together lie on the disk where they are more
 AROUND = 3  # cells of the surface model more than the pixels drawn need: heights between cells
-COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,22 +39,18 @@ class OrthoTask:
     """What an orthophoto is made from.
 
     Attributes:
-        frame: The run's.
-        site: What its photos show.
-        photos: Local metres, with their depths.
+        surface: The run's photos and depths.
+        site: What they show.
         dsm: `dsm.tif`.
         dsm_cell_m: Side of its cells on the ground.
-        area: Nothing outside of it is shown; None for all.
         gsd_m: Side of a pixel on the ground.
         threads: Tiles at a time.
     """
 
-    frame: Frame
+    surface: RunSurface
     site: Site
-    photos: Sequence[PhotoSource]
     dsm: Path
     dsm_cell_m: float
-    area: PlanArea | None
     gsd_m: float
     threads: int
 
@@ -77,14 +71,14 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
         SplatpipeError: if the grid would be absurdly large, or a photo is no longer what it was.
         MachineError: if the disk is full.
     """
-    grid = make_grid(task.frame, task.site.box, task.gsd_m)
-    heights = make_grid(task.frame, task.site.box, task.dsm_cell_m)
+    grid = make_grid(task.surface.frame, task.site.box, task.gsd_m)
+    heights = make_grid(task.surface.frame, task.site.box, task.dsm_cell_m)
     sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
-    making = SheetWork(sheets, task.site, task.area, TILE, work, report, "orthophoto")
+    making = SheetWork(sheets, task.site, task.surface.area, TILE, work, report, "orthophoto")
     work.mkdir(exist_ok=True)
-    with pixels_on_disk(task.photos, work, PIXEL_BYTES) as photos:
+    with pixels_on_disk(task.surface.photos, work, PIXEL_BYTES) as photos:
         gains = exposure_gains(photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
-        making.run(partial(_colours, replace(task, photos=photos), heights, gains, Shelf(PIXEL_BYTES)))
+        making.run(partial(_colours, task, heights, _Pictures(photos, gains, Shelf(PIXEL_BYTES))))
     known = 0
     with raster_file(out / "ortho.tif", grid, COLOURS) as file:
         for part, arrays in making.finished():
@@ -101,22 +95,23 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
     }
 
 
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """Photos whose pixels are at hand, as ``Album`` takes them."""
+
+    sources: Sequence[PhotoSource]
+    gains: Float64[np.ndarray, "n 3"]
+    pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]]
+
+
 def _colours(
-    task: OrthoTask,
-    heights: Grid,
-    gains: Float64[np.ndarray, "n 3"],
-    pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]],
-    sheet: GridSheet,
-    tiles: Sequence[Tile],
+    task: OrthoTask, heights: Grid, pictures: _Pictures, sheet: GridSheet, tiles: Sequence[Tile]
 ) -> Iterator[tuple[Tile, Arrays]]:
     """The colours of a sheet's tiles."""
     plane = sheet.sheet
-    moved = iter(plane.depths([photo.depths for photo in task.photos if photo.depths is not None]))
-    photos = [
-        replace(photo, camera=plane.moved(photo.camera), depths=photo.depths and next(moved)) for photo in task.photos
-    ]
+    photos = [plane.moved_photo(photo) for photo in pictures.sources]
     surface = _surface(sheet, task.dsm, heights)
-    album = Album(photos, surface, plane.lattice, plane.relief, gains, pixels, Shelf(HELD_BYTES))
+    album = Album(photos, surface, plane.lattice, plane.relief, pictures.gains, pictures.pixels, Shelf(HELD_BYTES))
     for part in orthophotos(album, tiles, task.threads):
         alpha = np.where(part.known, 255, 0).astype(np.uint8)
         yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}

@@ -15,7 +15,7 @@ from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best, spread
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, loader, rated, sampled, tone_curve
 from splatpipe.pipeline.surface.sight import Points, contiguous, sight
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.sources import DepthMap, Relief, Shelf, seen_by
 from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells a side
@@ -75,7 +75,7 @@ def orthophotos(album: Album, tiles: Sequence[Tile], threads: int) -> Iterator[O
         threads: Tiles at a time.
 
     Raises:
-        ValueError: if pixels do not fit their camera.
+        ValueError: if pixels or depths do not fit their camera.
     """
     return ordered_map(partial(tile_orthophoto, album), tiles, threads)
 
@@ -124,7 +124,7 @@ def _rated(
         source = album.sources[number]
         if source.depths is None:
             continue
-        view = sight(album.depths.get(number, partial(_loaded, source.depths)), points, 0.0)
+        view = sight(album.depths.get(number, source.depths.loaded), points, 0.0)
         each, there = rated(source.camera, points, album.lattice.cell_m, view.said)
         if there.any():
             cost[len(found)], seen[len(found)] = each, there
@@ -137,8 +137,3 @@ def _joined(tile: Tile, halves: Sequence[Orthophoto]) -> Orthophoto:
     axis = 0 if halves[0].tile.width == tile.width else 1
     columns = zip(*((half.colour, half.photos, half.label, half.known) for half in halves), strict=True)
     return Orthophoto(tile, *(np.concatenate(column, axis=axis) for column in columns))
-
-
-def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
-    found = source.load()
-    return found, found.depth.nbytes + found.confidence.nbytes

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
@@ -13,7 +12,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sight import Place, Sight, place_in, sight
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, PhotoWindow, Relief, Shelf, window_of
+from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, Shelf, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 
 EVERY = 4  # pixels, of which one is looked at where heights are looked for
@@ -48,7 +47,7 @@ class PhotoSet:
         """
         source = self.sources[number].depths
         assert source is not None
-        return self.depths.get(number, partial(_loaded, source))
+        return self.depths.get(number, source.loaded)
 
     def parts_in(self, lattice: Lattice, tile: Tile, relief: Relief) -> list[DepthPart]:
         """The parts of all photos' depths that may lie in a tile, between the heights that there are in it.
@@ -104,14 +103,6 @@ def place_of(
     ray = turned(camera.cam_from_world[:3, :3].T, x, y)
     centre = camera.centre()
     return np.stack([centre[axis] + ray[axis] / inverse for axis in range(3)])
-
-
-def _loaded(source: DepthSource) -> tuple[DepthMap, int]:
-    found = source.load()
-    shape = (found.camera.height, found.camera.width)
-    if found.depth.shape != shape or found.confidence.shape != shape:
-        raise ValueError(f"{found.camera.name}: depths of {found.depth.shape} for a camera of {shape}")
-    return found, found.depth.nbytes + found.confidence.nbytes
 
 
 def turned(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded, sampled, tone_curve
 from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet, look_at, place_of
 from splatpipe.pipeline.surface.sight import place_in
@@ -19,7 +19,6 @@ from splatpipe.pipeline.surface.sources import DepthMap, Shelf
 COARSE = 4  # power of the footprint that a photo's weight falls with: one half as fine counts a sixteenth
 MIXED = 0.01  # weight where a nearer surface lies in the next pixel of the depths: its colour may be mixed in
 BATCH = 1 << 17  # points at a time
-COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
 HELD_BYTES = 300 << 20  # of depths in memory
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter
@@ -25,25 +25,10 @@ from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.undistortion import Placed, place, read_flown
 from splatpipe.pipeline.surface.photo_samples import Lens, PhotoSource
 from splatpipe.pipeline.surface.site import Site, load_site
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, MetricMap
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 
 LENS_STEP = 8.0  # pixels
-
-
-@dataclass(frozen=True, eq=False)
-class MetricMap:
-    """A depth map in local metres.
-
-    Attributes:
-        camera: In the map's grid.
-        depth: Along the camera's z, metres; 0 where none is known.
-        confidence: How many other photos confirm it.
-    """
-
-    camera: Camera
-    depth: Float32[np.ndarray, "h w"]
-    confidence: UInt8[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +37,8 @@ class RunSurface:
 
     Attributes:
         frame: The run's, in metres.
-        area: Its boundary; None for all.
+        area: Nothing outside of it is shown; None for all.
+        boundary: The part that tells the area; None where the run has none.
         depths: Of its photos.
         photos: As flown, those with depths and others.
         finer: How many pixels of a photo as flown lie along one of its depths, the middle one of all.
@@ -60,6 +46,7 @@ class RunSurface:
 
     frame: Frame
     area: PlanArea | None
+    boundary: Path | None
     depths: tuple[DepthSource, ...]
     photos: tuple[PhotoSource, ...]
     finer: float
@@ -88,23 +75,29 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
     photos = photo_sources(placed, depths, local_from_model, (inputs["ingest.photos"], inputs.photos_dir))
     focal = {view.photo.name: view.source.mean_focal_length() for view in placed}
     finer = statistics.median(focal.get(name, each.camera.fx) / each.camera.fx for name, each in depths.items())
-    area = read_world_area(inputs.parts.get("georef.boundary"))
-    return RunSurface(frame, area, tuple(depths.values()), tuple(photos), finer)
+    boundary = inputs.parts.get("georef.boundary")
+    return RunSurface(frame, read_world_area(boundary), boundary, tuple(depths.values()), tuple(photos), finer)
 
 
-def open_surveyed(inputs: Inputs, report: Reporter) -> tuple[RunSurface, Site, float] | None:
-    """The same, with the site that `dsm` left and the side of its cells; None where there is no surface model.
+def open_surveyed(wanted: bool, inputs: Inputs, report: Reporter) -> tuple[RunSurface, Site, float] | None:
+    """The same, with the site that `dsm` left and the side of its cells.
+
+    None, which is told, where there is no surface model or nothing is wanted.
 
     Args:
+        wanted: Whether the stage's product is asked for.
         inputs: Of a stage that reads `dsm.site` besides.
         report: As above.
 
     Raises:
         SplatpipeError: as above.
     """
-    surveyed = load_site(inputs["dsm.site"])
+    surveyed = load_site(inputs["dsm.site"]) if wanted else None
     surface = None if surveyed is None else open_run_surface(inputs, report)
-    return None if surveyed is None or surface is None else (surface, *surveyed)
+    if surveyed is None or surface is None:
+        report.progress(1, 1, "nothing is made", "steps")
+        return None
+    return surface, *surveyed
 
 
 def metric_depths(maps: Sequence[KeptMap], local_from_model: Similarity) -> list[DepthSource]:

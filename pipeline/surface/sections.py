@@ -18,13 +18,12 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.ground_scale import ground_metres
 from splatpipe.pipeline.surface.map_crs import MapCrs
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthSource
 from splatpipe.pipeline.surface.surface_file import SurfaceFile
 
 SAMPLES_A_CELL = 2.0  # along the line, so that no cell that it crosses for some length is left out
 MOST_SAMPLES = 2_000_000  # 20 km at 2 cm: more is a wrong coordinate
 THICKNESS_CELLS = 1.5  # on either side of the plane, from where points are taken
-LEAST_CONFIRMED = 2  # photos that confirm a depth
 LEAST_PHOTOS = 2  # that have a point in a cell of the section
 
 Line = tuple[float, float, float, float]

@@ -7,16 +7,17 @@ is the highest there. A large raster is drawn on many small sheets, so that each
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.grid import Grid
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief
+from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, MetricMap, Relief
 from splatpipe.pipeline.surface.tiles import Tile, tiled
 
 SIDE = 2048  # cells of a sheet of the ground: four blocks of the files
@@ -51,26 +52,20 @@ class Sheet:
         back[:3, 3] = -back[:3, :3] @ self.from_local[:3, 3]
         return replace(camera, cam_from_world=camera.cam_from_world @ back)
 
-    def depths(self, sources: Sequence[DepthSource]) -> list[DepthSource]:
-        """Depths of the local frame's photos as the sheet's cameras see them."""
-        return [_moved(source, self.moved(source.camera)) for source in sources]
+    def moved_depths(self, source: DepthSource) -> DepthSource:
+        """Depths of a photo of the local frame in the sheet's."""
+        camera = self.moved(source.camera)
 
+        def load() -> DepthMap:
+            found = source.load()
+            return MetricMap(camera, found.depth, found.confidence)
 
-@dataclass(frozen=True, eq=False)
-class _Moved:
-    """A depth map whose camera was moved."""
+        return DepthSource(camera, load)
 
-    camera: Camera
-    depth: Float32[np.ndarray, "h w"]
-    confidence: UInt8[np.ndarray, "h w"]
-
-
-def _moved(source: DepthSource, camera: Camera) -> DepthSource:
-    def load() -> DepthMap:
-        found = source.load()
-        return _Moved(camera, found.depth, found.confidence)
-
-    return DepthSource(camera, load)
+    def moved_photo(self, photo: PhotoSource) -> PhotoSource:
+        """A photo of the local frame, with its depths, in the sheet's."""
+        depths = None if photo.depths is None else self.moved_depths(photo.depths)
+        return replace(photo, camera=self.moved(photo.camera), depths=depths)
 
 
 @dataclass(frozen=True, eq=False)

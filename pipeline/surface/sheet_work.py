@@ -10,10 +10,10 @@ import numpy as np
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.surface.sheet import GridSheet
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.surface.whole_file import whole_file
 
 Arrays = dict[str, np.ndarray]
 
@@ -58,8 +58,7 @@ class SheetWork:
                     self._take(whole, sheet, tile, arrays)
                     done += 1
                     self.report.progress(done, total, self.what, "tiles")
-                with whole_file(path) as aside, aside.open("wb") as file:
-                    np.savez(file, **whole)  # type: ignore[arg-type]
+                save_arrays(path, **whole)
             else:
                 done += len(tiles)
 

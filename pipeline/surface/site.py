@@ -20,17 +20,17 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthSource
 
 SAMPLES = 3000  # depths of a photo, evenly
 CELL_GSD = 100.0  # ground sample distances of a plan cell: so many samples of a photo lie in each that it sees
+MOST_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
 LEAST_PHOTOS = 3  # that see a place
 FARTHEST = 4.0  # pixels on the ground so many times the usual are of the far land, which no product shows
 LEAST_PART = 0.02  # of what is seen: smaller parts that lie by themselves are left out
 NOISE = 0.001  # of the samples, the lowest and the highest, that may be wrong
 MARGIN = 0.1  # of the relief, below and above, for what samples missed,
 LEAST_MARGIN_M = 3.0  # and at least so much: a mast or a well
-CONFIRMED = 2  # photos that confirm a depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def load_site(path: Path) -> tuple[Site, float] | None:
         if told is None:
             return None
         shape = int(told["rows"]), int(told["columns"])
-        bits = np.unpackbits(np.frombuffer(bytes.fromhex(told["covered"]), np.uint8), count=shape[0] * shape[1])
+        bits = np.unpackbits(np.frombuffer(bytes.fromhex(told["covered"]), np.uint8))[: shape[0] * shape[1]]
         gsd, low, high, cell, dsm_cell = (
             float(told[name]) for name in ("gsd_m", "low_m", "high_m", "cell_m", "dsm_cell_m")
         )
@@ -154,7 +154,7 @@ def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
     row, column = (grid.ravel() for grid in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
-    sure = (found.depth[row, column] > 0.0) & (found.confidence[row, column] >= CONFIRMED)
+    sure = (found.depth[row, column] > 0.0) & (found.confidence[row, column] >= LEAST_CONFIRMED)
     row, column = row[sure], column[sure]
     depth = found.depth[row, column].astype(np.float64)
     points = camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), depth)
@@ -167,7 +167,7 @@ def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
 def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "rows columns"]:
     """Cells that enough photos see and that are not off by themselves."""
     columns, rows = cell.max(axis=0) + 1
-    if rows * columns > 1 << 28:
+    if rows * columns > MOST_CELLS:
         raise SplatpipeError("The photos' depths reach too far for a surface.", "Set a --boundary.")
     place = cell[:, 1] * columns + cell[:, 0]
     pairs = np.unique(np.stack([place, number], axis=1), axis=0)

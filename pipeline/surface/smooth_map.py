@@ -34,7 +34,7 @@ class SmoothMap:
     squares: Float64[np.ndarray, "rows columns 8 3"]
 
     def __call__(self, points: Points) -> Points:
-        """The map of points; beyond the lattice the squares at its rim go on."""
+        """The map of points, nan of nan; beyond the lattice the squares at its rim go on."""
         found = np.empty_like(points)
         for start in range(0, len(points), CHUNK):
             found[start : start + CHUNK] = self._map(points[start : start + CHUNK])
@@ -43,8 +43,8 @@ class SmoothMap:
     def _map(self, points: Points) -> Points:
         x, y, z = ((points - self.low) / self.step).T
         rows, columns = self.squares.shape[:2]
-        column = np.clip(x.astype(np.int64), 0, columns - 1)
-        row = np.clip(y.astype(np.int64), 0, rows - 1)
+        column = np.clip(np.nan_to_num(x), 0, columns - 1).astype(np.int64)
+        row = np.clip(np.nan_to_num(y), 0, rows - 1).astype(np.int64)
         x, y = x - column, y - row
         terms = np.stack([np.ones_like(x), x, y, x * y, z, z * x, z * y, z * x * y], axis=1)
         squares = self.squares.reshape(-1, 8, 3)

@@ -17,6 +17,7 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 Loaded = TypeVar("Loaded")
 
+LEAST_CONFIRMED = 2  # other photos that confirm a depth that clouds, meshes, walls and sections are made from
 REACH_PX = 4  # pixels around a tile in a photo: more than slopes and filters look at
 
 
@@ -39,6 +40,15 @@ class DepthMap(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class MetricMap:
+    """A ``DepthMap`` in local metres, or in those of a sheet that things are drawn on."""
+
+    camera: Camera
+    depth: Float32[np.ndarray, "h w"]
+    confidence: UInt8[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
 class DepthSource:
     """Where a photo's depths come from.
 
@@ -49,6 +59,18 @@ class DepthSource:
 
     camera: Camera
     load: Callable[[], DepthMap]
+
+    def loaded(self) -> tuple[DepthMap, int]:
+        """The map and its size in memory, as a shelf wants it.
+
+        Raises:
+            ValueError: if it is not of its camera's size.
+        """
+        found = self.load()
+        shape = (found.camera.height, found.camera.width)
+        if found.depth.shape != shape or found.confidence.shape != shape:
+            raise ValueError(f"{found.camera.name}: depths of {found.depth.shape} for a camera of {shape}")
+        return found, found.depth.nbytes + found.confidence.nbytes
 
 
 class Shelf(Generic[Loaded]):

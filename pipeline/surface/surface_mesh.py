@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,15 @@ from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.surface.blocks import Box, surface_blocks
+from splatpipe.pipeline.mvs.array_file import save_arrays
+from splatpipe.pipeline.surface.blocks import surface_blocks
 from splatpipe.pipeline.surface.mesh_files import write_mesh
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet
 from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
+from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, without_crumbs
 from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
-from splatpipe.pipeline.surface.whole_file import whole_file
-from splatpipe.pipeline.survey.frames import Frame
 
 MOST_BLOCKS = 120_000  # of voxels: 0.5 GB, and about 5 million triangles before decimation; beyond it voxels are larger
 CRUMB_VOXELS = 200.0  # faces of voxels: a piece of a smaller area hangs in the air, or is nobody's interest
@@ -35,25 +32,21 @@ class MeshTask:
     """What a mesh is made from.
 
     Attributes:
-        frame: The run's.
-        site: What its photos show.
-        photos: Local metres, with their depths.
-        area: A boundary: triangles all of whose corners lie inside are kept; None for all.
+        surface: The run's photos and depths; triangles all of whose corners lie inside of its area are kept.
+        site: What they show.
         voxel_m: Side of the voxels, 2 GSD; larger where the site is.
         most_triangles: In the end.
         threads: Photos at a time.
     """
 
-    frame: Frame
+    surface: RunSurface
     site: Site
-    photos: Sequence[PhotoSource]
-    area: PlanArea | None
     voxel_m: float
     most_triangles: int
     threads: int
 
 
-def make_mesh(task: MeshTask, work: Path, out: Path, facts: Mapping[str, Any], report: Reporter) -> dict[str, Any]:
+def make_mesh(task: MeshTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
     """Write `mesh.glb`, `mesh.ply` and `georef.json`; the same bits for any number of threads.
 
     A killed one goes on from the whole mesh before it is decimated, if it came so far.
@@ -62,7 +55,6 @@ def make_mesh(task: MeshTask, work: Path, out: Path, facts: Mapping[str, Any], r
         task: What it is made from.
         work: Folder of what is kept meanwhile.
         out: Where the files go.
-        facts: What `georef.json` says besides: the uncertainty, a boundary.
         report: Told of progress.
 
     Returns:
@@ -74,7 +66,7 @@ def make_mesh(task: MeshTask, work: Path, out: Path, facts: Mapping[str, Any], r
         ValueError: if depths or pixels do not fit their camera.
     """
     open3d()
-    photos = photo_set(task.photos, task.voxel_m, task.threads)
+    photos = photo_set(task.surface.photos, task.voxel_m, task.threads)
     work.mkdir(exist_ok=True)
     kept = work / "fine.npz"
     if not kept.is_file():
@@ -83,7 +75,8 @@ def make_mesh(task: MeshTask, work: Path, out: Path, facts: Mapping[str, Any], r
     report.progress(0, 1, "decimating the mesh", "meshes")
     mesh = decimated(mesh, task.most_triangles)
     report.progress(1, 1, "decimating the mesh", "meshes")
-    write_mesh(out, ColouredMesh(mesh, vertex_colours(photos, mesh, task.threads)), task.frame, facts)
+    made = ColouredMesh(mesh, vertex_colours(photos, mesh, task.threads))
+    write_mesh(out, made, task.surface.frame, task.surface.boundary)
     return {
         "triangles": len(mesh.triangles),
         "vertices": len(mesh.vertices),
@@ -93,8 +86,7 @@ def make_mesh(task: MeshTask, work: Path, out: Path, facts: Mapping[str, Any], r
 
 
 def _keep(path: Path, mesh: TriangleMesh, voxel_m: float) -> None:
-    with whole_file(path) as aside, aside.open("wb") as file:
-        np.savez(file, vertices=mesh.vertices, triangles=mesh.triangles, voxel_m=np.float64(voxel_m))
+    save_arrays(path, vertices=mesh.vertices, triangles=mesh.triangles, voxel_m=np.array(voxel_m))
 
 
 def _kept(path: Path) -> tuple[TriangleMesh, float]:
@@ -104,13 +96,13 @@ def _kept(path: Path) -> tuple[TriangleMesh, float]:
 
 def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[TriangleMesh, float]:
     """The mesh before it is decimated, and the side of its voxels, metres."""
-    box = Box(*task.site.box)
+    box = task.site.box
     blocks = surface_blocks(photos, box, task.voxel_m, MOST_BLOCKS, task.threads)
     if blocks.voxel_m > task.voxel_m:
         report.note(f"The mesh has voxels of {blocks.voxel_m:.3g} m, not {task.voxel_m:.3g} m: the site is large.")
     mesh = tsdf_mesh(photos, box, blocks, task.threads, report)
-    if task.area is not None:
-        mesh = mesh.select(task.area.contains(mesh.vertices)[mesh.triangles].all(axis=1))
+    if task.surface.area is not None:
+        mesh = mesh.select(task.surface.area.contains(mesh.vertices)[mesh.triangles].all(axis=1))
     mesh = without_crumbs(mesh, CRUMB_VOXELS * blocks.voxel_m**2)
     if not len(mesh.triangles):
         raise SplatpipeError(

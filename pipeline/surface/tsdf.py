@@ -52,7 +52,7 @@ def tsdf_mesh(photos: PhotoSet, box: Box, blocks: Blocks, threads: int, report: 
         photos: With their depths.
         box: What of the world counts.
         blocks: Where the surface is.
-        threads: Photos at a time where depths are read, and open3d's.
+        threads: Photos at a time where depths are read.
         report: Told of progress.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Any
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.volumes import Amount, Volume
-from splatpipe.pipeline.surface.whole_file import whole_file
+from splatpipe.pipeline.surface.whole_file import write_whole_text
 
 FORMAT = 1
 DIGITS = 4
@@ -32,8 +32,7 @@ def write_volumes(path: Path, facts: Sequence[Mapping[str, Any]], crs: MapCrs) -
         OSError: if the disk is full or not writable.
     """
     value = {"format": FORMAT, "crs": crs.horizontal.name, "heights": crs.described_heights(), "uncertainty": HOW}
-    with whole_file(path) as aside:
-        aside.write_text(json_text({**value, "volumes": list(facts)}), encoding="utf-8")
+    write_whole_text(path, json_text({**value, "volumes": list(facts)}))
 
 
 def volume_facts(number: int, name: str, volume: Volume) -> dict[str, Any]:

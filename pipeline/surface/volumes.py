@@ -30,6 +30,7 @@ SHARED_CELLS = 1.0  # two cells' noise goes together by exp(-d² / 4 s²), d the
 SHARED_ALONG = 2.0 * math.sqrt(math.pi) * SHARED_CELLS  # that sum over a line of cells,
 SHARED_AROUND = 4.0 * math.pi * SHARED_CELLS**2  # and over an area
 RIM_CELLS = 1.0  # between places on the rim
+MOST_RIM = 1_000_000  # such places: 20 km at 2 cm, more is a wrong coordinate
 LEAST_RIM = 12  # places with heights that a plane is laid through
 LEAST_RIM_SHARE = 0.5  # of the rim that has heights: of less, nobody knows how the base goes on
 LOWEST_OF = 5  # neighbouring places whose median is one height: a single cell may be a hole's
@@ -129,10 +130,13 @@ def measure_volume(
         datum_sigma_m: Expected deviation of all heights together: counts where a height is stated.
 
     Raises:
-        SplatpipeError: if the outline lies outside of the surface, or too little of it has heights for its base.
+        SplatpipeError: if the outline is absurdly long, lies outside of the surface, or too little of it has heights
+            for its base.
     """
     rings = [tuple(_in_crs(ring, crs) for ring in polygon) for polygon in area.polygons]
     ground = _Ground(surface, PlanArea.seen_from_above(rings), ground_metres(crs), crs.height_unit_m)
+    if not sum(_lengths(ring)[-1] for ring in ground.rings()) <= MOST_RIM * RIM_CELLS * surface.cell:
+        raise SplatpipeError("The polygon's outline is far too long.", "Check its coordinates and its CRS.")
     plane = _base(ground, base, datum_sigma_m)
     sums = _Sums.zero()
     for part in _windows(ground):
@@ -173,10 +177,16 @@ def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
 
 def _along(ring: Ring, step: float) -> Float64[np.ndarray, "n 2"]:
     """Places on a closed outline, evenly."""
-    closed = np.concatenate([ring, ring[:1]])
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-    at = np.arange(max(LEAST_RIM, round(way[-1] / step))) / max(LEAST_RIM, round(way[-1] / step)) * way[-1]
+    closed, way = np.concatenate([ring, ring[:1]]), _lengths(ring)
+    count = max(LEAST_RIM, round(way[-1] / step))
+    at = np.arange(count) / count * way[-1]
     return np.stack([np.interp(at, way, closed[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _lengths(ring: Ring) -> Float64[np.ndarray, " n"]:
+    """How long a closed outline is up to each of its vertices, and as a whole."""
+    closed = np.concatenate([ring, ring[:1]])
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
 
 
 def _told(sigma: Float64[np.ndarray, " *n"], cell_m: float) -> Float64[np.ndarray, " *n"]:

@@ -40,3 +40,13 @@ def whole_file(path: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     sync_folder(path.parent)
+
+
+def write_whole_text(path: Path, text: str) -> None:
+    """Write a text as UTF-8 likewise.
+
+    Raises:
+        OSError: as ``whole_file``.
+    """
+    with whole_file(path) as aside:
+        aside.write_text(text, encoding="utf-8")

@@ -12,11 +12,12 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.geometry.plan_area import PlanArea
+from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import MIP_COMMENT
 from splatpipe.pipeline.survey.crs import utm_of
 from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.georeference import georeference
 
 
 def in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
@@ -82,8 +83,24 @@ def bounded_comments(inside: int | None, gaussians: int) -> list[str]:
     return [f"boundary: the first {inside} Gaussians lie inside, the other {gaussians - inside} are a backdrop"]
 
 
-def boundary_facts(area: PlanArea, part: Path) -> dict[str, Any]:
-    """What `georef.json` says of a boundary: its size and its polygons, in the world frame and as GeoJSON's rings.
+def georef_facts(frame: Frame, box: Float64[np.ndarray, "2 3"], boundary: Path | None) -> dict[str, Any]:
+    """What `georef.json` says beside what is handed over: where it lies, how surely, and a boundary if there is one.
+
+    Args:
+        frame: georef's.
+        box: Of what is handed over, in the world frame.
+        boundary: `georef.boundary`; None where the run has no such part.
+
+    Raises:
+        StageError: if the boundary cannot be read.
+    """
+    area = read_world_area(boundary)
+    bounded = {} if area is None or boundary is None else {"boundary": _boundary_facts(area, boundary)}
+    return {**georeference(frame, box), "uncertainty": frame.residuals.get("uncertainty"), **bounded}
+
+
+def _boundary_facts(area: PlanArea, part: Path) -> dict[str, Any]:
+    """A boundary's size and its polygons, in the world frame and as GeoJSON's rings.
 
     Args:
         area: In the world frame.

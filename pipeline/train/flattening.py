@@ -122,8 +122,10 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> Course:
 def _sky(trained: TrainedParts, views: Sequence[View], threads: int) -> SkyModel | None:
     """The trained panorama, with the skies found in the photos again; None where there is none."""
     panorama = read_panorama(trained.sky)
-    found = None if panorama is None else SkyModel.begin(views, trained.dataset, threads)
-    return None if panorama is None or found is None else SkyModel.given(panorama, found.masks)
+    if panorama is None:
+        return None
+    found = SkyModel.begin(views, trained.dataset, threads)
+    return None if found is None else SkyModel.given(panorama, found.masks)
 
 
 def options_of(gaussians: Gaussians, rendering: Rendering, has_exposures: bool) -> TrainConfig:

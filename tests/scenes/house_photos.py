@@ -1,14 +1,19 @@
 """The house's photos with their depths, as a run has them: exact, or with patches of nonsense."""
 
+from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from house_site import RIDGE_M, ROOF, TREE, WALLS, Array, ExactDepths, cameras, depths_of, photo_of
 from numpy.typing import NDArray
 
+from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.sources import DepthSource
+from splatpipe.pipeline.survey.frames import Frame
 
 GSD_M = 0.1
 SIDE_M = 10.0  # of what is made into clouds and meshes: the house, and lawn around it
@@ -70,6 +75,14 @@ def surface_distances(points: Array) -> Array:
         beside = (np.abs(across) < end + 0.05) & (up < RIDGE_M)
         parts.append(np.where(beside, np.abs(np.abs(along) - half), np.inf))
     return np.min(parts, axis=0)
+
+
+def run_surface(
+    frame: Frame, sources: Sequence[PhotoSource], area: PlanArea | None = None, boundary: Path | None = None
+) -> RunSurface:
+    """Photos as a run's, whose depths are as fine as they."""
+    depths = tuple(source.depths for source in sources if source.depths is not None)
+    return RunSurface(frame, area, boundary, depths, tuple(sources), 1.0)
 
 
 class Recorder:

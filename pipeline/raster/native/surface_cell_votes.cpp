@@ -27,6 +27,19 @@ std::int64_t steps_of(std::uint64_t key) {
     return static_cast<std::int64_t>(key >> (kCoverBits + kConfidenceBits) & ((std::uint64_t{1} << kStepBits) - 1));
 }
 
+// Puts what was found in cells into the cells' order, each cell's as it came; `starts` says where cells begin.
+template <class T, class CellOf>
+void sort_by_cell(const std::vector<T>& from, int cells, CellOf cell_of_one, std::vector<T>* to,
+                  std::vector<std::size_t>* starts) {
+    std::vector<std::size_t>& places = *starts;  // of a cell's next one, a cell on: in the end, where the next begins
+    places.assign(static_cast<std::size_t>(cells) + 2, 0);
+    for (const T& one : from) ++places[static_cast<std::size_t>(cell_of_one(one)) + 2];
+    for (std::size_t cell = 1; cell < places.size(); ++cell) places[cell] += places[cell - 1];
+    to->resize(from.size());
+    for (const T& one : from) (*to)[places[static_cast<std::size_t>(cell_of_one(one)) + 1]++] = one;
+    places.pop_back();
+}
+
 // Expected deviation of a height: of a pixel on the ground, which is longer where the ray is flat.
 double sigma_of(const SurfaceCamera& camera, const CellTile& tile, int cell, double height) {
     const double east = tile.east + (tile.column + cell % tile.width + 0.5) * tile.cell - camera.centre[0];
@@ -145,13 +158,7 @@ void CellVotes::read_window(const DepthPicture& picture, int left, int top, int 
 }
 
 void CellVotes::sort_keys() {
-    starts_.assign(static_cast<std::size_t>(cells()) + 1, 0);
-    for (std::uint64_t key : keys_) ++starts_[static_cast<std::size_t>(cell_of(key)) + 1];
-    for (std::size_t cell = 1; cell < starts_.size(); ++cell) starts_[cell] += starts_[cell - 1];
-    sorted_keys_.resize(keys_.size());
-    for (std::uint64_t key : keys_) sorted_keys_[starts_[static_cast<std::size_t>(cell_of(key))]++] = key;
-    for (std::size_t cell = starts_.size() - 1; cell > 0; --cell) starts_[cell] = starts_[cell - 1];
-    starts_[0] = 0;
+    sort_by_cell(keys_, cells(), cell_of, &sorted_keys_, &starts_);
     for (std::size_t cell = 0; cell + 1 < starts_.size(); ++cell)
         std::sort(sorted_keys_.begin() + static_cast<std::ptrdiff_t>(starts_[cell]),
                   sorted_keys_.begin() + static_cast<std::ptrdiff_t>(starts_[cell + 1]));
@@ -189,13 +196,8 @@ void CellVotes::vote(const SurfaceCamera& camera, std::size_t begin, std::size_t
 
 void CellVotes::sort_votes() {
     if (sorted_) return;
-    starts_.assign(static_cast<std::size_t>(cells()) + 1, 0);
-    for (const Vote& vote : votes_) ++starts_[static_cast<std::size_t>(vote.cell) + 1];
-    for (std::size_t cell = 1; cell < starts_.size(); ++cell) starts_[cell] += starts_[cell - 1];
-    std::vector<Vote> sorted(votes_.size());
-    for (const Vote& vote : votes_) sorted[starts_[static_cast<std::size_t>(vote.cell)]++] = vote;
-    for (std::size_t cell = starts_.size() - 1; cell > 0; --cell) starts_[cell] = starts_[cell - 1];
-    starts_[0] = 0;
+    std::vector<Vote> sorted;
+    sort_by_cell(votes_, cells(), [](const Vote& vote) { return vote.cell; }, &sorted, &starts_);
     votes_ = std::move(sorted);
     for (std::size_t cell = 0; cell + 1 < starts_.size(); ++cell)  // photos come in one order: equal heights keep it
         std::stable_sort(votes_.begin() + static_cast<std::ptrdiff_t>(starts_[cell]),
