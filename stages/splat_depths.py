@@ -22,7 +22,7 @@ from splatpipe.pipeline.render.rendering import as_trained, render_depth, render
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.blocks.site_plan import is_in_blocks
-from splatpipe.pipeline.train.flattening import TrainedParts, flatten
+from splatpipe.pipeline.train.flattening import FLATTENED, TrainedParts, flatten
 from splatpipe.pipeline.train.options import SplatDepthsConfig
 
 RenderDepth = Callable[[Gaussians, Camera, RenderOptions], Float[np.ndarray, "h w"]]
@@ -55,7 +55,10 @@ def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) 
             return render(placed, camera, options)
 
         found = rendered_depth_maps(depth_of, dataset, cameras, rendered, inputs.machine.threads, report)
-        return {"gaussians": len(gaussians), **keep_depth_maps(maps, found)}
+        summary = keep_depth_maps(maps, found)
+    shutil.rmtree(rendered)
+    (out / FLATTENED).unlink(missing_ok=True)
+    return {"gaussians": len(gaussians), **summary}
 
 
 def _model(inputs: Inputs, out: Path, report: Reporter) -> tuple[Gaussians, RenderDepth]:
