@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatpipe.pipeline.engine.stage import NamedFile, Shards, Stage, StageConfig
+from splatpipe.pipeline.engine.stage import NamedFile, Shards, Stage
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
@@ -270,29 +270,6 @@ SURFACE_READS = (
     "georef.boundary",
     "ingest.photos",
 )
-
-
-def _product(name: str, version: int, config: type[StageConfig], *reads: str) -> Stage:
-    """A stage that makes something on the site that `dsm` found, and hands over its folder `files`.
-
-    Args:
-        name: Of the stage and its module.
-        version: Of the stage.
-        config: Its options.
-        reads: Parts that it reads besides those of the site and the photos.
-    """
-    return Stage(
-        name,
-        version=version,
-        config=config,
-        reads=(*reads, "dsm.site", *SURFACE_READS),
-        parts={"files": "files"},
-        entry=f"splatpipe.stages.{name}:run",
-        resumable=True,
-        deliverables=("files",),
-    )
-
-
 DSM = Stage(
     "dsm",
     version=1,
@@ -303,10 +280,46 @@ DSM = Stage(
     resumable=True,
     deliverables=("files",),
 )
-ORTHO = _product("ortho", 1, OrthoConfig, "dsm.files")
-FACADES = _product("facades", 1, FacadesConfig)
-CLOUD = _product("cloud", 1, CloudConfig)
-MESH = _product("mesh", 1, MeshConfig)
+ORTHO = Stage(
+    "ortho",
+    version=2,
+    config=OrthoConfig,
+    reads=("dsm.files", "dsm.site", *SURFACE_READS),
+    parts={"files": "files"},
+    entry="splatpipe.stages.ortho:run",
+    resumable=True,
+    deliverables=("files",),
+)
+FACADES = Stage(
+    "facades",
+    version=2,
+    config=FacadesConfig,
+    reads=("dsm.site", *SURFACE_READS),
+    parts={"files": "files"},
+    entry="splatpipe.stages.facades:run",
+    resumable=True,
+    deliverables=("files",),
+)
+CLOUD = Stage(
+    "cloud",
+    version=2,
+    config=CloudConfig,
+    reads=("dsm.site", *SURFACE_READS),
+    parts={"files": "files"},
+    entry="splatpipe.stages.cloud:run",
+    resumable=True,
+    deliverables=("files",),
+)
+MESH = Stage(
+    "mesh",
+    version=2,
+    config=MeshConfig,
+    reads=("dsm.site", *SURFACE_READS),
+    parts={"files": "files"},
+    entry="splatpipe.stages.mesh:run",
+    resumable=True,
+    deliverables=("files",),
+)
 
 LINE = (
     INGEST,
