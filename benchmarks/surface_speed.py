@@ -18,7 +18,7 @@ import numpy as np
 from tables import Row, print_table
 
 from splatpipe.demo.depth_maps import load
-from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.exposures import exposure_levels
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.heights import TILE as HEIGHTS_TILE
 from splatpipe.pipeline.surface.heights import Capture, surface_heights
@@ -62,8 +62,8 @@ def coloured(photos: list[PhotoSource], surface: HeightField, lattice: Lattice) 
     centres = surface.lattice.centres(next(surface.lattice.tiles(surface.lattice.width)))
     places = np.concatenate([centres, surface.height[..., None].astype(np.float64)], axis=-1)
     places = places[::EVERY, ::EVERY].reshape(-1, 3)
-    gains = exposure_gains(photos, places[np.isfinite(places[:, 2])], 2.0 * lattice.cell_m, threads=1)
-    album = Album(photos, surface, lattice, RELIEF, gains, Shelf(HELD_BYTES), Shelf(HELD_BYTES))
+    levels = exposure_levels(photos, places[np.isfinite(places[:, 2])], 2.0 * lattice.cell_m, threads=1)
+    album = Album(photos, surface, lattice, RELIEF, levels, Shelf(HELD_BYTES), Shelf(HELD_BYTES))
     tiles = list(lattice.tiles(TILE))
     known = sum(int(part.known.sum()) for part in orthophotos(album, tiles, threads=1))
     return known / (lattice.width * lattice.height)

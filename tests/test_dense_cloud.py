@@ -14,6 +14,7 @@ from splatpipe.pipeline.surface import dense_cloud
 from splatpipe.pipeline.surface.dense_cloud import CloudTask, make_cloud, tile_cloud
 from splatpipe.pipeline.surface.fusion import FusedPoints
 from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet
 from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
@@ -131,6 +132,6 @@ def test_depths_that_do_not_fit_their_camera_are_refused() -> None:
         source.camera,
         lambda: type(source.depths.load())(source.camera, np.ones((3, 3), np.float32), np.ones((3, 3), np.uint8)),
     )
-    broken = PhotoSet([type(source)(source.camera, source.load, other)], np.ones((1, 3)), Shelf(1 << 20))
+    broken = PhotoSet([type(source)(source.camera, source.load, other)], Levels.plain(1), Shelf(1 << 20))
     with pytest.raises(ValueError, match="depths of"):
         broken.depth_map(0)

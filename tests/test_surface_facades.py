@@ -23,6 +23,7 @@ from splatpipe.pipeline.surface.elevation import Elevation, Photos, draw_elevati
 from splatpipe.pipeline.surface.facades import FacadesTask, make_facades
 from splatpipe.pipeline.surface.facets import Facets, facets_of, upright_facets
 from splatpipe.pipeline.surface.holes import filled
+from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
 from splatpipe.pipeline.surface.openings import outlines, projections, recesses
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
@@ -80,7 +81,7 @@ def walls() -> dict[str, Wall]:
 
 
 def drawn(name: str, threads: int = 1) -> Elevation:
-    return draw_elevation(walls()[name], PIXEL_M, Photos(photos(), np.ones((16, 3)), threads), lambda done, total: None)
+    return draw_elevation(walls()[name], PIXEL_M, Photos(photos(), Levels.plain(16), threads), lambda done, total: None)
 
 
 @cache

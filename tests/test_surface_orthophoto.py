@@ -11,11 +11,13 @@ import pytest
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface import mosaic
-from splatpipe.pipeline.surface.exposures import exposure_gains
+from splatpipe.pipeline.surface.exposures import exposure_levels
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.levels import GAMMA, OFFSET, Levels
 from splatpipe.pipeline.surface.orthophoto import SPREAD, Album, Orthophoto, orthophotos, tile_orthophoto
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, sampled, tone_curve
+from splatpipe.pipeline.surface.sight import contiguous, place_in
 from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
 from splatpipe.pipeline.surface.tiles import Tile
 
@@ -40,20 +42,20 @@ def plain_album() -> Album:
         sources.append(PhotoSource(camera, lambda photo=photo: photo, depths))
     east, north = np.moveaxis(HEIGHTS.centres(WHOLE), -1, 0)
     surface = HeightField(HEIGHTS, true_height(east, north).astype(np.float32))
-    return Album(sources, surface, FINE, RELIEF, np.ones((len(sources), 3)), Shelf(1 << 28), Shelf(1 << 28))
+    return Album(sources, surface, FINE, RELIEF, Levels.plain(len(sources)), Shelf(1 << 28), Shelf(1 << 28))
 
 
-def gains(album: Album) -> np.ndarray:
+def levels(album: Album) -> Levels:
     """Levelled at places on the surface."""
     centres, up = HEIGHTS.centres(WHOLE)[1::3, 1::3], album.surface.height[1::3, 1::3]
     places = np.concatenate([centres, up[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
-    return exposure_gains(album.sources, places[np.isfinite(places[:, 2])], 2 * HEIGHTS.cell_m, threads=1)
+    return exposure_levels(album.sources, places[np.isfinite(places[:, 2])], 2 * HEIGHTS.cell_m, threads=1)
 
 
 @cache
 def album() -> Album:
     """The same with exposures levelled."""
-    return replace(plain_album(), gains=gains(plain_album()))
+    return replace(plain_album(), levels=levels(plain_album()))
 
 
 @cache
@@ -95,9 +97,36 @@ def test_stripes_keep_their_contrast() -> None:
 
 
 def test_exposures_are_levelled() -> None:
-    left = np.log2(album().gains[:, 1] * EXPOSURES)
+    left = np.log2(album().levels.gain[:, 1] * EXPOSURES)
     assert np.ptp(left) < 0.06
     assert np.ptp(np.log2(EXPOSURES)) > 0.4
+
+
+def test_dark_corners_are_levelled() -> None:
+    """Photos through a lens that takes half of the light in its corners."""
+    plain = plain_album()
+    sources = []
+    for source in plain.sources:
+        rows, columns = np.mgrid[: source.camera.height, : source.camera.width] + 0.5
+        x, y = 2.0 * columns / source.camera.width - 1.0, 2.0 * rows / source.camera.height - 1.0
+        shade = np.exp(-0.35 * (x * x + y * y))[..., None]
+        dark = np.clip(np.round((source.load() + OFFSET) * shade ** (1.0 / GAMMA) - OFFSET), 0, 255).astype(np.uint8)
+        sources.append(replace(source, load=lambda dark=dark: dark))
+    shaded = replace(plain, sources=sources)
+    found = levels(shaded)
+    middle = found.shading.mean(axis=(0, 2))
+    assert np.abs(middle[[2, 4]] - 0.35).max() < 0.1  # the terms of x² and y²
+    assert np.abs(middle[[0, 1, 3]]).max() < 0.1
+    east, north = np.moveaxis(HEIGHTS.centres(WHOLE), -1, 0)
+    points = contiguous((east, north, true_height(east, north)))
+    seen = place_in(plain.sources[0].camera, *points).inside & np.isfinite(points[2])
+    shown = [
+        np.log(told.sampled(0, (source, source.load()), points, seen, HEIGHTS.cell_m)[seen] + OFFSET)
+        for told, source in ((levels(plain), plain.sources[0]), (found, sources[0]), (plain.levels, sources[0]))
+    ]
+    levelled, dark = (np.subtract(*np.quantile(each - shown[0], [0.95, 0.05])) for each in shown[1:])
+    assert levelled < 0.05
+    assert dark > 0.15
 
 
 def test_tiles_and_threads_change_no_bit() -> None:
@@ -143,12 +172,13 @@ def test_far_from_all_that_is_seen_there_is_no_colour() -> None:
 def test_a_photo_without_depths_colours_nothing() -> None:
     whole = plain_album()
     blind = replace(
-        whole, sources=[replace(source, depths=None) for source in whole.sources[:3]], gains=np.ones((3, 3))
+        whole, sources=[replace(source, depths=None) for source in whole.sources[:3]], levels=Levels.plain(3)
     )
     part = tile_orthophoto(blind, Tile(0, 0, 12, 10))
     assert not part.known.any()
     assert (part.label == -1).all()
-    assert np.array_equal(gains(blind), np.ones((3, 3)))
+    assert np.array_equal(levels(blind).gain, np.ones((3, 3)))
+    assert not levels(blind).shading.any()
 
 
 def test_pixels_of_another_size_are_refused() -> None:

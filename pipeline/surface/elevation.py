@@ -19,6 +19,7 @@ from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.heights import TILE as HEIGHTS_TILE
 from splatpipe.pipeline.surface.heights import Capture, surface_heights
 from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import Sheet
@@ -90,12 +91,12 @@ class Photos:
 
     Attributes:
         sources: The photos with their depths, local metres, always in the same order.
-        gains: By how much each photo's light is multiplied, a channel each.
+        levels: By how much photos' light is multiplied.
         threads: Tiles at a time.
     """
 
     sources: Sequence[PhotoSource]
-    gains: Float64[np.ndarray, "n 3"]
+    levels: Levels
     threads: int
 
 
@@ -114,7 +115,7 @@ def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress
     sheet = wall_sheet(wall, cell_m)
     depths_tiles, colour_tiles = (list(sheet.lattice.tiles(side)) for side in (HEIGHTS_TILE, TILE))
     total = len(depths_tiles) + len(colour_tiles)
-    sources, gains = _before(sheet, photos)
+    sources, levels = _before(sheet, photos)
     shape = sheet.lattice.height, sheet.lattice.width
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     colour = np.zeros((*shape, 4), np.uint8)
@@ -127,7 +128,7 @@ def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress
         progress(done, total)
     depth = without_specks(depth)
     surface = HeightField(sheet.lattice, depth)
-    album = Album(sources, surface, sheet.lattice, sheet.relief, gains, Shelf(SHELF_BYTES), Shelf(SHELF_BYTES))
+    album = Album(sources, surface, sheet.lattice, sheet.relief, levels, Shelf(SHELF_BYTES), Shelf(SHELF_BYTES))
     for done, drawn in enumerate(orthophotos(album, colour_tiles, photos.threads), len(depths_tiles) + 1):
         cut = drawn.tile.slices
         colour[(*cut, slice(0, 3))] = drawn.colour
@@ -150,9 +151,9 @@ def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h 
     return result
 
 
-def _before(sheet: Sheet, photos: Photos) -> tuple[list[PhotoSource], Float64[np.ndarray, "n 3"]]:
-    """Photos that stand before a wall, in its sheet's frame, with their gains."""
+def _before(sheet: Sheet, photos: Photos) -> tuple[list[PhotoSource], Levels]:
+    """Photos that stand before a wall, in its sheet's frame, with their levels."""
     rows = [
         row for row, source in enumerate(photos.sources) if sheet.place(source.camera.centre())[2] > sheet.relief.high_m
     ]
-    return [sheet.moved_photo(photos.sources[row]) for row in rows], photos.gains[rows]
+    return [sheet.moved_photo(photos.sources[row]) for row in rows], photos.levels.of(rows)

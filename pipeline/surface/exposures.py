@@ -1,4 +1,8 @@
-"""Exposures of photos, levelled where several see the same."""
+"""Exposures of photos and their shading, levelled where several see the same.
+
+Lenses darken corners, and fields are brighter away from the sun: without its shading levelled, each photo's part of an
+orthophoto is a patch that can be told from the next.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +10,32 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
+from scipy.sparse.linalg import LinearOperator, cg
 
 from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.surface.levels import SHADES, Levels, across
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, linear, loaded, sampled
 from splatpipe.pipeline.surface.sight import Points, place_in, sight
 
-COMPARED_AT = 4000  # places that all photos together are compared at: no matter of a capture's size
+COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
 MOST_GAIN = 2.0  # and one over it: more is not exposure
+MOST_SHADE = 0.5  # of a term's logarithm of light
 DARKEST, LIGHTEST = 8, 247  # values that are not cut off
-REST = 3.0  # places' worth with which a photo keeps to its own exposure
+REST = 3.0  # places' worth with which a photo keeps to its own exposure,
+REST_SHADE = 10.0  # and to the shading that all photos have: corners say more of a term than the middle
+REST_ALL = 0.01  # times as much for what all have in common
 STRANGE = 0.15  # logarithm of light by which a photo may differ from the others; further off counts less
 ROUNDS = 4
-DIGITS = 5  # of gains: what solvers do otherwise for another number of threads lies far below
+TOLERANCE = 1e-10  # of the equations' right side
+DIGITS = 5  # of gains: what sums do otherwise for another number of threads lies far below
+
+Numbers = Int64[np.ndarray, " k"]
 
 
-def exposure_gains(
+def exposure_levels(
     sources: Sequence[PhotoSource], places: Float64[np.ndarray, "m 3"], cell_m: float, threads: int
-) -> Float64[np.ndarray, "n 3"]:
+) -> Levels:
     """By how much each photo's light is to be multiplied so that photos agree where they see the same.
 
     Least squares of the logarithms over places that two photos see at least, robust (Huber's weights), about the mean
@@ -35,46 +47,84 @@ def exposure_gains(
         cell_m: How fine photos are compared; a little softer than what is coloured, matches need not be exact.
         threads: Photos at a time.
     """
+    if not sources:
+        return Levels.plain(0)
     rows = list(ordered_map(partial(_light, places, cell_m), sources, threads))
-    light = np.stack([row for row, _ in rows]) if rows else np.zeros((0, 0, 3))
-    seen = np.stack([there for _, there in rows]) if rows else np.zeros((0, 0), np.bool_)
-    gains = [_levelled(light[..., channel], seen) for channel in range(3)]
-    return np.asarray(np.round(np.clip(np.exp(np.stack(gains, axis=-1)), 1.0 / MOST_GAIN, MOST_GAIN), DIGITS))
+    light, seen = np.stack([row for row, _, _ in rows]), np.stack([there for _, there, _ in rows])
+    shades = np.stack([terms for _, _, terms in rows])
+    seen &= seen.sum(axis=0) >= 2
+    photo, place = np.nonzero(seen)
+    if not len(photo):
+        return Levels.plain(len(sources))
+    light, terms = light[photo, place], np.column_stack([np.ones(len(photo)), shades[photo, place]])
+    rest = np.array([REST, *([REST_SHADE] * SHADES)])
+    numbers = photo.astype(np.int64), place.astype(np.int64)
+    factors = np.stack([_levelled(each, terms, rest, numbers, len(sources)) for each in light.T], axis=-1)
+    gain = np.clip(np.exp(factors[:, 0]), 1.0 / MOST_GAIN, MOST_GAIN)
+    shading = np.clip(factors[:, 1:], -MOST_SHADE, MOST_SHADE)
+    return Levels(np.round(gain, DIGITS), np.round(shading, DIGITS))
 
 
 def _light(
     places: Float64[np.ndarray, "m 3"], cell_m: float, source: PhotoSource
-) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
-    """Logarithms of the light in a photo at places, and where it sees them well."""
-    unseen = np.zeros((len(places), 3)), np.zeros(len(places), np.bool_)
+) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"], Float64[np.ndarray, "m k"]]:
+    """Logarithms of the light in a photo at places, where it sees them well, and where in the photo they lie."""
+    unseen = np.zeros((len(places), 3)), np.zeros(len(places), np.bool_), np.zeros((len(places), SHADES))
     points: Points = (places[:, 0], places[:, 1], places[:, 2])
-    inside = place_in(source.camera, *points).inside
-    if source.depths is None or not inside.any():
+    place = place_in(source.camera, *points)
+    if source.depths is None or not place.inside.any():
         return unseen
     view = sight(source.depths.load(), points, 0.0)
-    seen = view.seen & ~view.mixed & inside
+    seen = view.seen & ~view.mixed & place.inside
     if not seen.any():
         return unseen
     pixels, _ = loaded(source)
     colour = sampled(source, pixels, points, seen, cell_m, PLAIN_TONE)
     good = seen & (colour >= DARKEST).all(axis=1) & (colour <= LIGHTEST).all(axis=1)
-    return np.log(linear(np.maximum(colour, DARKEST) / 255.0)), good
+    terms = np.where(good[:, None], across(source.camera, place.column, place.row).T, 0.0)
+    return np.log(linear(np.maximum(colour, DARKEST) / 255.0)), good, terms
 
 
-def _levelled(light: Float64[np.ndarray, "n m"], seen: Bool[np.ndarray, "n m"]) -> Float64[np.ndarray, " n"]:
-    """Logarithms of the gains of one channel."""
-    seen = seen & (seen.sum(axis=0) >= 2)
-    gain = np.zeros(len(light))
-    weight = seen.astype(np.float64)
+def _levelled(
+    light: Float64[np.ndarray, " k"],
+    terms: Float64[np.ndarray, "k t"],
+    rest: Float64[np.ndarray, " t"],
+    numbers: tuple[Numbers, Numbers],
+    photos: int,
+) -> Float64[np.ndarray, "n t"]:
+    """What is to be added to the logarithms of a channel's light, of each photo a factor for each term.
+
+    Args:
+        light: Of each photo's each place.
+        terms: What a photo's factors are multiplied with there; the first is one.
+        rest: How much a factor keeps to what it is on the average.
+        numbers: The photo and the place of each.
+        photos: How many there are.
+    """
+    photo, place = numbers
+    found, weight = np.zeros((photos, terms.shape[1])), np.ones(len(light))
+
+    def about_mean(value: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
+        total = np.bincount(place, weight)
+        mean = np.bincount(place, weight * value) / np.maximum(total, 1e-9)
+        return np.asarray(value - mean[place])
+
+    def gathered(value: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "n t"]:
+        each = (np.bincount(photo, weight * value * term, photos) for term in terms.T)
+        return np.stack(list(each), axis=-1)
+
+    def equations(flat: Float64[np.ndarray, " u"]) -> Float64[np.ndarray, " u"]:
+        factors = flat.reshape(found.shape)
+        kept = rest * (factors - (1.0 - REST_ALL) * factors.mean(axis=0))
+        return np.asarray((gathered(about_mean((terms * factors[photo]).sum(axis=1))) + kept).ravel())
+
     for _ in range(ROUNDS):
-        total = np.maximum(weight.sum(axis=0), 1e-9)
-        share = weight / total
-        # Normal equations of sum w (light + gain - mean of the place)², the places' means eliminated.
-        matrix = np.diag(weight.sum(axis=1) + REST) - np.einsum("im,jm->ij", weight, share)
-        mean = (share * light).sum(axis=0)
-        gain = np.linalg.solve(matrix, (weight * (mean - light)).sum(axis=1))
-        level = (share * (light + gain[:, None])).sum(axis=0)
-        off = np.abs(light + gain[:, None] - level)
-        weight = np.where(seen, np.minimum(1.0, STRANGE / np.maximum(off, 1e-9)), 0.0)
-    heard = seen.any(axis=1)
-    return np.where(heard, gain - gain[heard].mean() if heard.any() else 0.0, 0.0)
+        operator = LinearOperator((found.size, found.size), matvec=equations, dtype=np.float64)
+        solution, _ = cg(operator, -gathered(about_mean(light)).ravel(), x0=found.ravel(), rtol=TOLERANCE)
+        found = solution.reshape(found.shape)
+        off = np.abs(about_mean(light + (terms * found[photo]).sum(axis=1)))
+        weight = np.minimum(1.0, STRANGE / np.maximum(off, 1e-9))
+    heard = np.bincount(photo, minlength=photos) > 0
+    if heard.any():
+        found[:, 0] -= found[heard, 0].mean()
+    return np.asarray(np.where(heard[:, None], found, 0.0))

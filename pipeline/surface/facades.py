@@ -25,7 +25,7 @@ from splatpipe.pipeline.surface.elevation_files import (
     write_facades,
     write_picture,
 )
-from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_levels
 from splatpipe.pipeline.surface.facets import Facets, upright_facets
 from splatpipe.pipeline.surface.grid import DIGITS
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
@@ -85,7 +85,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         write_facades(out / LIST, [], crs)
         return []
     places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
-    photos = Photos(sources, exposure_gains(sources, places, 2.0 * pixel_m, task.threads), task.threads)
+    photos = Photos(sources, exposure_levels(sources, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
     for number, wall in enumerate(walls):
 

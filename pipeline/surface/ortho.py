@@ -15,10 +15,11 @@ from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.surface.dsm import HELD_BYTES, height_range
-from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_levels
 from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.height_field import HeightField
+from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.mosaic import MARGIN
 from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, Album, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
@@ -77,8 +78,8 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
     making = SheetWork(sheets, task.site, task.surface.area, TILE, work, report, "orthophoto")
     work.mkdir(exist_ok=True)
     with pixels_on_disk(task.surface.photos, work, PIXEL_BYTES) as photos:
-        gains = exposure_gains(photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
-        making.run(partial(_colours, task, heights, _Pictures(photos, gains, Shelf(PIXEL_BYTES))))
+        levels = exposure_levels(photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
+        making.run(partial(_colours, task, heights, _Pictures(photos, levels, Shelf(PIXEL_BYTES))))
     known = 0
     with raster_file(out / "ortho.tif", grid, COLOURS) as file:
         for part, arrays in making.finished():
@@ -90,7 +91,7 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
         "width": grid.width,
         "height": grid.height,
         "pixels": known,
-        "exposures_stops": round(float(np.ptp(np.log2(gains[:, 1]))), 3) if len(gains) else 0.0,
+        "exposures_stops": round(float(np.ptp(np.log2(levels.gain[:, 1]))), 3) if len(photos) else 0.0,
         "crs": grid.crs.horizontal.name,
     }
 
@@ -100,7 +101,7 @@ class _Pictures:
     """Photos whose pixels are at hand, as ``Album`` takes them."""
 
     sources: Sequence[PhotoSource]
-    gains: Float64[np.ndarray, "n 3"]
+    levels: Levels
     pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]]
 
 
@@ -111,7 +112,7 @@ def _colours(
     plane = sheet.sheet
     photos = [plane.moved_photo(photo) for photo in pictures.sources]
     surface = _surface(sheet, task.dsm, heights)
-    album = Album(photos, surface, plane.lattice, plane.relief, pictures.gains, pictures.pixels, Shelf(HELD_BYTES))
+    album = Album(photos, surface, plane.lattice, plane.relief, pictures.levels, pictures.pixels, Shelf(HELD_BYTES))
     for part in orthophotos(album, tiles, task.threads):
         alpha = np.where(part.known, 255, 0).astype(np.uint8)
         yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int16, Int64, UInt8, UInt16
+from jaxtyping import Bool, Int16, Int64, UInt8, UInt16
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best, spread
-from splatpipe.pipeline.surface.photo_samples import PhotoSource, loader, rated, sampled, tone_curve
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, loader, rated
 from splatpipe.pipeline.surface.sight import Points, contiguous, sight
 from splatpipe.pipeline.surface.sources import DepthMap, Relief, Shelf, seen_by
 from splatpipe.pipeline.surface.tiles import Tile
@@ -52,7 +53,7 @@ class Album:
         surface: Heights.
         lattice: Whose cells get colours; may be finer than the heights'.
         relief: Between which heights the surface lies.
-        gains: By how much each photo's light is multiplied, a channel each.
+        levels: By how much photos' light is multiplied.
         pixels: Holds a few photos.
         depths: Holds a few of their depths.
     """
@@ -61,7 +62,7 @@ class Album:
     surface: HeightField
     lattice: Lattice
     relief: Relief
-    gains: Float64[np.ndarray, "n 3"]
+    levels: Levels
     pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]]
     depths: Shelf[DepthMap]
 
@@ -100,9 +101,9 @@ def tile_orthophoto(album: Album, tile: Tile, most: int = MOST_RATED) -> Orthoph
     numbers, seen, cost = numbers[best], seen[best], cost[best]
     colour = np.empty((*seen.shape, 3), np.uint8)
     for number, there, out in zip(numbers, seen, colour, strict=True):
-        source, tone = album.sources[number], tone_curve(album.gains[number])
+        source = album.sources[number]
         pixels = album.pixels.get(number, loader(source))
-        out[:] = sampled(source, pixels, points, there, album.lattice.cell_m, tone)
+        out[:] = album.levels.sampled(int(number), (source, pixels), points, there, album.lattice.cell_m)
     made = composed(seen, cost, colour, (wide.row + wide.column) % 2)
     filled, known = spread(made.colour, made.label >= 0, np.isfinite(points[2]), SPREAD)
     inner = tuple(slice(MARGIN + SPREAD, MARGIN + SPREAD + size) for size in (tile.height, tile.width))

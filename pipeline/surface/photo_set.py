@@ -10,6 +10,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
+from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sight import Place, Sight, place_in, sight
 from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, Shelf, window_of
@@ -27,12 +28,12 @@ class PhotoSet:
 
     Attributes:
         sources: Photos, always in the same order.
-        gains: By how much each photo's light is multiplied, a channel each.
+        levels: By how much photos' light is multiplied.
         depths: Holds a few of their depths.
     """
 
     sources: Sequence[PhotoSource]
-    gains: Float64[np.ndarray, "n 3"]
+    levels: Levels
     depths: Shelf[DepthMap]
 
     def with_depths(self) -> list[int]:

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_gains
-from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded, sampled, tone_curve
+from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_levels
+from splatpipe.pipeline.surface.levels import Levels
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded
 from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet, look_at, place_of
 from splatpipe.pipeline.surface.sight import place_in
 from splatpipe.pipeline.surface.sources import DepthMap, Shelf
@@ -30,12 +31,12 @@ def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> Ph
         cell_m: How fine they are to colour something.
         threads: Photos at a time.
     """
-    photos = PhotoSet(sources, np.ones((len(sources), 3)), Shelf(HELD_BYTES))
+    photos = PhotoSet(sources, Levels.plain(len(sources)), Shelf(HELD_BYTES))
     numbers = photos.with_depths()
     most = -(-COMPARED_AT // max(len(numbers), 1))
     places = [_some_places(photos.depth_map(number), most) for number in numbers]
     every = np.concatenate([np.zeros((0, 3)), *places])
-    return replace(photos, gains=exposure_gains(sources, every, 2.0 * cell_m, threads))
+    return replace(photos, levels=exposure_levels(sources, every, 2.0 * cell_m, threads))
 
 
 def _some_places(found: DepthMap, most: int) -> Float64[np.ndarray, "n 3"]:
@@ -98,9 +99,9 @@ def _offer(photos: PhotoSet, pieces: Facing, cell_m: float, number: int) -> _Off
     if not rows.size:
         return _Offer(rows, np.zeros((0, 3), np.uint8), weight)
     source = photos.sources[number]
-    pixels, tone = loaded(source)[0], tone_curve(photos.gains[number])
+    pixels, _ = loaded(source)
     east, north, up = pieces.xyz[:, rows]
-    colour = sampled(source, pixels, (east, north, up), np.ones(len(rows), np.bool_), cell_m, tone)
+    colour = photos.levels.sampled(number, (source, pixels), (east, north, up), np.ones(len(rows), np.bool_), cell_m)
     return _Offer(rows, colour, weight)
 
 

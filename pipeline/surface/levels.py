@@ -1,0 +1,84 @@
+"""By how much photos' light is multiplied, so that they show the same alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, sampled, tone_curve
+from splatpipe.pipeline.surface.sight import Points, place_in
+
+SHADES = 5  # terms of a photo's shading
+GAMMA = 2.4  # of sRGB above its darkest values: (value + offset) ** gamma is proportional to light
+OFFSET = 0.055 * 255.0
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Of all photos.
+
+    Attributes:
+        gain: By how much each photo's light is multiplied, a channel each.
+        shading: And across it: factors of ``across``, whose sum is the logarithm of what light is multiplied by.
+            Leaves are shaded otherwise than sand, so a channel each.
+    """
+
+    gain: Float64[np.ndarray, "n 3"]
+    shading: Float64[np.ndarray, "n k 3"]
+
+    @staticmethod
+    def plain(photos: int) -> Levels:
+        """Photos as they are."""
+        return Levels(np.ones((photos, 3)), np.zeros((photos, SHADES, 3)))
+
+    def of(self, numbers: list[int]) -> Levels:
+        """Of some photos."""
+        return Levels(self.gain[numbers], self.shading[numbers])
+
+    def sampled(
+        self,
+        number: int,
+        photo: tuple[PhotoSource, UInt8[np.ndarray, "h w 3"]],
+        points: Points,
+        seen: Bool[np.ndarray, " *n"],
+        cell_m: float,
+    ) -> UInt8[np.ndarray, " *n 3"]:
+        """Levelled colours of points in a photo, as ``photo_samples.sampled`` takes them.
+
+        Args:
+            number: The photo's.
+            photo: With its pixels.
+            points: East, north, up.
+            seen: Whether it sees them.
+            cell_m: Side of the points' cells.
+
+        Raises:
+            ValueError: if the pixels are not of the photo's size.
+        """
+        source, pixels = photo
+        colour = sampled(source, pixels, points, seen, cell_m, tone_curve(self.gain[number]))
+        if not self.shading[number].any():
+            return colour
+        east, north, up = (axis[seen] for axis in points)
+        place = place_in(source.camera, east, north, up)
+        terms = across(source.camera, place.column, place.row).astype(np.float32)
+        factors = (self.shading[number] / GAMMA).astype(np.float32)
+        for channel in range(3):
+            shade = terms[0] * factors[0, channel]
+            for term, factor in zip(terms[1:], factors[1:, channel], strict=True):  # no matrix product: bits stay
+                shade += term * factor
+            value = (colour[seen, channel] + np.float32(OFFSET)) * np.exp(shade) - np.float32(OFFSET)
+            colour[seen, channel] = np.clip(np.round(value), 0, 255).astype(np.uint8)
+        return colour
+
+
+def across(
+    camera: Camera, column: Float64[np.ndarray, " n"], row: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, "k n"]:
+    """Terms of a shading that is smooth across a photo: quadratic, of mean zero."""
+    x = np.clip(2.0 * column / camera.width - 1.0, -1.0, 1.0)
+    y = np.clip(2.0 * row / camera.height - 1.0, -1.0, 1.0)
+    return np.stack([x, y, x * x - 1.0 / 3.0, x * y, y * y - 1.0 / 3.0])
