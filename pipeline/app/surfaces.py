@@ -209,9 +209,12 @@ def _volumes(surface: _Surface, wanted: Wanted) -> Items:
     area = placed_area(drawing, surface.frame)
     rings = sum(len(polygon) for polygon in area.polygons[:TRACED_VOLUMES])
     most = max(4, min(RING_PLACES, ALL_PLACES // rings))
+    uncertainty = surface.frame.residuals.get("uncertainty") or {}  # there is none where control places the run
+    datum_sigma_m = float(uncertainty.get("offset_sigma_m", (0.0,))[-1])
     found: Items = []
     for number, (polygon, name) in enumerate(zip(area.polygons, drawing.names, strict=True), 1):
-        volume = measure_volume(surface.model, PlanArea(area.axes, (polygon,)), surface.crs, wanted.base)
+        alone = PlanArea(area.axes, (polygon,))
+        volume = measure_volume(surface.model, alone, surface.crs, wanted.base, datum_sigma_m)
         facts = volume_facts(number, name, volume)
         if number <= TRACED_VOLUMES:
             facts["trace"] = polygon_trace(surface.model, polygon, surface.crs, most)

@@ -15,8 +15,9 @@ FORMAT = 1
 DIGITS = 4
 HOW = (
     "One standard deviation: the cells' expected deviations, shared by some 13 neighbours each; the base's, by the "
-    "misfit of the rim to it; for a stated height the datum's. Volumes are of the part that has heights, and nothing "
-    "is filled in. Lengths are on the ground. Noise about the base makes cut and fill larger alike, and not the net."
+    "misfit of the rim to it; for a stated height that of photo positions, where these place the run. Volumes are of "
+    "the part that has heights, and nothing is filled in. Lengths are on the ground. Noise about the base makes cut "
+    "and fill larger alike, and not the net."
 )
 
 
