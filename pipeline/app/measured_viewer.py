@@ -16,7 +16,6 @@ from splatpipe.pipeline.app.measurements import any_measured, is_number, read_me
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.web.measured_page import PAGE, with_measurements
-from splatpipe.stages.line import DSM, EXPORT, LINE
 
 SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
@@ -60,6 +59,8 @@ def renew_viewer(out: Path) -> str:
 
 def shown_measurements(out: Path) -> dict[str, Any] | None:
     """What the page is to show: of the present surface model, and in the frame of the page. None for nothing."""
+    from splatpipe.stages.line import DSM, EXPORT, LINE  # here: every run ends in this module, of any line
+
     run = open_run_folder(out, LINE)
     of_surface, of_page = run.lineage(DSM), run.lineage(EXPORT)
     surface, frame = of_surface.get("dsm.files"), of_page.get("georef.frame")
