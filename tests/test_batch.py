@@ -308,7 +308,7 @@ def test_a_control_file_that_cannot_be_read_is_told_without_a_job_until_it_is_me
         assert "three" in planned.message and planned.jobs == () and planned.photo_count == 2
     (house / "gcp_list.txt").unlink()
     (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, Settings("preview")).captures
-    assert planned.message == "" and len(planned.jobs) == len(LINE) - 2  # depths, and those of the splat, have no reader
+    assert planned.message == "" and len(planned.jobs) == len(LINE) - 2  # nobody reads depths
 
 
 def test_a_profile_decides_where_jobs_run_and_without_one_memory_does(tmp_path: Path) -> None:
