@@ -74,7 +74,7 @@ REFERENCE = Costs(
             "ortho": StageCosts(0.4, 1250e6, 0.0, 0.5e6),
             "facades": StageCosts(1.0, 1000e6, 0.0, 0.2e6),
             "cloud": StageCosts(2.0, 1500e6, 0.0, 0.5e6),
-            "mesh": StageCosts(2.0, 2000e6, 0.0, 0.5e6),
+            "mesh": StageCosts(2.0, 2800e6, 0.0, 0.5e6),
         }
     ),
 )

@@ -22,7 +22,7 @@ from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, without_crumbs
 from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
 
-MOST_BLOCKS = 120_000  # of voxels: 0.5 GB, and about 5 million triangles before decimation; beyond it voxels are larger
+MOST_BLOCKS = 55_000  # of voxels: 0.25 GB, and 2.5 million triangles before decimation; beyond it voxels are larger
 CRUMB_VOXELS = 200.0  # faces of voxels: a piece of a smaller area hangs in the air, or is nobody's interest
 GREY = 128  # of what no photo shows, where nothing near has a colour
 
@@ -118,14 +118,16 @@ def decimated(mesh: TriangleMesh, most: int) -> TriangleMesh:
         mesh: In order.
         most: Triangles.
     """
-    size = len(mesh.triangles)
-    if size <= most:
+    if len(mesh.triangles) <= most:
         return mesh
     o3d = open3d()
     low = mesh.vertices.min(axis=0)  # float32 is finer near zero
     vertices, triangles = (mesh.vertices - low).astype(np.float32), mesh.triangles.astype(np.int32)
-    fine = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
-    coarse = fine.simplify_quadric_decimation(1.0 - most / size)
+    coarse = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
+    size, before = len(triangles), 0
+    while size > most and size != before:  # of a large mesh, one pass leaves more than it is asked to
+        coarse = coarse.simplify_quadric_decimation(1.0 - most / size)
+        size, before = len(coarse.triangle.indices), size
     found = coarse.vertex.positions.numpy().astype(np.float64) + low
     whole = TriangleMesh(found, coarse.triangle.indices.numpy().astype(np.int64))
     return whole.select(whole.areas() > 0.0)
