@@ -80,13 +80,13 @@ def _ended(holdings: Holdings) -> tuple[Finding | None, str]:
     if not story.stages:
         return Finding("bad", "Nothing has run yet", "The folder has no record of a run that began."), ""
     if story.complete:
-        last = [stage.name for stage in LINE if stage.name in holdings.artifacts][-1:]
-        if last == [LINE[-1].name]:
-            return None, f"The run ended on {when}."
         gone = [name for name in story.stages if name == stage_name(name) and name not in holdings.artifacts]
         if gone:
             lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or cannot be read any more."
             return Finding("bad", "Finished, but its results are damaged", f"{lost} The same command mends it."), ""
+        last = [stage.name for stage in LINE if stage.name in holdings.artifacts][-1:]
+        if last == [LINE[-1].name]:
+            return None, f"The run ended on {when}."
         got = f"up to {last[0]}" if last else "without a result"
         return Finding("doubt", f"The line was run {got}, as asked for", f"It ended on {when}."), ""
     stage = story.culprit
