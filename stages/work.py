@@ -318,13 +318,12 @@ class Work:
         return film.seconds * film.fps * frame
 
     def units(self) -> dict[str, Units]:
-        """By stage: CPU time, memory, disk."""
+        """By stage: CPU time, memory, disk; also of those that are turned off."""
         size, train = self.size, self.config.train
         photos, pixels = float(size.photos), size.photos * size.megapixels
         keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
         judged = photos * min(self.kept_at, JUDGED_MEGAPIXELS)
-        searched, rendered = self.config.depths, self.config.splat_depths.enabled
-        depths = photos * min(self.kept_at, searched.max_megapixels) if searched.enabled else 0.0
+        depths = photos * min(self.kept_at, self.config.depths.max_megapixels)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
         done = self.done
@@ -355,14 +354,12 @@ class Work:
             "export": Units(gaussians, gaussians, gaussians),
             "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
             "depths": Units(depths, 0.0, depths),
-            "dsm": Units(pixels if self.config.dsm.enabled and depths else 0.0, 0.0, pixels),
-            "ortho": Units(pixels if self.config.ortho.enabled and depths else 0.0, 0.0, pixels),
-            "splat_depths": Units(
-                photos * min(self.kept_at, searched.max_megapixels) if rendered else 0.0, 0.0, pixels
-            ),
-            "facades": Units(pixels if self.config.facades.enabled else 0.0, 0.0, pixels),
-            "cloud": Units(pixels if self.config.cloud.enabled else 0.0, 0.0, pixels),
-            "mesh": Units(pixels if self.config.mesh.enabled else 0.0, 0.0, pixels),
+            "dsm": Units(pixels, 0.0, pixels),
+            "ortho": Units(pixels, 0.0, pixels),
+            "splat_depths": Units(depths, 0.0, depths),
+            "facades": Units(pixels, 0.0, pixels),
+            "cloud": Units(pixels, 0.0, pixels),
+            "mesh": Units(pixels, 0.0, pixels),
         }
 
     @property
@@ -385,9 +382,12 @@ class Work:
         return 0 if self.blocks is None else sum(count for _level, count in self.blocks.lengths)
 
     def needs(self, speed: float) -> dict[str, Need]:
-        """What the units cost, by stage, on a machine of that speed."""
+        """What the units cost, by stage, on a machine of that speed; nothing where a stage is turned off."""
         most, found = self.config.train.max_memory_bytes, {}
         for stage, units in self.units().items():
+            if getattr(self.config, stage).is_off:
+                found[stage] = Need(0, 0.0, 0)
+                continue
             cost = self.costs.stages[TRAINING.get(stage, stage)]
             memory = cost.resident + cost.memory * units.memory
             if stage in TRAINING and most:
