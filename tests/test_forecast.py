@@ -53,7 +53,9 @@ def test_every_stage_has_a_forecast_that_grows_with_the_preset() -> None:
 
 
 def test_what_is_turned_off_costs_nothing() -> None:
-    off, on = (forecast(SIZE, resolve(LineConfig, [{"mesh": {"enabled": enabled}}]))["mesh"] for enabled in (False, True))
+    off, on = (
+        forecast(SIZE, resolve(LineConfig, [{"mesh": {"enabled": enabled}}]))["mesh"] for enabled in (False, True)
+    )
     assert off == Need(0, 0.0, 0)
     assert min(on.memory_bytes, on.cpu_seconds, on.disk_bytes) > 0
 
