@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from scipy.sparse.linalg import LinearOperator, cg
 
 from splatpipe.pipeline.engine.parallel import ordered_map
@@ -50,13 +50,13 @@ def exposure_levels(
     if not sources:
         return Levels.plain(0)
     rows = list(ordered_map(partial(_light, places, cell_m), sources, threads))
-    light, seen = np.stack([row for row, _, _ in rows]), np.stack([there for _, there, _ in rows])
-    shades = np.stack([terms for _, _, terms in rows])
-    seen &= seen.sum(axis=0) >= 2
-    photo, place = np.nonzero(seen)
-    if not len(photo):
+    photo = np.repeat(np.arange(len(rows)), [len(there) for there, _, _ in rows])
+    place, light, shades = (np.concatenate(column) for column in zip(*rows, strict=True))
+    shared = np.bincount(place, minlength=len(places))[place] >= 2
+    if not shared.any():
         return Levels.plain(len(sources))
-    light, terms = light[photo, place], np.column_stack([np.ones(len(photo)), shades[photo, place]])
+    photo, place, light = photo[shared], place[shared], light[shared]
+    terms = np.column_stack([np.ones(len(photo)), shades[shared]])
     rest = np.array([REST, *([REST_SHADE] * SHADES)])
     numbers = photo.astype(np.int64), place.astype(np.int64)
     factors = np.stack([_levelled(each, terms, rest, numbers, len(sources)) for each in light.T], axis=-1)
@@ -67,9 +67,9 @@ def exposure_levels(
 
 def _light(
     places: Float64[np.ndarray, "m 3"], cell_m: float, source: PhotoSource
-) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"], Float64[np.ndarray, "m k"]]:
-    """Logarithms of the light in a photo at places, where it sees them well, and where in the photo they lie."""
-    unseen = np.zeros((len(places), 3)), np.zeros(len(places), np.bool_), np.zeros((len(places), SHADES))
+) -> tuple[Numbers, Float64[np.ndarray, "k 3"], Float64[np.ndarray, "k t"]]:
+    """Which places a photo sees well, logarithms of its light there, and where in the photo they lie."""
+    unseen = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, SHADES))
     points: Points = (places[:, 0], places[:, 1], places[:, 2])
     place = place_in(source.camera, *points)
     if source.depths is None or not place.inside.any():
@@ -80,9 +80,9 @@ def _light(
         return unseen
     pixels, _ = loaded(source)
     colour = sampled(source, pixels, points, seen, cell_m, PLAIN_TONE)
-    good = seen & (colour >= DARKEST).all(axis=1) & (colour <= LIGHTEST).all(axis=1)
-    terms = np.where(good[:, None], across(source.camera, place.column, place.row).T, 0.0)
-    return np.log(linear(np.maximum(colour, DARKEST) / 255.0)), good, terms
+    good = np.flatnonzero(seen & (colour >= DARKEST).all(axis=1) & (colour <= LIGHTEST).all(axis=1))
+    terms = across(source.camera, place.column[good], place.row[good]).T
+    return good, np.log(linear(colour[good] / 255.0)), terms
 
 
 def _levelled(
