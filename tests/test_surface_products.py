@@ -14,9 +14,11 @@ import rasterio
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.surface import ortho as ortho_file
 from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
 from splatpipe.pipeline.surface.grid import make_grid
 from splatpipe.pipeline.surface.heights import Capture, tile_heights
+from splatpipe.pipeline.surface.known_cells import known_cells
 from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import grid_sheets
@@ -178,6 +180,33 @@ def test_the_orthophoto_lies_on_the_surface_model(made: Path) -> None:
     counts = (bands[3] > 0) & (edge_distance(east, north) > CELL_M / 2)  # the eaves halve cells of the surface model
     wrong = np.square(np.moveaxis(bands[:3], 0, -1) - true)[counts]
     assert 10 * np.log10(255**2 / wrong.mean()) > 28.0
+
+
+def test_the_orthophoto_covers_all_that_the_surface_model_does(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ortho_file, "TILE", 32)
+    covered = np.zeros_like(site().covered)
+    covered[len(covered) // 2, 0] = True  # enough photos see but a corner, as far as samples tell
+    (tmp_path / "dsm.tif").write_bytes((made / "dsm.tif").read_bytes())
+    surface = run_surface(FRAME, photos(), HOUSE)
+    make_ortho(
+        OrthoTask(surface, replace(site(), covered=covered), tmp_path / "dsm.tif", CELL_M, CELL_M / 2, 1),
+        tmp_path / "work",
+        tmp_path,
+        Told(),
+    )
+    whole, part = (centres(folder / "ortho.tif")[0][3] > 0 for folder in (made, tmp_path))
+    assert np.array_equal(whole, part)
+
+
+def test_known_cells_are_told_by_blocks_and_end_with_the_raster(made: Path) -> None:
+    (height,), _, _ = centres(made / "dsm.tif")
+    known, (rows, columns) = known_cells(made / "dsm.tif"), np.nonzero(height != -9999.0)
+    assert known.any_in(Tile(int(rows[0]), int(columns[0]), 1, 1))
+    assert known.any_in(Tile(-1000, -1000, 3000, 3000))
+    assert not known.any_in(Tile(-10, 0, 10, 10))
+    assert not known.any_in(Tile(height.shape[0] + 64, 0, 10, 10))
 
 
 @pytest.mark.parametrize("product", [dsm, ortho])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
     """
     grid = make_grid(task.surface.frame, task.site.box, task.cell_m)
     sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
-    making = SheetWork(sheets, task.site, task.surface.area, TILE, work, report, "surface model")
+    making = SheetWork(sheets, partial(_seen, task.site), task.surface.area, TILE, work, report, "surface model")
 
     def heights(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
         sources = [sheet.sheet.moved_depths(source) for source in task.surface.depths]
@@ -100,6 +101,13 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
         "crs": grid.crs.horizontal.name,
         "heights": grid.crs.described_heights(),
     }
+
+
+def _seen(site: Site, sheet: GridSheet, tile: Tile) -> bool:
+    """Whether enough photos see any of a tile."""
+    corners = sheet.sheet.lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
+    local = sheet.sheet.local(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
+    return site.sees(np.stack([local.min(axis=0), local.max(axis=0)]))
 
 
 def _write_rasters(making: SheetWork, out: Path, grid: Grid) -> Int64[np.ndarray, " 65536"]:

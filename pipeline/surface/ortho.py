@@ -19,6 +19,7 @@ from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_levels
 from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.height_field import HeightField
+from splatpipe.pipeline.surface.known_cells import KnownCells, known_cells
 from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.mosaic import MARGIN
 from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, Album, orthophotos
@@ -75,22 +76,23 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
     grid = make_grid(task.surface.frame, task.site.box, task.gsd_m)
     heights = make_grid(task.surface.frame, task.site.box, task.dsm_cell_m)
     sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
-    making = SheetWork(sheets, task.site, task.surface.area, TILE, work, report, "orthophoto")
+    known = partial(_has_heights, known_cells(task.dsm), heights)
+    making = SheetWork(sheets, known, task.surface.area, TILE, work, report, "orthophoto")
     work.mkdir(exist_ok=True)
     with pixels_on_disk(task.surface.photos, work, PIXEL_BYTES) as photos:
         levels = exposure_levels(photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
         making.run(partial(_colours, task, heights, _Pictures(photos, levels, Shelf(PIXEL_BYTES))))
-    known = 0
+    pixels = 0
     with raster_file(out / "ortho.tif", grid, COLOURS) as file:
         for part, arrays in making.finished():
             file.write(part, np.moveaxis(arrays["colour"], -1, 0))
-            known += int(np.count_nonzero(arrays["colour"][..., 3]))
+            pixels += int(np.count_nonzero(arrays["colour"][..., 3]))
     return {
         "pixel": grid.cell,
         "pixel_m": round(grid.cell_m, 6),
         "width": grid.width,
         "height": grid.height,
-        "pixels": known,
+        "pixels": pixels,
         "exposures_stops": round(float(np.ptp(np.log2(levels.gain[:, 1]))), 3) if len(photos) else 0.0,
         "crs": grid.crs.horizontal.name,
     }
@@ -118,16 +120,34 @@ def _colours(
         yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}
 
 
+def _has_heights(known: KnownCells, heights: Grid, sheet: GridSheet, tile: Tile) -> bool:
+    """Whether pixels of a sheet's tile may lie on a height."""
+    part = Tile(sheet.part.row + tile.row, sheet.part.column + tile.column, tile.height, tile.width)
+    return known.any_in(_cells_under(sheet.grid, part, heights, AROUND * heights.cell))
+
+
+def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
+    """The surface model's cells that lie under pixels, or next to them; some may be outside of the model.
+
+    Args:
+        grid: The pixels'.
+        part: Which of them.
+        heights: The surface model's, in the same CRS.
+        margin: How far around, the CRS's unit.
+    """
+    west, north = (grid.left + part.column) * grid.cell - margin, (grid.top - part.row) * grid.cell + margin
+    east, south = west + part.width * grid.cell + 2.0 * margin, north - part.height * grid.cell - 2.0 * margin
+    left, right = (int(np.floor(at / heights.cell)) - heights.left for at in (west, east))
+    top, bottom = (heights.top - int(np.ceil(at / heights.cell)) for at in (north, south))
+    return Tile(top, left, bottom + 1 - top, right + 1 - left)
+
+
 def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
     """The heights that a sheet's pixels lie on, over the sheet."""
     margin = (MARGIN + SPREAD) * sheet.grid.cell + AROUND * heights.cell
-    west = (sheet.grid.left + sheet.part.column) * sheet.grid.cell - margin
-    north = (sheet.grid.top - sheet.part.row) * sheet.grid.cell + margin
-    east = west + sheet.part.width * sheet.grid.cell + 2.0 * margin
-    south = north - sheet.part.height * sheet.grid.cell - 2.0 * margin
-    left, right = (int(np.floor(at / heights.cell)) - heights.left for at in (west, east))
-    top, bottom = (heights.top - int(np.ceil(at / heights.cell)) for at in (north, south))
-    rows, columns = np.clip([top, bottom + 1], 0, heights.height), np.clip([left, right + 1], 0, heights.width)
+    part = _cells_under(sheet.grid, sheet.part, heights, margin)
+    rows = np.clip([part.row, part.row + part.height], 0, heights.height)
+    columns = np.clip([part.column, part.column + part.width], 0, heights.width)
     part = Tile(int(rows[0]), int(columns[0]), int(max(rows[1] - rows[0], 1)), int(max(columns[1] - columns[0], 1)))
     found = _read(dsm, part)
     return HeightField(sheet.lattice_of(heights, part), sheet.over(heights, part, found).astype(np.float32))

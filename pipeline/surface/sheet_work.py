@@ -12,7 +12,6 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.surface.sheet import GridSheet
-from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.tiles import Tile
 
 Arrays = dict[str, np.ndarray]
@@ -24,7 +23,7 @@ class SheetWork:
 
     Attributes:
         sheets: All of a grid's.
-        site: Where there is anything to be made.
+        wanted: Whether there may be anything in a tile of a sheet.
         area: Nothing outside of it is made; None for all.
         tile: Cells of a tile's side.
         folder: Where finished sheets are kept.
@@ -33,7 +32,7 @@ class SheetWork:
     """
 
     sheets: Sequence[GridSheet]
-    site: Site
+    wanted: Callable[[GridSheet, Tile], bool]
     area: PlanArea | None
     tile: int
     folder: Path
@@ -48,7 +47,9 @@ class SheetWork:
                 or nan.
         """
         self.folder.mkdir(exist_ok=True)
-        wanted = [self._tiles(sheet) for sheet in self.sheets]
+        wanted = [
+            [tile for tile in sheet.sheet.lattice.tiles(self.tile) if self.wanted(sheet, tile)] for sheet in self.sheets
+        ]
         done, total = 0, sum(len(tiles) for tiles in wanted)
         for number, (sheet, tiles) in enumerate(zip(self.sheets, wanted, strict=True)):
             path = self._path(number)
@@ -72,17 +73,6 @@ class SheetWork:
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{number:06d}.npz"
-
-    def _tiles(self, sheet: GridSheet) -> list[Tile]:
-        """Those that may have anything."""
-        lattice = sheet.sheet.lattice
-        found = []
-        for tile in lattice.tiles(self.tile):
-            corners = lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
-            local = sheet.sheet.local(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
-            if self.site.sees(np.stack([local.min(axis=0), local.max(axis=0)])):
-                found.append(tile)
-        return found
 
     def _take(self, whole: Arrays, sheet: GridSheet, tile: Tile, arrays: Arrays) -> None:
         outside = None if self.area is None else ~self._inside(self.area, sheet, tile)
