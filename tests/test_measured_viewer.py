@@ -21,7 +21,8 @@ from splatpipe.stages.line import DSM, EXPORT, GEOREF, LINE
 PLAIN = b"<title>House</title>" + BEGIN + b"null" + END + b"<script>draw()</script>"
 HOSTILE = "</script><script>alert(1)</script>\u202e\u2028"
 TRACE = {
-    **{name: [0.0, 1.0, None, 3.0] for name in ("distance", "height", "sigma", "x", "y", "z")},
+    "distance": [0.0, 1.0, 2.0, 3.0],
+    **{name: [0.0, 1.0, None, 3.0] for name in ("height", "sigma", "x", "y", "z")},
     "point_distance": [],
     "point_height": [],
 }
@@ -189,6 +190,11 @@ def changed(item: dict[str, Any], **members: Any) -> dict[str, Any]:
         [changed(SECTION, trace={**TRACE, "x": ["1", 2.0, None, 3.0]})],
         [changed(SECTION, trace={**TRACE, "x": [float("nan"), 2.0, None, 3.0]})],
         [changed(SECTION, length_m=float("inf"))],
+        [changed(SECTION, length_m=10**400)],
+        [changed(SECTION, trace={**TRACE, "x": [1e300, 2.0, None, 3.0]})],
+        [changed(SECTION, trace={**TRACE, "distance": [0.0, 0.0, 0.0, 0.0]})],
+        [changed(SECTION, trace={**TRACE, "distance": [0.0, 1.0, 2.0, None]})],
+        [changed(SECTION, trace={**TRACE, "height": [None] * 4})],
         [changed(SECTION, csv="../../nothing")],
     ],
 )

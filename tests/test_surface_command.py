@@ -107,6 +107,16 @@ def test_other_sections_are_refused(text: str) -> None:
             parse_lines(text)
 
 
+def test_a_section_without_length_is_refused() -> None:
+    with pytest.raises(UsageError, match="no length"):
+        Wanted.of(["1,2,1,2.0"], None, "rim")
+
+
+def test_polygons_that_are_nowhere_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no file"):
+        Wanted.of([], tmp_path / "heap.geojson", "rim")
+
+
 def test_lines_are_taken_whole_or_not_at_all() -> None:
     assert len(parse_lines(";".join(["388700,5299700,388710.5,5299710.5"] * 200))) == 200
     with pytest.raises(UsageError, match="too many"):

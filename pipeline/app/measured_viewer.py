@@ -21,6 +21,7 @@ SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
 PLACES = ("x", "y", "z")
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
+LARGEST = 1e9  # of a coordinate, metres: beyond it there is no earth, and a chart's steps drown in rounding
 
 
 def renew_viewer(out: Path) -> str:
@@ -89,7 +90,9 @@ def _volume(item: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_section_trace(trace: Any) -> bool:
     """Whether the page can draw it: a damaged one may not cost people the rest."""
-    return _has_columns(trace, PROFILE) and _has_columns(trace, POINTS)
+    if not _has_columns(trace, PROFILE) or not _has_columns(trace, POINTS) or None in trace["distance"]:
+        return False
+    return trace["distance"][-1:] > [0.0] and any(height is not None for height in trace["height"])
 
 
 def _is_polygon_trace(trace: Any) -> bool:
@@ -100,6 +103,8 @@ def _has_columns(trace: Any, names: Sequence[str]) -> bool:
     """Whether these are there, equally long, and of numbers or None."""
     if not isinstance(trace, dict) or not all(isinstance(trace.get(name), list) for name in names):
         return False
-    if not all(value is None or is_number(value) for name in names for value in trace[name]):
+    if not all(
+        value is None or (is_number(value) and abs(value) <= LARGEST) for name in names for value in trace[name]
+    ):
         return False
     return len({len(trace[name]) for name in names}) == 1

@@ -8,7 +8,7 @@ others it would be wrong.
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -105,7 +105,7 @@ def _is_whole(item: Any, kind: Kind) -> bool:
 
 def is_number(value: Any) -> bool:
     """Whether it is a number that a page can show."""
-    return isinstance(value, int | float) and math.isfinite(value)
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max  # NaN is not; an int may be any size
 
 
 def _kept(out: Path) -> dict[str, Any]:

@@ -57,13 +57,15 @@ class Wanted:
         """As it stands on a command line.
 
         Raises:
-            UsageError: if a section is no line, or the base none.
+            UsageError: if a section is no line or has no length, the base is none, or there is no such file.
         """
         if len(sections) > MOST_SECTIONS:
             raise UsageError(f"{len(sections)} sections are too many.", hint=f"At most {MOST_SECTIONS} at a time.")
         height = _number(base)
         if height is None and base not in ("rim", "lowest"):
             raise UsageError(f'There is no base "{base[:40]}".', hint="Choose rim, lowest, or a height.")
+        if polygons is not None and not polygons.is_file():  # told now: the products may take minutes
+            raise UsageError(f"There is no file {polygons}.", hint="Give --volume a GeoJSON file of polygons.")
         plane: Base = height if height is not None else "rim" if base == "rim" else "lowest"
         return Wanted(tuple(_line(text) for text in sections), polygons, plane)
 
@@ -73,6 +75,8 @@ def _line(text: str) -> Line:
     if len(numbers) != 4 or None in numbers:
         raise UsageError(f'Cannot understand --section "{text[:60]}".', hint="Write it as --section X1,Y1,X2,Y2.")
     x1, y1, x2, y2 = (number for number in numbers if number is not None)
+    if (x1, y1) == (x2, y2):
+        raise UsageError(f"The section {text[:60]} has no length.", hint="Write it as --section X1,Y1,X2,Y2.")
     return x1, y1, x2, y2
 
 
