@@ -282,7 +282,7 @@ DSM = Stage(
 )
 ORTHO = Stage(
     "ortho",
-    version=2,
+    version=3,
     config=OrthoConfig,
     reads=("dsm.files", "dsm.site", *SURFACE_READS),
     parts={"files": "files"},

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import rasterio
 
-from splatpipe.pipeline.app.surfaces import Wanted
-from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.app.surfaces import Wanted, check_possible, measured_lines
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_length
+from splatpipe.pipeline.surface import tsdf
 from splatpipe.pipeline.surface.facades import parse_lines
 from splatpipe.stages.products import options_for
 
@@ -105,6 +106,41 @@ def test_other_sections_are_refused(text: str) -> None:
     if text:
         with pytest.raises(UsageError):
             parse_lines(text)
+
+
+def test_a_mesh_without_its_library_is_refused_and_not_remembered(
+    demo_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(tsdf.importlib, "import_module", missing)
+    before = (demo_run / "config.toml").read_bytes()
+    check_possible(demo_run, options_for("facades,cloud", None, None))
+    with pytest.raises(MachineError, match="open3d"):
+        check_possible(demo_run, options_for("mesh", None, None))
+    assert (demo_run / "config.toml").read_bytes() == before
+
+
+def test_a_run_without_scale_is_told_so_at_once_unless_it_is_placed_anew(demo_run: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(demo_run, tmp_path / "out")
+    for path in (out / "stages").glob("georef-*/frame.json"):
+        path.write_text(json.dumps({**json.loads(path.read_text()), "kind": "arbitrary", "origin": None}))
+    asked = options_for(None, None, None)
+    check_possible(demo_run, asked)
+    check_possible(out, asked, {"georef": {"control": "gcp.txt"}})
+    with pytest.raises(SplatpipeError, match="no scale"):
+        check_possible(out, asked)
+
+
+def test_what_was_measured_is_told_in_lines() -> None:
+    section = {"name": "Section 1", "length_m": 41.767, "share_with_height": 0.98, "height_sigma_m": 0.0171}
+    volume = {"polygon": 2, "name": "", "cut_m3": 23.834, "cut_sigma_m3": 0.9, "fill_m3": 0.0, "fill_sigma_m3": 0.01}
+    told = {"sections": [{**section, "dxf": "section-1.dxf"}], "volumes": [volume]}
+    first, second = measured_lines(Path("out"), told)
+    assert first == "Section 1: 41.77 m, 98% with heights, these to 1.7 cm: out/sections/section-1.dxf"
+    assert second == "Polygon 2: cut 23.83 ± 0.90 m³, fill 0.00 ± 0.01 m³: out/volumes.json"
+    assert measured_lines(Path("out"), {}) == []
 
 
 def test_a_section_without_length_is_refused() -> None:

@@ -242,7 +242,7 @@ def surface(
     as_json: JsonOption = False,
 ) -> None:
     """Make surface products of a finished run: orthophoto, surface model, façades, cloud, mesh; sections, volumes."""
-    from splatpipe.pipeline.app.surfaces import Wanted, measure_surface
+    from splatpipe.pipeline.app.surfaces import Wanted, check_possible, measure_surface, measured_lines
     from splatpipe.pipeline.engine.quantities import parse_length
     from splatpipe.stages.products import options_for
 
@@ -252,11 +252,14 @@ def surface(
         products = "dsm" if products is None and wanted.anything else products
         asked = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
         tables = [asked, *overrides(None, assignments, None).tables]
-        with RunSession(existing(out, tables, device, threads), wait) as runner:
+        request = existing(out, tables, device, threads)
+        check_possible(out, *tables)
+        with RunSession(request, wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
             if wanted.anything:
-                done.told = {"surface": measure_surface(out, wanted, threads or available_cores())}
+                measured = measure_surface(out, wanted, threads or available_cores())
+                done.told, done.news = {"surface": measured}, measured_lines(out, measured)
 
 
 @app.command()

@@ -230,10 +230,20 @@ def show_standings(standings: Iterable[Standing]) -> None:
     Console(highlight=False).print(table)
 
 
-def show_outputs(out: Path, seconds: float, ran: int, metrics: Mapping[str, JSON], files: Iterable[Path]) -> None:
-    """What a run left and how good it is, for people."""
+def show_outputs(
+    out: Path, seconds: float | None, metrics: Mapping[str, JSON], files: Iterable[Path], news: Sequence[str] = ()
+) -> None:
+    """What a run left and how good it is, for people.
+
+    Args:
+        out: OUT.
+        seconds: How long it took; None where all was there already.
+        metrics: Figures of its result.
+        files: Its files.
+        news: What was measured besides, a line each.
+    """
     console = Console(file=sys.stderr, highlight=False)
-    done = "Everything was there already: nothing to do." if not ran else f"Done in {_duration(seconds)}."
+    done = "Everything was there already: nothing to do." if seconds is None else f"Done in {_duration(seconds)}."
     console.print(f"\n[bold]{done}[/]  {escape(_brief(metrics))}", soft_wrap=True)
     sizes: dict[Path, int] = {}
     for path in files:  # what lies in a folder is told of as that
@@ -241,7 +251,9 @@ def show_outputs(out: Path, seconds: float, ran: int, metrics: Mapping[str, JSON
         sizes[shown] = sizes.get(shown, 0) + path.stat().st_size
     for path, size in sizes.items():
         console.print(f"  {escape(str(path))}  [dim]{_bytes(size)}[/]", soft_wrap=True)
-    if not ran:
+    for line in news:
+        console.print(f"[bold]{escape(line)}[/]", soft_wrap=True)
+    if seconds is None:
         console.print(f"[dim]Change an option, or --rerun a stage, to do more. Results: {escape(str(out))}[/]")
 
 

@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +32,7 @@ class Ending:
     outcome: Outcome | None = None
     reports: bool = True  # not who makes one shard: others may be at work in OUT, and the report is of all
     told: Mapping[str, Any] | None = None
+    news: Sequence[str] = ()
     _reported: Path | None = None
     _command: str | None = None
 
@@ -96,7 +97,8 @@ class Ending:
         from splatpipe.pipeline.app.console import show_accuracy, show_bad_cameras, show_outputs
 
         show_accuracy(*_accuracy(outcome))
-        show_outputs(self._out, seconds, len(outcome.ran), _headline(outcome), self._files(outcome))
+        took = seconds if outcome.ran or self.news else None
+        show_outputs(self._out, took, _headline(outcome), self._files(outcome), self.news)
         if "sparse" in outcome.artifacts:
             show_bad_cameras(outcome.artifacts["sparse"].summary.get("verdict") or {})
 

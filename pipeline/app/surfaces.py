@@ -16,6 +16,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.store import Part
 from splatpipe.stages.line import DEPTHS, DSM, GEOREF, LINE, UNDISTORT
+from splatpipe.stages.products import NO_PRODUCTS
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.surface.map_crs import MapCrs
@@ -108,6 +109,56 @@ class _Surface:
     def digests(self) -> tuple[str, str]:
         """Of the model and of the frame: what is measured holds for these alone."""
         return self.parts["dsm.files"].digest, self.parts["georef.frame"].digest
+
+
+def check_possible(out: Path, *tables: Mapping[str, Any]) -> None:
+    """Say what cannot be made before anything is begun or remembered.
+
+    Args:
+        out: OUT, of a run.
+        tables: Options that are asked for now.
+
+    Raises:
+        SplatpipeError: if the run has no scale.
+        MachineError: if a mesh is asked for, and there is no open3d.
+    """
+    from splatpipe.pipeline.survey.frames import load_frame
+
+    asked = {stage for table in tables for stage in table}
+    frame = (
+        open_run_folder(out, LINE).lineage(GEOREF).get("georef.frame")
+        if asked <= {*NO_PRODUCTS, "splat_depths"}
+        else None
+    )
+    if frame is not None and not load_frame(frame.path).in_metres:
+        raise SplatpipeError(
+            "The run has no scale: nothing can be made of it in metres.",
+            hint=f"Give it control (splatpipe georef {out} --gcp FILE), scale bars, or photos with positions.",
+        )
+    if "mesh" in asked:
+        from splatpipe.pipeline.surface.tsdf import open3d
+
+        open3d()
+
+
+def measured_lines(out: Path, told: Mapping[str, Any]) -> list[str]:
+    """What was measured, a line each, for people.
+
+    Args:
+        out: OUT.
+        told: As ``measure_surface`` returns it.
+    """
+    lines = []
+    for section in told.get("sections", ()):
+        sigma_m = section["height_sigma_m"]
+        sure = "" if sigma_m is None else f", these to {sigma_m * 100.0:.1f} cm"
+        known = f"{section['length_m']:.2f} m, {section['share_with_height']:.0%} with heights{sure}"
+        lines.append(f"{section['name']}: {known}: {out / SECTIONS / section['dxf']}")
+    for volume in told.get("volumes", ()):
+        name = volume["name"] or f"Polygon {volume['polygon']}"
+        kinds = (f"{kind} {volume[f'{kind}_m3']:.2f} ± {volume[f'{kind}_sigma_m3']:.2f} m³" for kind in ("cut", "fill"))
+        lines.append(f"{name}: {', '.join(kinds)}: {out / VOLUMES}")
+    return lines
 
 
 def measure_surface(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:

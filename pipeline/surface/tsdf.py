@@ -7,6 +7,7 @@ axes. A photo that looks through a voxel counts, too: so what one photo imagines
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -36,7 +37,8 @@ def open3d() -> Any:
         return importlib.import_module("open3d")
     except ModuleNotFoundError as error:
         raise MachineError(
-            "The mesh is made by open3d, which is not installed.", hint="Install it: pip install 'splatpipe[mesh]'."
+            "The mesh is made by open3d, which is not installed.",
+            hint=f"Install it: {sys.executable} -m pip install 'splatpipe[mesh]'",
         ) from error
     except (ImportError, OSError) as error:
         raise MachineError(
