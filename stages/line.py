@@ -302,7 +302,7 @@ FACADES = Stage(
 )
 CLOUD = Stage(
     "cloud",
-    version=2,
+    version=3,
     config=CloudConfig,
     reads=("dsm.site", *SURFACE_READS),
     parts={"files": "files"},

@@ -117,6 +117,7 @@ def test_a_mesh_without_its_library_is_refused_and_not_remembered(
     monkeypatch.setattr(tsdf.importlib, "import_module", missing)
     before = (demo_run / "config.toml").read_bytes()
     check_possible(demo_run, options_for("facades,cloud", None, None))
+    check_possible(demo_run, options_for("mesh", None, None), {"mesh": {"enabled": False}})
     with pytest.raises(MachineError, match="open3d"):
         check_possible(demo_run, options_for("mesh", None, None))
     assert (demo_run / "config.toml").read_bytes() == before
@@ -125,12 +126,13 @@ def test_a_mesh_without_its_library_is_refused_and_not_remembered(
 def test_a_run_without_scale_is_told_so_at_once_unless_it_is_placed_anew(demo_run: Path, tmp_path: Path) -> None:
     out = shutil.copytree(demo_run, tmp_path / "out")
     for path in (out / "stages").glob("georef-*/frame.json"):
-        path.write_text(json.dumps({**json.loads(path.read_text()), "kind": "arbitrary", "origin": None}))
-    asked = options_for(None, None, None)
-    check_possible(demo_run, asked)
-    check_possible(out, asked, {"georef": {"control": "gcp.txt"}})
+        text = path.read_text()
+        placed = {**json.loads(text), "kind": "arbitrary", "origin": None}
+        path.write_text(json.dumps(placed).ljust(len(text)))  # of its size, or the artifact would count as damaged
+    check_possible(demo_run, options_for("ortho", None, None))
+    check_possible(out, options_for("ortho", None, None), {"georef": {"max_position_error_m": 5.0}})
     with pytest.raises(SplatpipeError, match="no scale"):
-        check_possible(out, asked)
+        check_possible(out, options_for("ortho", None, None))
 
 
 def test_what_was_measured_is_told_in_lines() -> None:

@@ -16,6 +16,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.store import Part
 from splatpipe.stages.line import DEPTHS, DSM, GEOREF, LINE, UNDISTORT
+from splatpipe.stages.options import LineConfig
 from splatpipe.stages.products import NO_PRODUCTS
 
 if TYPE_CHECKING:
@@ -111,12 +112,12 @@ class _Surface:
         return self.parts["dsm.files"].digest, self.parts["georef.frame"].digest
 
 
-def check_possible(out: Path, *tables: Mapping[str, Any]) -> None:
+def check_possible(out: Path, *tables: dict[str, Any]) -> None:
     """Say what cannot be made before anything is begun or remembered.
 
     Args:
         out: OUT, of a run.
-        tables: Options that are asked for now.
+        tables: Of options that are asked for now, over those of the run.
 
     Raises:
         SplatpipeError: if the run has no scale.
@@ -124,18 +125,15 @@ def check_possible(out: Path, *tables: Mapping[str, Any]) -> None:
     """
     from splatpipe.pipeline.survey.frames import load_frame
 
-    asked = {stage for table in tables for stage in table}
-    frame = (
-        open_run_folder(out, LINE).lineage(GEOREF).get("georef.frame")
-        if asked <= {*NO_PRODUCTS, "splat_depths"}
-        else None
-    )
-    if frame is not None and not load_frame(frame.path).in_metres:
+    asked, run = {stage for table in tables for stage in table}, open_run_folder(out, LINE)
+    placed_anew = not {*NO_PRODUCTS, "splat_depths"}.issuperset(asked)
+    frame = run.lineage(GEOREF).get("georef.frame")
+    if frame is not None and not placed_anew and not load_frame(frame.path).in_metres:
         raise SplatpipeError(
             "The run has no scale: nothing can be made of it in metres.",
             hint=f"Give it control (splatpipe georef {out} --gcp FILE), scale bars, or photos with positions.",
         )
-    if "mesh" in asked:
+    if "mesh" in asked and run.config(LineConfig, *tables)[1].mesh.enabled:
         from splatpipe.pipeline.surface.tsdf import open3d
 
         open3d()

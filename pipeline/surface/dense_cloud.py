@@ -24,7 +24,7 @@ from splatpipe.pipeline.surface.site import Site
 from splatpipe.pipeline.surface.sources import Relief
 from splatpipe.pipeline.surface.tiles import Tile, tiled
 
-SIDE = 2048  # cells of a part of the plan, in which each photo is read once: some 6 million points, 0.4 GB
+SIDE = 1024  # cells of a part of the plan, in which each photo is read once: some 2 million points; 2048 took 3.2 GB
 TILE = 256  # cells of a tile, in which depths are compared
 MARGIN = 3  # cells around a tile from which points may move into it
 
