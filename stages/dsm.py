@@ -30,6 +30,7 @@ def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summa
         return {"cells": 0}
     site = survey_site(surface.depths, surface.finer, surface.area, inputs.machine.threads)
     if site is None:
+        report.progress(1, 1, "nothing is made", "steps")
         report.warning("No place is seen well by three photos, so there is no surface model.")
         return {"cells": 0}
     cell_m = config.cell_m or max(CELL_GSD, surface.finer) * site.gsd_m

@@ -272,7 +272,7 @@ SURFACE_READS = (
 )
 DSM = Stage(
     "dsm",
-    version=1,
+    version=2,
     config=DsmConfig,
     reads=SURFACE_READS,
     parts={"files": "files", "site": "site.json"},

@@ -211,7 +211,11 @@ def test_kill_9_in_every_stage_loses_nothing(photos: Path, undisturbed: Path, tm
         for how in ("alone", "group"):
             command = [sys.executable, KILLED_RUN, photos, out, stage, how, *every]
             died = subprocess.run(command, check=False, start_new_session=True, capture_output=True)
-            assert died.returncode == -signal.SIGKILL, f"{stage} was not hit: {died.stderr.decode()[-2000:]}"
+            told = (out / "events.jsonl").read_text().splitlines()
+            of_stage = "\n".join(line for line in told if f'"{stage}"' in line)
+            assert died.returncode == -signal.SIGKILL, (
+                f"{stage} was not hit: {died.stderr.decode()[-2000:]}{of_stage[-4000:]}"
+            )
             assert not list((out / "stages").glob(f"{stage}-*")), f"{stage} was left in spite of the kill"
     told = splatpipe("run", photos, out, *sets(*every))
     assert ran(told) == [STAGES[-1]]

@@ -1,5 +1,6 @@
 """Surface products as files, of a scene whose heights and colours are known, in a frame of local metres."""
 
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,13 +13,16 @@ import pytest
 import rasterio
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface import ortho as ortho_file
+from splatpipe.pipeline.surface import site as site_survey
 from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
 from splatpipe.pipeline.surface.grid import make_grid
 from splatpipe.pipeline.surface.heights import Capture, tile_heights
 from splatpipe.pipeline.surface.known_cells import known_cells
+from splatpipe.pipeline.surface.options import DsmConfig
 from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import grid_sheets
@@ -26,6 +30,7 @@ from splatpipe.pipeline.surface.site import Site, load_site, save_site, survey_s
 from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, Shelf
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.stages import dsm as dsm_stage
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from house_photos import run_surface
@@ -128,6 +133,29 @@ def test_depths_that_reach_too_far_for_a_site_are_refused() -> None:
         survey_site([sources()[0], DepthSource(away.camera, lambda: away)], 1.0, None, 1)
 
 
+def test_of_a_site_in_many_small_parts_the_largest_is_kept() -> None:
+    cells = np.array([[3 * (number % 20), 3 * (number // 20)] for number in range(100)] + [[1, 0]], np.int64)
+    seen = np.repeat(cells, 3, axis=0)
+    covered = site_survey._covered(seen, np.tile(np.arange(3), len(cells)))
+    assert np.argwhere(covered).tolist() == [[0, 0], [0, 1]]
+
+
+def test_a_stage_that_finds_no_site_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dsm_stage, "open_run_surface", lambda *_: run_surface(FRAME, photos(), HOUSE))
+    monkeypatch.setattr(dsm_stage, "survey_site", lambda *_: None)
+    told = Told()
+    assert dsm_stage.run(DsmConfig(), Inputs({}, tmp_path, {}, Machine("cpu", 1)), tmp_path, told) == {"cells": 0}
+    assert told.calls == 1
+    assert load_site(tmp_path / "site.json") is None
+
+
+def test_what_is_there_already_is_told_of_as_done(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / "work", tmp_path / "work")
+    told = Told()
+    dsm(tmp_path, report=told)
+    assert told.calls == 1
+
+
 def test_a_site_is_read_as_it_was_written(tmp_path: Path) -> None:
     save_site(tmp_path / "site.json", site(), 0.25)
     loaded = load_site(tmp_path / "site.json")
@@ -219,7 +247,7 @@ def test_an_interrupted_product_goes_on_with_the_same_bytes(made: Path, tmp_path
     product(tmp_path)
     again = Told()
     product(tmp_path, report=again)
-    assert again.calls == 0  # all sheets were there
+    assert again.calls == 1  # all sheets were there
     for path in tmp_path.glob("*.tif"):
         assert path.read_bytes() == (made / path.name).read_bytes()
 

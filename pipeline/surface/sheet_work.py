@@ -40,7 +40,7 @@ class SheetWork:
     what: str
 
     def run(self, make: Callable[[GridSheet, Sequence[Tile]], Iterator[tuple[Tile, Arrays]]]) -> None:
-        """Make what is not there yet.
+        """Make what is not there yet; progress is told of to the end, also where nothing was left to make.
 
         Args:
             make: Yields the arrays of a sheet's tiles, each of a tile's size; what lies outside the area is set to 0,
@@ -62,6 +62,7 @@ class SheetWork:
                 save_arrays(path, **whole)
             else:
                 done += len(tiles)
+        self.report.progress(max(1, done), max(1, total), self.what, "tiles")
 
     def finished(self) -> Iterator[tuple[Tile, Arrays]]:
         """The sheets that have anything, with the part of the grid that each is."""

@@ -176,7 +176,7 @@ def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) ->
     _, parts = cv2.connectedComponents(covered, connectivity=8)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    kept = sizes >= LEAST_PART * sizes.sum()
+    kept = sizes >= min(LEAST_PART * sizes.sum(), sizes.max())  # of a site in many pieces, too, the largest
     return np.asarray((covered > 0) & kept[parts])
 
 
