@@ -21,18 +21,20 @@ from splatpipe.pipeline.geometry.plan_area import read_world_area
 from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
 from splatpipe.pipeline.render.rendering import as_trained, load_rendering
 from splatpipe.pipeline.splat.dome import sky_dome
+from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.scene import Scene
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.georeference import scene_box, told_in_a_line
 from splatpipe.pipeline.survey.handover import (
     bounded_comments,
     cameras_json,
+    facts_of,
     georef_facts,
     in_world,
     inside_first,
-    ply_comments,
     pose_in_world,
 )
 from splatpipe.pipeline.survey.sparse_scene import sparse_glb
@@ -58,18 +60,19 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 
     report.progress(0, 4, "moving the model into its frame", "files")
     model = read_splat(inputs["train.model"])
-    comments = ply_comments(frame, load_rendering(inputs["train.rendering"]).antialias)
+    facts = facts_of(frame, load_rendering(inputs["train.rendering"]).antialias)
     area = read_world_area(inputs.parts.get("georef.boundary"))
     sky = read_panorama(inputs["train.sky"]) if config.sky else None
     (out / "sky").mkdir()
     if sky is not None:
         dome = sky_dome(sky, model.select(model.finite()), np.array([camera.centre() for camera in cameras]))
-        write_splat(out / "sky/sky.ply", in_world(dome, frame), comments)
+        plain_ply.write(out / "sky/sky.ply", Scene(in_world(dome, frame), facts))
     elif config.sky:
         report.warning("There is no sky to hand over.", hint="It takes train.sky=model, and photos that show the sky.")
     gaussians, within = inside_first(in_world(model, frame), area)
     del model  # the next is as large, and what follows wants room
-    write_splat(out / "splat.ply", gaussians, [*comments, *bounded_comments(within, len(gaussians))])
+    bounded = bounded_comments(within, len(gaussians))
+    plain_ply.write(out / "splat.ply", Scene(gaussians, facts), bounded)
     report.progress(1, 4, "writing the cameras and the points", "files")
     write_json(out / "cameras.json", cameras_json(cameras, frame))
     (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))

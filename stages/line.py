@@ -196,7 +196,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=6,
+    version=7,
     config=ExportConfig,
     reads=(
         "train.model",

@@ -18,10 +18,11 @@ from splatpipe.pipeline.photos.dataset import load_points, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.splat.formats.plain_ply import frame_comments
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, write_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.handover import in_world, ply_comments
+from splatpipe.pipeline.survey.handover import facts_of, in_world
 from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
@@ -156,7 +157,7 @@ def test_header_says_where_the_origin_is(exported: Path, tmp_path: Path) -> None
     comments = PlyData.read(str(exported / "splat.ply")).comments
     assert any("east north up, metres" in comment for comment in comments)
     assert any("52.2" in comment and "20.9" in comment and "110.5" in comment for comment in comments)
-    arbitrary = ply_comments(load_frame(write_frame(tmp_path / "frame.json", "arbitrary")), antialias=True)
+    arbitrary = frame_comments(facts_of(load_frame(write_frame(tmp_path / "frame.json", "arbitrary")), antialias=True))
     assert arbitrary[0] == "SplatRenderMode: mip"
     assert "arbitrary scale" in arbitrary[1]
 

@@ -16,11 +16,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.splat.formats.plain_ply import frame_comments
 from splatpipe.pipeline.surface.photo_samples import linear
 from splatpipe.pipeline.surface.triangles import ColouredMesh
 from splatpipe.pipeline.surface.whole_file import whole_file
 from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.handover import georef_facts, ply_comments
+from splatpipe.pipeline.survey.handover import facts_of, georef_facts
 from splatpipe.pipeline.survey.sparse_scene import GLTF_FROM_WORLD
 
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125  # glTF's component types
@@ -45,7 +46,7 @@ def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, boundary: Path | 
     with whole_file(folder / "mesh.glb") as aside, aside.open("wb") as file:
         _write_glb(file, made)
     with whole_file(folder / "mesh.ply") as aside, aside.open("wb") as file:
-        _write_ply(file, made, ply_comments(frame, antialias=False))
+        _write_ply(file, made, frame_comments(facts_of(frame, antialias=False)))
     vertices = made.mesh.vertices
     box = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
     write_json(folder / "georef.json", georef_facts(frame, box, boundary))

@@ -14,9 +14,9 @@ from jaxtyping import Float64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import MIP_COMMENT
+from splatpipe.pipeline.splat.scene import Place, SceneFacts
 from splatpipe.pipeline.survey.crs import utm_of
-from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.frames import Frame, Origin, Similarity
 from splatpipe.pipeline.survey.georeference import georeference
 
 
@@ -42,21 +42,32 @@ def _in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
     return moved.select(moved.finite() & (length[:, 0] > 0.0))
 
 
-def ply_comments(frame: Frame, antialias: bool) -> list[str]:
-    """Header lines that say in which frame the splat is."""
-    comments = [MIP_COMMENT] if antialias else []
-    if frame.origin is None:
-        scale = "metres, arbitrary place" if frame.metres else "arbitrary scale"
-        return [*comments, f"frame: z up, {scale} and heading"]
-    origin = frame.origin
-    where = f"{origin.latitude:.9f} {origin.longitude:.9f} {origin.height_m:.4f}"
-    return [
-        *comments,
-        "frame: local east north up, metres",
-        f"origin: {where} (latitude longitude in degrees, WGS 84; height in metres, in the vertical datum)",
-        f"vertical datum: {frame.vertical_datum}",
-        f"crs: {frame.crs or utm_of(origin.latitude, origin.longitude).text} (see georef.json)",
-    ]
+def facts_of(frame: Frame, antialias: bool) -> SceneFacts:
+    """What files say of a splat in the world frame.
+
+    Args:
+        frame: georef's.
+        antialias: Whether its opacities allow for the blur on screen.
+    """
+    origin, place = frame.origin, None
+    if origin is not None:
+        crs = frame.crs or utm_of(origin.latitude, origin.longitude).text
+        where = (origin.latitude, origin.longitude, origin.height_m)
+        place = Place(*where, frame.vertical_datum, crs, frame.approximate_crs)
+    return SceneFacts("z up", antialias, frame.in_metres, place)
+
+
+def frame_of(place: Place) -> Frame:
+    """The frame of a splat that lies there, turned to z up, as ``open_world`` takes it."""
+    origin = Origin(place.latitude, place.longitude, place.height_m)
+    return Frame(
+        kind="enu",
+        world_from_model=Similarity.identity(),
+        origin=origin,
+        vertical_datum=place.vertical_datum,
+        crs=place.crs,
+        approximate_crs=place.approximate_crs,
+    )
 
 
 def inside_first(gaussians: Gaussians, area: PlanArea | None) -> tuple[Gaussians, int | None]:
