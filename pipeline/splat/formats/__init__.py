@@ -10,29 +10,38 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatpipe.pipeline.engine.errors import UsageError
+
 if TYPE_CHECKING:
     from splatpipe.pipeline.splat.scene import Scene
 
 
 @dataclass(frozen=True)
 class SplatFormat:
-    """A format of one file or folder that holds a splat, and no more.
+    """A format of one file, or one folder, that holds a splat and no more.
 
     Attributes:
         name: As people ask for it.
         file: What a run's is called, below `OUT/export/`.
         module: In this package.
-        reads: Whether there is a reader.
+        writer: The module's function that writes it.
+        reads: Whether the module's ``read`` is to be asked for it: formats may share one.
     """
 
     name: str
     file: str
     module: str
+    writer: str = "write"
     reads: bool = True
+
+    @property
+    def ending(self) -> str:
+        """Of the files' names, from the first dot on; empty for a folder."""
+        return "".join(self.file.partition(".")[1:])
 
     def write(self, path: Path, scene: Scene) -> None:
         """Write a scene; see the module."""
-        importlib.import_module(f"{__name__}.{self.module}").write(path, scene)
+        getattr(importlib.import_module(f"{__name__}.{self.module}"), self.writer)(path, scene)
 
     def read(self, path: Path) -> Scene:
         """Read a scene; see the module."""
@@ -40,5 +49,22 @@ class SplatFormat:
         return scene
 
 
-SPLAT_FORMATS = (SplatFormat("ply", "splat.ply", "plain_ply"),)
+SPLAT_FORMATS = (
+    SplatFormat("ply", "splat.ply", "plain_ply"),
+    SplatFormat("viewer-ply", "splat.viewer.ply", "plain_ply", "write_for_viewers", reads=False),
+    SplatFormat("model", "model", "model_folder"),
+)
 """All of them."""
+
+
+def format_named(name: str) -> SplatFormat:
+    """The format of that name.
+
+    Raises:
+        UsageError: if there is none.
+    """
+    found = next((each for each in SPLAT_FORMATS if each.name == name), None)
+    if found is None:
+        names = ", ".join(each.name for each in SPLAT_FORMATS)
+        raise UsageError(f'There is no format "{name[:40]}".', hint=f"Choose of: {names}.")
+    return found

@@ -14,7 +14,9 @@ _AXES: dict[Axes, str] = {"z up": "z up", "y up": "y up", "y down": "y down (−
 
 
 def write(path: Path, scene: Scene, comments: Sequence[str] = ()) -> None:
-    """Write it in its own axes.
+    """Write it as a survey wants it: z up where it lies on the earth or has metres; else as viewers take it, y down.
+
+    Nothing is turned that has those axes already.
 
     Args:
         path: The file; replaced if it is there.
@@ -25,6 +27,22 @@ def write(path: Path, scene: Scene, comments: Sequence[str] = ()) -> None:
         ValueError: if a value is not finite.
         OSError: if the file cannot be written.
     """
+    facts = scene.facts
+    surveyed = facts.place is not None or facts.metres or facts.axes == "z up"
+    _write(path, scene.turned("z up" if surveyed else "y down"), comments)
+
+
+def write_for_viewers(path: Path, scene: Scene) -> None:
+    """Write it y down, as viewers take a PLY.
+
+    Raises:
+        ValueError: if a value is not finite.
+        OSError: if the file cannot be written.
+    """
+    _write(path, scene.turned("y down"))
+
+
+def _write(path: Path, scene: Scene, comments: Sequence[str] = ()) -> None:
     write_splat(path, scene.gaussians, [*frame_comments(scene.facts), f"{RECORD}{scene.facts.record()}", *comments])
 
 

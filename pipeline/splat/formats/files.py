@@ -1,0 +1,120 @@
+"""Splat files of any format: recognised by their content, written by what they are called."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
+from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.scene import Scene
+
+_MOST_HEADER_BYTES = 65_536  # of a PLY, in which it says whether it is compressed
+_MAGIC = ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK", "sog"), (b"glTF", "glb"))
+_HINT = "Give a splat as PLY, compressed PLY, SPZ, SOG or GLB, or the folder of a 3DGS model."
+
+
+def read_scene(path: Path) -> Scene:
+    """Read a splat of any format that can be read.
+
+    Args:
+        path: A file, or the folder of a 3DGS model.
+
+    Returns:
+        The splat, in the axes that the file has, its quaternions as they are there.
+
+    Raises:
+        SplatpipeError: if it is not there, none of the formats, or broken.
+    """
+    found = format_of_content(path)
+    try:
+        return found.read(path)
+    except OSError as error:
+        raise SplatpipeError(f"Cannot read {path}: {error.strerror or error}.", hint="Check the path.") from error
+    except MemoryError as error:
+        raise MachineError(f"{path} does not fit in memory.", hint="Take a machine with more.") from error
+
+
+def format_of_content(path: Path) -> SplatFormat:
+    """The format that a file or folder has.
+
+    Raises:
+        SplatpipeError: if it is not there, or none that can be read.
+    """
+    if path.is_dir():
+        name = "model" if (path / "point_cloud").is_dir() else "sog" if (path / "meta.json").is_file() else ""
+    else:
+        name = _name_of_file(path)
+    found = next((each for each in SPLAT_FORMATS if each.name == name and each.reads), None)
+    if found is None:
+        raise SplatpipeError(f"{path} is no splat that can be read.", hint=_HINT)
+    return found
+
+
+def _name_of_file(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            start = file.read(_MOST_HEADER_BYTES)
+    except OSError as error:
+        raise SplatpipeError(f"Cannot read {path}: {error.strerror}.", hint="Check the path.") from error
+    if start.startswith(b"ply"):
+        return "compressed-ply" if b"packed_position" in start.partition(b"end_header")[0] else "ply"
+    if start.lstrip()[:1] == b"{" and path.suffix == ".json":
+        return "sog"
+    return next((name for magic, name in _MAGIC if start.startswith(magic)), "")
+
+
+def format_of_name(path: Path, asked: str | None = None) -> SplatFormat:
+    """The format that a file is to be written in.
+
+    Args:
+        path: What it is called; the longest ending that fits counts, and a name without any is a folder.
+        asked: The format's name, where somebody gave it.
+
+    Raises:
+        UsageError: if there is none of that name or ending.
+    """
+    if asked is not None:
+        return format_named(asked)
+    if not path.suffix:
+        return format_named("model")
+    fits = [each for each in SPLAT_FORMATS if each.ending and path.name.lower().endswith(each.ending)]
+    if not fits:
+        endings = ", ".join(dict.fromkeys(each.ending for each in SPLAT_FORMATS if each.ending))
+        raise UsageError(f"No format ends in {path.suffix}.", hint=f"Choose of {endings}, or name it with --format.")
+    return max(fits, key=lambda each: len(each.ending))
+
+
+def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> None:
+    """Write a splat: quaternions of unit length, in the axes that the format's readers expect.
+
+    Args:
+        path: Where; not there in part if this fails.
+        scene: What to write; finite.
+        kind: Its format; None for the one that the name ends in.
+
+    Raises:
+        UsageError: if the name ends in no format's ending.
+        SplatpipeError: if the format cannot hold it.
+        MachineError: if it cannot be written.
+    """
+    kind = format_of_name(path) if kind is None else kind
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        kind.write(path, scene)
+    except OSError as error:
+        raise MachineError(f"Cannot write {path}: {error.strerror or error}.", hint="Check the free space.") from error
+
+
+def in_unit_quats(scene: Scene) -> Scene:
+    """The same splat with quaternions of unit length; one of no length is no rotation."""
+    pieces = (_normalised(piece) for piece in scene.gaussians.pieces())
+    return replace(scene, gaussians=Gaussians.gathered(pieces, scene.gaussians))
+
+
+def _normalised(piece: Gaussians) -> Gaussians:
+    length = piece.quats.double().norm(dim=1, keepdim=True)
+    unit = (piece.quats.double() / length.clamp(min=1e-30)).to(piece.quats.dtype)
+    unit[length[:, 0] == 0.0] = unit.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return replace(piece, quats=unit)

@@ -1,0 +1,114 @@
+"""Splat files of any format: found by content, written by name, folders and all."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
+from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, format_named, model_folder, plain_ply
+from splatpipe.pipeline.splat.formats.files import (
+    format_of_content,
+    format_of_name,
+    in_unit_quats,
+    read_scene,
+    write_scene,
+)
+from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from some_splats import some_gaussians
+
+FACTS = SceneFacts("z up", False, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS, ids=lambda kind: kind.name)
+def test_every_format_is_written_by_its_name_read_by_its_content_and_keeps_its_place(tmp_path: Path, kind):
+    scene = in_unit_quats(Scene(some_gaussians(300), FACTS))
+    path = tmp_path / kind.file
+    assert format_of_name(path) == kind
+    write_scene(path, scene)
+    read = read_scene(path)
+    assert read.facts.place == FACTS.place
+    assert read.facts.metres
+    assert len(read.gaussians) == 300
+    span = float(scene.gaussians.means.amax() - scene.gaussians.means.amin())
+    means = read.turned("z up").gaussians.means
+    apart = torch.cdist(scene.gaussians.means.double(), means.double()).amin(dim=1)
+    assert float(apart.max()) < 1e-3 * span
+
+
+def test_a_ply_and_a_model_folder_keep_every_bit(tmp_path: Path):
+    scene = Scene(some_gaussians(70), FACTS)
+    for name in ("splat.ply", "model"):
+        write_scene(tmp_path / name, scene)
+        read = read_scene(tmp_path / name)
+        for key, tensor in scene.gaussians.tensors().items():
+            assert torch.equal(getattr(read.gaussians, key), tensor)
+
+
+def test_the_copy_for_viewers_is_y_down(tmp_path: Path):
+    scene = Scene(some_gaussians(5), FACTS)
+    write_scene(tmp_path / "splat.viewer.ply", scene)
+    read = read_scene(tmp_path / "splat.viewer.ply")
+    assert read.facts.axes == "y down"
+    torch.testing.assert_close(read.gaussians.means[:, 1], -scene.gaussians.means[:, 2])
+
+
+def test_a_splat_from_nowhere_becomes_a_ply_as_viewers_take_it(tmp_path: Path):
+    write_scene(tmp_path / "a.ply", Scene(some_gaussians(5), SceneFacts("y up")))
+    assert read_scene(tmp_path / "a.ply").facts.axes == "y down"
+
+
+def test_the_newest_iteration_of_a_model_folder_is_taken(tmp_path: Path):
+    for number, count in ((7000, 3), (30000, 4), (200, 5)):
+        folder = tmp_path / f"point_cloud/iteration_{number}"
+        folder.mkdir(parents=True)
+        write_splat(folder / "point_cloud.ply", some_gaussians(count))
+    (tmp_path / "point_cloud/iteration_99999").mkdir()
+    assert len(model_folder.read(tmp_path).gaussians) == 4
+
+
+@pytest.mark.parametrize("name", ["nothing.ply", "folder", "text.ply", "empty.sog", "other.bin"])
+def test_what_is_no_splat_is_said(tmp_path: Path, name):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "text.ply").write_text("ply of sorts")
+    (tmp_path / "empty.sog").write_bytes(b"")
+    (tmp_path / "other.bin").write_bytes(b"\x00" * 99)
+    with pytest.raises(SplatpipeError):
+        read_scene(tmp_path / name)
+
+
+def test_endings_and_names_that_are_none_are_refused(tmp_path: Path):
+    with pytest.raises(UsageError, match="ends in"):
+        format_of_name(Path("a.xyz"))
+    with pytest.raises(UsageError, match="no format"):
+        format_named("obj")
+    assert format_of_name(Path("a.ply")).name == "ply"
+    assert format_of_name(Path("A.VIEWER.PLY")).name == "viewer-ply"
+    assert format_of_name(Path("folder")).name == "model"
+    assert format_of_name(Path("a.xyz"), "ply").name == "ply"
+    assert format_of_content(_written(tmp_path)).name == "ply"
+
+
+def test_a_place_that_cannot_be_written_is_said(tmp_path: Path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(MachineError, match="Cannot write"):
+        write_scene(tmp_path / "file" / "a.ply", Scene(some_gaussians(2)))
+
+
+def test_quaternions_get_unit_length_and_none_is_no_rotation():
+    made = some_gaussians(3)
+    made.quats[1] = 0.0
+    unit = in_unit_quats(Scene(made)).gaussians.quats
+    torch.testing.assert_close(unit.norm(dim=1), torch.ones(3))
+    assert unit[1].tolist() == [1.0, 0.0, 0.0, 0.0]
+    torch.testing.assert_close(unit[0] * made.quats[0].norm(), made.quats[0])
+
+
+def _written(folder: Path) -> Path:
+    plain_ply.write(folder / "a.ply", Scene(some_gaussians(2), replace(FACTS, place=None)))
+    return folder / "a.ply"
