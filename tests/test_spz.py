@@ -31,7 +31,7 @@ def read(data: bytes) -> tuple[dict[str, int], dict[str, np.ndarray]]:
     magic, version, count, degree, bits, flags, _ = struct.unpack_from("<IIIBBBB", raw)
     assert magic == 0x5053474E
     terms = (degree + 1) ** 2 - 1
-    sizes = {"means": 9, "alpha": 1, "colour": 3, "scale": 3, "quat": 4, "sh": 3 * terms}
+    sizes = {"means": 9, "alpha": 1, "colour": 3, "scale": 3, "quat": 3 if version == 2 else 4, "sh": 3 * terms}
     assert len(raw) == 16 + count * sum(sizes.values())
     arrays, at = {}, 16
     for name, size in sizes.items():
@@ -48,7 +48,9 @@ def read(data: bytes) -> tuple[dict[str, int], dict[str, np.ndarray]]:
         "alpha": np.array([a[0] / 255.0 for a in arrays["alpha"]]),
         "dc": np.array([[(c / 255.0 - 0.5) / 0.15 for c in colour] for colour in arrays["colour"]]),
         "log_scales": np.array([[s / 16.0 - 10.0 for s in scale] for scale in arrays["scale"]]),
-        "quats": np.array([smallest_three(struct.unpack("<I", q)[0]) for q in arrays["quat"]]),
+        "quats": np.array(
+            [first_three(q) if version == 2 else smallest_three(struct.unpack("<I", q)[0]) for q in arrays["quat"]]
+        ),
         "sh": np.array([[(s - 128.0) / 128.0 for s in sh] for sh in arrays["sh"]]).reshape(count, terms, 3),
     }
     return {"version": version, "degree": degree, "bits": bits, "flags": flags}, found
@@ -64,6 +66,26 @@ def smallest_three(word: int) -> list[float]:
         square += value * value
     rest.insert(largest, math.sqrt(max(0.0, 1.0 - square)))
     return [rest[3], *rest[:3]]
+
+
+def first_three(code: bytes) -> list[float]:
+    """(w, x, y, z): each of x, y, z in a byte, w not negative."""
+    x, y, z = (part / 127.5 - 1.0 for part in code)
+    return [math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z)), x, y, z]
+
+
+def test_version_2_differs_in_its_rotations_alone() -> None:
+    made = some_gaussians()
+    head, found = read(spz_bytes(made, antialias=False, version=2))
+    head_3, found_3 = read(spz_bytes(made, antialias=False))
+    assert head == {**head_3, "version": 2}
+    for name in found.keys() - {"quats"}:
+        np.testing.assert_array_equal(found[name], found_3[name])
+    quats = made.quats / torch.linalg.vector_norm(made.quats, dim=1, keepdim=True)
+    xyz = quats[:, 1:] * torch.where(quats[:, :1] < 0.0, -1.0, 1.0)
+    np.testing.assert_allclose(found["quats"][:, 1:], xyz, atol=0.5 / 127.5 + 1e-6)
+    with pytest.raises(ValueError, match="version"):
+        spz_bytes(made, antialias=False, version=1)
 
 
 def test_every_parameter_reads_back_within_half_a_step_of_its_code() -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.formats.bounded import check_values, open_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count
 
@@ -168,21 +169,14 @@ def read_splat(path: Path) -> Gaussians:
     Raises:
         SplatpipeError: if the file is missing, cut off, no splat, or has values that are not numbers.
     """
-    with _opened(path) as file:
+    with open_file(path) as file:
         header = _read_header(path, file)
         gaussians = Gaussians.empty(header.count, header.sh_degree)
         start = 0
         for rows in _chunks(path, file, header):
             _fill(gaussians, start, rows)
             start += len(rows)
-    finite = gaussians.finite()
-    if not bool(finite.all()):
-        bad = torch.nonzero(~finite)
-        raise SplatpipeError(
-            f"{path}: {len(bad)} of {len(gaussians)} Gaussians have values that are not numbers "
-            f"(the first is number {int(bad[0])}).",
-            hint="The program that wrote it failed there; export it again, or remove them in a splat editor.",
-        )
+    check_values(path, gaussians)
     return gaussians
 
 
@@ -192,7 +186,7 @@ def read_splat_header(path: Path) -> SplatHeader:
     Raises:
         SplatpipeError: as ``read_splat``, but for the values.
     """
-    with _opened(path) as file:
+    with open_file(path) as file:
         return _read_header(path, file)
 
 
@@ -205,13 +199,6 @@ def _header(count: int, names: Sequence[str], comments: Sequence[str]) -> bytes:
     lines += [f"property float {name}" for name in names]
     lines += ["end_header", ""]
     return "\n".join(lines).encode("ascii", "backslashreplace")
-
-
-def _opened(path: Path) -> BinaryIO:
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise SplatpipeError(f"Cannot read {path}: {error.strerror}.", hint="Check the path.") from error
 
 
 def _read_header(path: Path, file: BinaryIO) -> SplatHeader:

@@ -1,8 +1,9 @@
-"""SPZ, the compressed splat file that viewers read most widely: written here, version 3.
+"""SPZ, the compressed splat file that viewers read most widely: written here, versions 3 and 2.
 
 Specification: the README of github.com/nianticlabs/spz. A 16-byte header and six arrays, one after another, all within
 one gzip stream: positions (24-bit fixed point), opacities, colours, logarithms of the scales (8 bits each), rotations
-(the smallest three components, 10 bits each) and spherical harmonics (8 bits). Its frame is x right, y up, z back.
+(the smallest three components, 10 bits each; in version 2 x, y, z, 8 bits each) and spherical harmonics (8 bits). Its
+frame is x right, y up, z back.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 
 MAGIC = 0x5053474E  # "NGSP"
 VERSION = 3
+FIRST_THREE_VERSION = 2
+"""The one before, which CesiumJS reads in tiles: rotations in three bytes, off by up to a degree and more."""
 ANTIALIASED = 1
 """The header's flag: trained with opacities that allow for the blur on screen."""
 SPZ_FROM_Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -41,6 +44,7 @@ def spz_bytes(
     antialias: bool,
     sh_bits: tuple[int, int] = SH_BITS,
     turn: Float[torch.Tensor, "3 3"] | None = None,
+    version: int = VERSION,
 ) -> bytes:
     """Code Gaussians; the same bytes for the same Gaussians.
 
@@ -52,25 +56,28 @@ def spz_bytes(
         antialias: Whether their opacities allow for the blur on screen.
         sh_bits: Kept of the harmonics of degree 1, and of the others; at most 8.
         turn: Rotation to the file's frame, where they are in another.
+        version: 3, or 2 for readers that know no other.
 
     Returns:
         The file.
 
     Raises:
-        ValueError: if a parameter is not finite.
+        ValueError: if a parameter is not finite, or of another version.
     """
+    if version not in (FIRST_THREE_VERSION, VERSION):
+        raise ValueError(f"SPZ version {version} is not written")
     if not all(bool(piece.finite().all()) for piece in gaussians.pieces()):
         raise ValueError("an SPZ file holds finite numbers only")
     gaussians = gaussians.detach()
     means = [np.zeros((0, 3)), *(_turned(piece, turn).means.numpy() for piece in gaussians.pieces())]
     bits, shrink = _range(np.concatenate(means, dtype=np.float64))
     header = struct.pack(
-        "<IIIBBBB", MAGIC, VERSION, len(gaussians), gaussians.sh_degree, bits, ANTIALIASED if antialias else 0, 0
+        "<IIIBBBB", MAGIC, version, len(gaussians), gaussians.sh_degree, bits, ANTIALIASED if antialias else 0, 0
     )
     coded: list[list[bytes]] = [[] for _ in range(ARRAYS)]
     done = 0
     for piece in gaussians.pieces():
-        arrays = _coded(_turned(piece, turn), bits, shrink[done : done + len(piece)], sh_bits)
+        arrays = _coded(_turned(piece, turn), bits, shrink[done : done + len(piece)], sh_bits, version)
         for kept, array in zip(coded, arrays, strict=True):
             kept.append(array.tobytes())
         done += len(piece)
@@ -82,7 +89,7 @@ def _turned(gaussians: Gaussians, turn: Float[torch.Tensor, "3 3"] | None) -> Ga
 
 
 def _coded(
-    gaussians: Gaussians, bits: int, shrink: Float64[np.ndarray, " n"], sh_bits: tuple[int, int]
+    gaussians: Gaussians, bits: int, shrink: Float64[np.ndarray, " n"], sh_bits: tuple[int, int], version: int
 ) -> tuple[UInt8[np.ndarray, ...], ...]:
     """The file's arrays of some Gaussians."""
     log_scales = gaussians.log_scales.numpy() + np.log(shrink).astype(np.float32)[:, None]
@@ -91,7 +98,7 @@ def _coded(
         _to_byte(torch.sigmoid(gaussians.opacity_logits).numpy() * 255.0),
         _to_byte(gaussians.sh[:, 0].numpy() * (COLOUR_SCALE * 255.0) + 127.5),
         _to_byte((log_scales - LEAST_LOG_SCALE) * LOG_SCALE_STEPS),
-        _smallest_three(gaussians.quats.numpy()),
+        (_smallest_three if version == VERSION else _first_three)(gaussians.quats.numpy()),
         _harmonics(gaussians.sh[:, 1:].numpy(), sh_bits),
     )
 
@@ -120,8 +127,7 @@ def _fixed_point(means: Float64[np.ndarray, "n 3"], bits: int) -> UInt8[np.ndarr
 
 def _smallest_three(quats: Float32[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
     """Which of x, y, z, w is the largest, in the upper 2 bits, then sign and 9 bits of each other one, over √½."""
-    ordered = quats[:, [1, 2, 3, 0]].astype(np.float64)
-    ordered /= np.maximum(np.linalg.norm(ordered, axis=1, keepdims=True), 1e-30)
+    ordered = _normalized(quats)
     largest = np.abs(ordered).argmax(axis=1)
     rows = np.arange(len(ordered))
     ordered *= np.where(ordered[rows, largest] < 0.0, -1.0, 1.0)[:, None]
@@ -131,6 +137,19 @@ def _smallest_three(quats: Float32[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4
     signed = magnitude | ((rest < 0.0).astype(np.uint32) << 9)
     word = (largest.astype(np.uint32) << 30) | (signed[:, 0] << 20) | (signed[:, 1] << 10) | signed[:, 2]
     return np.asarray(word.astype("<u4")[:, None].view(np.uint8))
+
+
+def _first_three(quats: Float32[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 3"]:
+    """x, y, z of the one of both quaternions whose w is not negative, a byte each."""
+    ordered = _normalized(quats)
+    ordered *= np.where(ordered[:, 3:] < 0.0, -1.0, 1.0)
+    return _to_byte(ordered[:, :3].astype(np.float32) * 127.5 + 127.5)
+
+
+def _normalized(quats: Float32[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
+    """Of length one, in the order x, y, z, w."""
+    ordered = quats[:, [1, 2, 3, 0]].astype(np.float64)
+    return np.asarray(ordered / np.maximum(np.linalg.norm(ordered, axis=1, keepdims=True), 1e-30))
 
 
 def _harmonics(sh: Float32[np.ndarray, "n k 3"], bits: tuple[int, int]) -> UInt8[np.ndarray, "n k 3"]:

@@ -1,0 +1,171 @@
+"""What readers of anybody's files share: errors instead of exceptions, and no more memory than a file is worth."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from io import BufferedIOBase, BufferedReader
+from pathlib import Path
+
+import torch
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.gaussians import Gaussians
+
+MOST_EXPANSION = 10.0
+"""Splats hardly compress: SPZ to a third, with harmonics of zero to a sixth. What grows more is made to fill memory."""
+FREE_BYTES = 1 << 25
+"""What a file of any size may expand to: of little or uniform content it may be small indeed."""
+MOST_LOG_SCALE, MOST_COORDINATE = 40.0, 1e18  # float32 holds the squares of what is smaller
+_READ_BYTES = 1 << 16
+_AGAIN = "Copy or export it again."
+
+
+def open_file(path: Path) -> BufferedReader:
+    """Open a user's file to read its bytes.
+
+    Raises:
+        SplatpipeError: if it cannot be opened, or is a folder.
+    """
+    try:
+        return path.open("rb")
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise SplatpipeError(f"Cannot read {path}: {_reason(error)}.", hint="Check the path.") from error
+
+
+def file_bytes(file: BufferedIOBase) -> int:
+    """An open file's size."""
+    return os.fstat(file.fileno()).st_size
+
+
+def read_whole(path: Path) -> bytes:
+    """All bytes of a user's file.
+
+    Raises:
+        SplatpipeError: if it cannot be read.
+    """
+    with open_file(path) as file:
+        return _read(path, file, -1)
+
+
+def read_exactly(path: Path, file: BufferedIOBase, count: int) -> bytes:
+    """The next bytes of a file, all of them.
+
+    Args:
+        path: For the error.
+        file: Where to read on.
+        count: How many: at most what is held in memory at a time, never a header's say.
+
+    Raises:
+        SplatpipeError: if the file ends before, or cannot be read.
+    """
+    data = _read(path, file, count)
+    if len(data) != count:
+        raise SplatpipeError(f"{path} is cut off.", hint=_AGAIN)
+    return data
+
+
+def check_expansion(path: Path, expanded_bytes: int, stored_bytes: int, most: float = MOST_EXPANSION) -> None:
+    """Refuse what would take far more memory than its file is worth, before any is taken.
+
+    Args:
+        path: For the error.
+        expanded_bytes: What a header promises.
+        stored_bytes: What there is of it.
+        most: Times that splats of the format may grow.
+
+    Raises:
+        SplatpipeError: if it promises more than that.
+    """
+    if expanded_bytes > FREE_BYTES + most * stored_bytes:
+        raise SplatpipeError(
+            f"{path} is damaged or cut off: {stored_bytes:,} bytes cannot hold {expanded_bytes:,} as promised.",
+            hint=_AGAIN,
+        )
+
+
+def check_values(path: Path, gaussians: Gaussians) -> None:
+    """Refuse Gaussians that nothing can be computed with.
+
+    Args:
+        path: For the error.
+        gaussians: As read.
+
+    Raises:
+        SplatpipeError: if a value is no number, or so large that float32 cannot hold its square.
+    """
+    finite = gaussians.finite()
+    if not bool(finite.all()):
+        bad = torch.nonzero(~finite)
+        raise SplatpipeError(
+            f"{path}: {len(bad)} of {len(gaussians)} Gaussians have values that are not numbers "
+            f"(the first is number {int(bad[0])}).",
+            hint="The program that wrote it failed there; export it again, or remove them in a splat editor.",
+        )
+    if not len(gaussians):
+        return
+    if float(gaussians.log_scales.max()) > MOST_LOG_SCALE:
+        raise SplatpipeError(
+            f"{path}: scales as large as exp({float(gaussians.log_scales.max()):.6g}) are no splat's.",
+            hint="A splat file holds the scales' logarithms; the program that wrote it wrote something else.",
+        )
+    if max(float(gaussians.means.max()), -float(gaussians.means.min())) > MOST_COORDINATE:
+        raise SplatpipeError(f"{path}: coordinates beyond {MOST_COORDINATE:g} are no splat's.", hint=_AGAIN)
+
+
+class InflatedFile:
+    """A gzip stream read on and on, in memory that its reader sets and no file can raise.
+
+    Args:
+        path: For errors.
+        file: Where the stream begins.
+    """
+
+    def __init__(self, path: Path, file: BufferedIOBase) -> None:
+        self._path, self._file = path, file
+        self._inflate = zlib.decompressobj(31)  # 15 bits of window, with gzip's header and check sum
+
+    def exactly(self, count: int) -> bytes:
+        """The next bytes, all of them.
+
+        Args:
+            count: How many: at most what is held in memory at a time.
+
+        Raises:
+            SplatpipeError: if the stream ends before, or is damaged.
+        """
+        data = self.at_most(count)
+        if len(data) != count:
+            raise SplatpipeError(f"{self._path} is cut off: what it holds ends early.", hint=_AGAIN)
+        return data
+
+    def at_most(self, count: int) -> bytes:
+        """The next bytes; fewer where the stream ends, whose check sum is then known to be right.
+
+        Raises:
+            SplatpipeError: if the stream is cut off or damaged.
+        """
+        parts: list[bytes] = []
+        left = count
+        while left and not self._inflate.eof:
+            stored = self._inflate.unconsumed_tail or _read(self._path, self._file, _READ_BYTES)
+            try:
+                part = self._inflate.decompress(stored, left)
+            except zlib.error as error:
+                raise SplatpipeError(f"{self._path} is damaged: its gzip stream is broken.", hint=_AGAIN) from error
+            if not stored and not part:
+                raise SplatpipeError(f"{self._path} is cut off: its gzip stream does not end.", hint=_AGAIN)
+            parts.append(part)
+            left -= len(part)
+        return b"".join(parts)
+
+
+def _read(path: Path, file: BufferedIOBase, count: int) -> bytes:
+    try:
+        return file.read(count)
+    except OSError as error:  # a folder opens on some systems and fails here
+        raise SplatpipeError(f"Cannot read {path}: {_reason(error)}.", hint="Check the path.") from error
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return getattr(error, "strerror", None) or str(error)
