@@ -1,0 +1,174 @@
+"""Levels of detail: a tree of parts of space, each of which stands for those below it until one comes near."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.moments import moments_of
+from splatpipe.pipeline.splat.reduction import Reduction, reduce_further
+
+MOST_PER_NODE = 60_000
+CHILDREN = 4
+"""Of a node, at most: a surface twice as coarse has a quarter as many Gaussians."""
+BOX_SIGMAS = 3.0
+ERROR_PER_SPREAD = 16.0
+"""World units of a node's error for each of the spread of its merged Gaussians."""
+_SPREAD_QUANTILE = 0.9  # by mass: the coarsest tenth may lie beyond
+_ERROR_STEP = 1.01  # that a node's error is at least above its children's
+_FAR_SIDES = 2.0  # what lies so many sides of the middle 80 % beyond them is far: sky, floaters
+_MIDDLE_PERCENT = (10.0, 90.0)  # even a fifth of all Gaussians in a sky around leaves these to the scene
+_EXTENT_PERCENT = (5.0, 95.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelNode:
+    """A part of the scene at one level of detail.
+
+    Attributes:
+        box: Lowest and highest corner of the centres ± 3 standard deviations of what it and all below it hold, scene
+            frame.
+        error: How far it stands from the full model, world units; 0 where it is that. Above its children's.
+        gaussians: Stands for everything below.
+        children: Together they replace it; none at the full model.
+    """
+
+    box: Float64[np.ndarray, "2 3"]
+    error: float
+    gaussians: Gaussians
+    children: tuple[LevelNode, ...]
+
+    def nodes(self) -> Iterator[LevelNode]:
+        """This one and all below it, each before its children."""
+        yield self
+        for child in self.children:
+            yield from child.nodes()
+
+
+def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> LevelNode:
+    """Divide Gaussians in space into leaves, and merge those of a node's children until they fit one node.
+
+    What lies far outside, as a sky does, has its own branch: the others' boxes stay small.
+
+    Args:
+        gaussians: On the CPU, in any frame; at least one.
+        most_per_node: Gaussians in a node, at most.
+
+    Returns:
+        The root. Every Gaussian is in one leaf, to the bit.
+
+    Raises:
+        ValueError: if there are no Gaussians, or nodes may not hold any.
+    """
+    if not len(gaussians) or most_per_node < 1:
+        raise ValueError(f"levels of {len(gaussians)} Gaussians, at most {most_per_node} in a node")
+    means = gaussians.means.detach().to(torch.float64).numpy()
+    everything = np.arange(len(means))
+    far = _far(means)
+    if len(far) <= most_per_node // 2 or len(far) == len(means):  # too few to be worth a branch
+        return _branch(gaussians, means, everything, most_per_node).node
+    near = np.setdiff1d(everything, far, assume_unique=True)
+    parts = [_branch(gaussians, means, part, most_per_node) for part in (near, far)]
+    return _joined(parts, most_per_node).node
+
+
+def select_nodes(
+    root: LevelNode, camera_centre: Float64[np.ndarray, " 3"], focal_px: float, most_error_px: float = 16.0
+) -> list[LevelNode]:
+    """The nodes that show the scene from a place: as few as are needed for no error to be larger there than allowed.
+
+    Args:
+        root: Of the levels.
+        camera_centre: World frame.
+        focal_px: Pixels.
+        most_error_px: Largest error on the screen, at the nearest point of a node's box.
+    """
+    if not root.children or root.error * focal_px <= most_error_px * box_distance(root.box, camera_centre):
+        return [root]
+    return [node for child in root.children for node in select_nodes(child, camera_centre, focal_px, most_error_px)]
+
+
+def box_distance(box: Float64[np.ndarray, "2 3"], point: Float64[np.ndarray, " 3"]) -> float:
+    """From a point to the nearest of a box; 0 inside."""
+    return float(np.linalg.norm(np.maximum(np.maximum(box[0] - point, point - box[1]), 0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Branch:
+    """A node, and the spreads of its Gaussians."""
+
+    node: LevelNode
+    spreads: Float64[np.ndarray, " n"]
+
+
+def _branch(
+    gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], part: Int64[np.ndarray, " m"], most: int
+) -> _Branch:
+    """The tree of a part: as low as nodes of this size allow, its leaves alike in number."""
+    if len(part) <= most:
+        own = gaussians.select(torch.from_numpy(np.sort(part)))
+        return _Branch(LevelNode(_box(own), 0.0, own, ()), np.zeros(len(own)))
+    height = 0
+    while most * CHILDREN**height < len(part):
+        height += 1
+    count = math.ceil(len(part) / (most * CHILDREN ** (height - 1)))
+    return _joined([_branch(gaussians, means, cell, most) for cell in _cells(means, part, count)], most)
+
+
+def _joined(branches: Sequence[_Branch], most: int) -> _Branch:
+    """The node over some: what they hold, merged until it fits."""
+    children = tuple(branch.node for branch in branches)
+    joined = Reduction(
+        Gaussians.concat([child.gaussians for child in children]),
+        np.concatenate([branch.spreads for branch in branches]),
+    )
+    reduced = reduce_further(joined, most)
+    boxes = np.stack([child.box for child in children])
+    box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+    error = max(_ERROR_STEP * max(child.error for child in children), ERROR_PER_SPREAD * _spread(reduced))
+    return _Branch(LevelNode(box, error, reduced.gaussians, children), reduced.spreads)
+
+
+def _spread(reduced: Reduction) -> float:
+    """Upper quantile, by mass, of how far Gaussians stand from what they stand for."""
+    masses = moments_of(reduced.gaussians).masses()
+    order = np.argsort(reduced.spreads, kind="stable")
+    below = np.cumsum(masses[order])
+    at = np.searchsorted(below, _SPREAD_QUANTILE * below[-1])
+    return float(reduced.spreads[order][min(at, len(order) - 1)])
+
+
+def _cells(
+    means: Float64[np.ndarray, "n 3"], part: Int64[np.ndarray, " m"], count: int
+) -> list[Int64[np.ndarray, " k"]]:
+    """Divide a part in space into so many, alike in number, across the longest side each time."""
+    if count == 1:
+        return [part]
+    first = count // 2
+    low, high = np.percentile(means[part], _EXTENT_PERCENT, axis=0)
+    axis = int(np.argmax(high - low))
+    order = part[np.argsort(means[part, axis], kind="stable")]
+    at = round(len(part) * first / count)
+    return _cells(means, order[:at], first) + _cells(means, order[at:], count - first)
+
+
+def _far(means: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " m"]:
+    low, high = np.percentile(means, _MIDDLE_PERCENT, axis=0)
+    margin = _FAR_SIDES * float((high - low).max())
+    return np.flatnonzero(((means < low - margin) | (means > high + margin)).any(1))
+
+
+def _box(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
+    """Around centres and so many standard deviations along each axis of the frame."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for piece in gaussians.pieces():
+        moments = moments_of(piece)
+        reach = BOX_SIGMAS * np.sqrt(moments.covariances[:, [0, 3, 5]])
+        low, high = np.minimum(low, (moments.means - reach).min(0)), np.maximum(high, (moments.means + reach).max(0))
+    return np.stack([low, high])

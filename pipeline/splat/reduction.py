@@ -1,0 +1,172 @@
+"""Fewer Gaussians that look the same: neighbours are merged, the least visible merge first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.matching import match_cheapest
+from splatpipe.pipeline.splat.merge_costs import merge_costs
+from splatpipe.pipeline.splat.moments import merge_pairs, moments_of, shares
+from splatpipe.pipeline.splat.morton import morton_keys
+
+NEIGHBOURS = 8
+"""Of each Gaussian that it may merge with."""
+ROUND_SHARE = 0.2
+"""Of the Gaussians, at most so many merge in a round: the less, the nearer to always taking the very cheapest."""
+PIECE = 200_000
+"""Gaussians looked at together: bounds the memory."""
+_ROWS_AT_ONCE = 1 << 15
+_CROWD = 1e-9  # of the extent: keeps points at one place apart in the tree, which is slow of many of them else
+_CROWD_SEED = 1
+_EDGE_ON = 1e-6  # standard deviation of what is flat, as a share of the extent
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """What is left of Gaussians, and how far it stands from them.
+
+    Attributes:
+        gaussians: Those left, in the order of the first of what each stands for.
+        spreads: How far what each stands for lies from its centre, root mean square by mass, world units; 0 for one
+            that stands for itself.
+    """
+
+    gaussians: Gaussians
+    spreads: Float64[np.ndarray, " n"]
+
+
+def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
+    """Merge neighbours until so many are left; each merge keeps mass, mean and covariance (``moments.merge_pairs``).
+
+    Args:
+        gaussians: On the CPU. One with a NaN, or at infinity, is drawn by nobody: it goes first.
+        count: How many are to be left, at least 1.
+
+    Returns:
+        So many, or fewer where fewer can be drawn; the argument itself where it has no more.
+
+    Raises:
+        ValueError: if the count is less than 1.
+    """
+    return reduce_further(Reduction(gaussians, np.zeros(len(gaussians))), count).gaussians
+
+
+def reduce_further(start: Reduction, count: int) -> Reduction:
+    """``reduce_to`` of what stands for others already.
+
+    Args:
+        start: What is there.
+        count: How many are to be left, at least 1.
+
+    Raises:
+        ValueError: if the count is less than 1.
+    """
+    if count < 1:
+        raise ValueError(f"{count} Gaussians are no splat")
+    if len(start.gaussians) <= count:
+        return start
+    given = start.gaussians.detach()
+    work, spreads = given.clone(), start.spreads.copy()
+    alive = np.flatnonzero(_drawn(work))
+    turn = 0
+    while len(alive) > count:
+        quota = min(len(alive) - count, max(1, math.ceil(ROUND_SHARE * len(alive))))
+        pairs = _cheapest_pairs(work, alive, quota, turn)
+        _merge_into_first(work, spreads, pairs)
+        gone = np.zeros(len(work), dtype=bool)
+        gone[pairs[:, 1]] = True
+        alive = alive[~gone[alive]]
+        turn += 1
+    return Reduction(work.select(torch.from_numpy(alive)), spreads[alive])
+
+
+def _drawn(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
+    """Which are drawn: opacities of 0 and 1 and scales of 0 have infinite parameters, and are."""
+    fine = torch.ones(len(gaussians), dtype=torch.bool)
+    for name in PARAMETERS:
+        for first in range(0, len(gaussians), _ROWS_AT_ONCE):
+            rows = slice(first, first + _ROWS_AT_ONCE)
+            values: Tensor = getattr(gaussians, name)[rows].reshape(len(fine[rows]), -1)
+            if name == "opacity_logits":
+                fine[rows] &= ~values.isnan().any(1)
+            elif name == "log_scales":
+                fine[rows] &= (values < math.inf).all(1)
+            else:
+                fine[rows] &= values.isfinite().all(1)
+    return np.asarray(fine.numpy())
+
+
+def _cheapest_pairs(work: Gaussians, alive: Int64[np.ndarray, " n"], quota: int, turn: int) -> Int64[np.ndarray, "m 2"]:
+    """Pairs without conflict, the cheapest of all pieces; at least one."""
+    found, costs = [], []
+    for piece in _pieces(work, alive, turn):
+        pairs, paid = _piece_pairs(work.select(torch.from_numpy(piece)))
+        found.append(piece[pairs])
+        costs.append(paid)
+    order = np.argsort(np.concatenate(costs), kind="stable")[:quota]
+    return np.asarray(np.concatenate(found)[order])
+
+
+def _pieces(work: Gaussians, alive: Int64[np.ndarray, " n"], turn: int) -> Iterator[Int64[np.ndarray, " m"]]:
+    """Parts of space with so many Gaussians each, cut elsewhere every other turn."""
+    if len(alive) <= PIECE:
+        yield alive
+        return
+    means = work.means[torch.from_numpy(alive)].to(torch.float64)
+    low, high = np.percentile(means[:: max(1, len(means) // PIECE)].numpy(), [1.0, 99.0], axis=0)
+    keys = morton_keys(means, torch.from_numpy(low), torch.from_numpy(high - low)).numpy()
+    sorted_alive = alive[np.argsort(keys, kind="stable")]
+    count = math.ceil(len(alive) / PIECE) + turn % 2
+    yield from np.array_split(sorted_alive, count)
+
+
+def _piece_pairs(piece: Gaussians) -> tuple[Int64[np.ndarray, "m 2"], Float64[np.ndarray, " m"]]:
+    """A matching of neighbours, and what each pair costs."""
+    moments = moments_of(piece)
+    edges = _neighbours(moments.means)
+    extent = float(np.ptp(moments.means, axis=0).max())
+    colours = piece.sh.to(torch.float32).reshape(len(piece), -1).numpy()
+    costs = merge_costs(moments, colours, edges, (_EDGE_ON * extent) ** 2)
+    chosen = match_cheapest(edges, costs, len(piece))
+    return edges[chosen], costs[chosen]
+
+
+def _neighbours(means: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "e 2"]:
+    """Pairs of neighbours, the lower index first, in order; and a chain through all, which always has a matching."""
+    count = len(means)
+    extent = float(np.ptp(means, axis=0).max()) or 1.0
+    noise = np.random.default_rng(_CROWD_SEED).uniform(-1.0, 1.0, means.shape)
+    apart = means + _CROWD * extent * noise
+    _, nearest = cKDTree(apart).query(apart, k=min(NEIGHBOURS + 1, count))
+    nearest = nearest.reshape(count, -1)
+    own = np.repeat(np.arange(count), nearest.shape[1])
+    keys = morton_keys(torch.from_numpy(apart), *(torch.from_numpy(x) for x in (apart.min(0), np.ptp(apart, axis=0))))
+    chain = np.argsort(keys.numpy(), kind="stable")
+    first, second = np.concatenate([own, chain[:-1]]), np.concatenate([nearest.ravel(), chain[1:]])
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    codes = np.unique((low * count + high)[low != high])
+    return np.stack(np.divmod(codes, count), axis=1)
+
+
+def _merge_into_first(work: Gaussians, spreads: Float64[np.ndarray, " n"], pairs: Int64[np.ndarray, "m 2"]) -> None:
+    """Put each pair's merged Gaussian in its first one's place."""
+    for start in range(0, len(pairs), _ROWS_AT_ONCE):
+        i, j = pairs[start : start + _ROWS_AT_ONCE].T
+        first, second = torch.from_numpy(i), torch.from_numpy(j)
+        one, other = work.select(first), work.select(second)
+        ours, theirs = moments_of(one), moments_of(other)
+        share = shares(ours, theirs)
+        apart = ((ours.means - theirs.means) ** 2).sum(1)
+        within = share * spreads[i] ** 2 + (1.0 - share) * spreads[j] ** 2
+        spreads[i] = np.sqrt(within + share * (1.0 - share) * apart)
+        for name, tensor in merge_pairs(one, other).tensors().items():
+            work.tensors()[name][first] = tensor
