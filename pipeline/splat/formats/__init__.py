@@ -53,6 +53,7 @@ SPLAT_FORMATS = (
     SplatFormat("ply", "splat.ply", "plain_ply"),
     SplatFormat("viewer-ply", "splat.viewer.ply", "plain_ply", "write_for_viewers", reads=False),
     SplatFormat("model", "model", "model_folder"),
+    SplatFormat("sog", "splat.sog", "sog", reads=False),
 )
 """All of them."""
 

@@ -1,0 +1,179 @@
+"""What a SOG file holds, in memory: Gaussians as bytes in lossless pictures, and the meta.json that tells them."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8, UInt16
+from PIL import Image
+from torch import Tensor
+
+from splatpipe.pipeline.splat.codebooks import fit_codebook, nearest_codes
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.morton import morton_keys
+from splatpipe.pipeline.splat.palettes import fit_palette, nearest_entries
+
+VERSION = 2
+META = "meta.json"
+RECORD = "splatpipe"
+"""The name of our record in meta.json."""
+LEVELS = 65_535  # of a coordinate
+FIRST_MODE = 252  # of a quaternion: 252 + which of w, x, y, z is the largest
+ENTRIES_A_ROW = 64  # of the picture of the palette
+MOST_ENTRIES = 65_536
+_SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
+_QUALITY, _METHOD = 70, 4  # libwebp's own for lossless; more takes 5 times as long for 1 % of the size
+
+
+@dataclass(frozen=True)
+class SogImages:
+    """Files of a SOG.
+
+    Attributes:
+        meta: What `meta.json` says; it names the pictures.
+        images: The pictures, lossless WebP, by file name.
+    """
+
+    meta: dict[str, Any]
+    images: dict[str, bytes]
+
+    def files(self) -> dict[str, bytes]:
+        """All by name, `meta.json` first."""
+        text = json.dumps(self.meta, separators=(",", ":"), allow_nan=False)
+        return {META: text.encode("ascii"), **self.images}
+
+
+def encode_sog(gaussians: Gaussians, antialias: bool = False, record: str = "", in_order: bool = False) -> SogImages:
+    """Code Gaussians; the same bytes for the same Gaussians, whatever the number of threads.
+
+    Args:
+        gaussians: Finite, on the CPU, in the file's frame (y down: what viewers take it for), about an origin near the
+            scene: a coordinate's quantum is 1 / 65,535 of its range in ± log(1 + |x|).
+        antialias: Whether their opacities allow for the blur on screen.
+        record: ``SceneFacts.record()`` of a whole file; none in the pieces of a streamed one.
+        in_order: Keep the Gaussians' order, as where an index of levels counts them; along a Morton curve otherwise,
+            which takes less room.
+
+    Returns:
+        meta.json and the pictures.
+
+    Raises:
+        ValueError: if a parameter is not finite.
+    """
+    gaussians = gaussians.detach().to("cpu", torch.float32)
+    if not bool(gaussians.finite().all()):
+        raise ValueError("a SOG file holds finite numbers only")
+    if not in_order and len(gaussians):
+        lowest, highest = gaussians.means.amin(0), gaussians.means.amax(0)
+        gaussians = gaussians.select(torch.argsort(morton_keys(gaussians.means, lowest, highest - lowest), stable=True))
+    meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "splatpipe"}, "count": len(gaussians)}
+    meta["antialias"] = antialias
+    if record:
+        meta[RECORD] = json.loads(record)
+    images: dict[str, bytes] = {}
+    for name, (facts, pictures) in _parts(gaussians).items():
+        meta[name] = {**facts, "files": [f"{picture}.webp" for picture in pictures]}
+        images |= {f"{picture}.webp": _webp(pixels) for picture, pixels in pictures.items()}
+    return SogImages(meta, images)
+
+
+_Part = tuple[dict[str, Any], dict[str, UInt8[np.ndarray, "h w c"]]]
+
+
+def _parts(gaussians: Gaussians) -> dict[str, _Part]:
+    parts = {
+        "means": _means(gaussians.means),
+        "scales": _scales(gaussians.log_scales),
+        "quats": _quats(gaussians.quats),
+        "sh0": _colours(gaussians.sh[:, 0], gaussians.opacity_logits),
+    }
+    if gaussians.sh_degree:
+        parts["shN"] = _harmonics(gaussians.sh[:, 1:], gaussians.sh_degree)
+    return parts
+
+
+def _means(means: Float[Tensor, "n 3"]) -> _Part:
+    logs = _signed_log(means.numpy().astype(np.float64))
+    low, high = (logs.min(0), logs.max(0)) if len(logs) else (np.zeros(3), np.zeros(3))
+    size = np.where(high > low, high - low, 1.0)
+    levels: UInt16[np.ndarray, "n 3"] = np.rint((logs - low) / size * LEVELS).astype(np.uint16)
+    pictures = {
+        "means_l": _picture((levels & 255).astype(np.uint8)),
+        "means_u": _picture((levels >> 8).astype(np.uint8)),
+    }
+    return {"mins": low.tolist(), "maxs": high.tolist()}, pictures
+
+
+def _signed_log(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return np.asarray(np.sign(values) * np.log1p(np.abs(values)))
+
+
+def _scales(log_scales: Float[Tensor, "n 3"]) -> _Part:
+    codebook = fit_codebook(log_scales.numpy().ravel())
+    pictures = {"scales": _picture(nearest_codes(log_scales.numpy(), codebook))}
+    return {"codebook": _numbers(codebook)}, pictures
+
+
+def _quats(quats: Float[Tensor, "n 4"]) -> _Part:
+    """The three smallest of w, x, y, z over √½, and which the fourth is."""
+    unit = quats.numpy().astype(np.float64)
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-30)
+    largest = np.abs(unit).argmax(axis=1)
+    unit *= np.where(np.take_along_axis(unit, largest[:, None], 1) < 0.0, -1.0, 1.0)
+    others = np.arange(3) + (np.arange(3) >= largest[:, None])
+    rest = np.take_along_axis(unit, others, axis=1)
+    codes = np.rint((rest * math.sqrt(0.5) + 0.5) * 255.0).clip(0.0, 255.0)
+    pixels = np.concatenate((codes, FIRST_MODE + largest[:, None]), axis=1).astype(np.uint8)
+    return {}, {"quats": _picture(pixels)}
+
+
+def _colours(dc: Float[Tensor, "n 3"], opacity_logits: Float[Tensor, " n"]) -> _Part:
+    codebook = fit_codebook(dc.numpy().ravel())
+    opacities = torch.sigmoid(opacity_logits).mul(255.0).round().to(torch.uint8).numpy()
+    pixels = np.concatenate((nearest_codes(dc.numpy(), codebook), opacities[:, None]), axis=1)
+    return {"codebook": _numbers(codebook)}, {"sh0": _picture(pixels)}
+
+
+def _harmonics(sh: Float[Tensor, "n k 3"], bands: int) -> _Part:
+    """A palette of all coefficients of a Gaussian, and which entry each Gaussian has."""
+    rows = sh.flatten(1)
+    palette = fit_palette(rows, palette_size(len(rows))) if len(rows) else torch.zeros(1, rows.shape[1])
+    codebook = fit_codebook(palette.numpy().ravel())
+    codes = np.unique(nearest_codes(palette.numpy(), codebook), axis=0)
+    labels = nearest_entries(rows, torch.from_numpy(codebook[codes])).numpy()
+    room = np.zeros((-(-len(codes) // ENTRIES_A_ROW) * ENTRIES_A_ROW, *sh.shape[1:]), np.uint8)
+    room[: len(codes)] = codes.reshape(len(codes), *sh.shape[1:])
+    split = np.stack((labels & 255, labels >> 8, np.zeros_like(labels)), axis=1).astype(np.uint8)
+    pictures = {"shN_centroids": room.reshape(-1, ENTRIES_A_ROW * sh.shape[1], 3), "shN_labels": _picture(split)}
+    return {"count": len(codes), "bands": bands, "codebook": _numbers(codebook)}, pictures
+
+
+def palette_size(count: int) -> int:
+    """Entries for so many Gaussians: the largest power of two that is not more, as far as the format goes."""
+    return min(1 << (count.bit_length() - 1), MOST_ENTRIES)
+
+
+def _picture(pixels: UInt8[np.ndarray, "n c"]) -> UInt8[np.ndarray, "h w c"]:
+    """Rows of pixels, nearly a square; zeros after the last."""
+    width = max(math.ceil(math.sqrt(len(pixels)) / _SIDES), 1) * _SIDES
+    height = max(math.ceil(len(pixels) / width / _SIDES), 1) * _SIDES
+    room = np.zeros((width * height, pixels.shape[1]), np.uint8)
+    room[: len(pixels)] = pixels
+    return room.reshape(height, width, pixels.shape[1])
+
+
+def _webp(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "WEBP", lossless=True, quality=_QUALITY, method=_METHOD, exact=True)
+    return file.getvalue()
+
+
+def _numbers(values: Float32[np.ndarray, " n"]) -> list[float]:
+    """As the shortest decimals that are these float32."""
+    return [float(str(value)) for value in values]
