@@ -54,6 +54,7 @@ SPLAT_FORMATS = (
     SplatFormat("viewer-ply", "splat.viewer.ply", "plain_ply", "write_for_viewers", reads=False),
     SplatFormat("model", "model", "model_folder"),
     SplatFormat("sog", "splat.sog", "sog", reads=False),
+    SplatFormat("glb", "splat.glb", "glb"),
 )
 """All of them."""
 

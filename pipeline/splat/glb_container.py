@@ -1,0 +1,248 @@
+"""GLB, the container of binary glTF: a JSON document and one chunk of numbers; written for us, read from anybody.
+
+Specification: Khronos, "glTF 2.0", section 4 (the GLB file format) and 3.6 (buffers, buffer views and accessors).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any, NoReturn, TypeGuard
+
+import numpy as np
+from jaxtyping import Float32
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.formats.bounded import file_bytes, read_exactly
+
+MAGIC, VERSION = 0x46546C67, 2  # "glTF"
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942  # "JSON", "BIN\0"
+MOST_BYTES = 2**32 - 1
+"""Of a file: its length is told in 32 bits."""
+MOST_JSON_BYTES = 1 << 22
+"""A splat's document has some kB; Python's objects of one take twenty times its bytes."""
+BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5120, 5121, 5122, 5123, 5125, 5126
+_NUMBERS = {BYTE: "<i1", UNSIGNED_BYTE: "<u1", SHORT: "<i2", UNSIGNED_SHORT: "<u2", UNSIGNED_INT: "<u4", FLOAT: "<f4"}
+_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_LEAST_STRIDE, _MOST_STRIDE = 4, 252
+_HEADER, _CHUNK_HEADER = struct.Struct("<III"), struct.Struct("<II")
+_AGAIN = "Export it again."
+
+
+def padded(count: int) -> int:
+    """A number of bytes, up to the next multiple of 4, at which chunks and what is in them begin."""
+    return -(-count // 4) * 4
+
+
+def write_head(file: BufferedIOBase, document: Mapping[str, Any], binary_bytes: int) -> None:
+    """Write a GLB up to where its binary chunk's bytes begin.
+
+    Args:
+        file: At its beginning.
+        document: glTF's JSON.
+        binary_bytes: Of the binary chunk; a multiple of 4.
+
+    Raises:
+        SplatpipeError: if the file would be larger than a GLB can be.
+        ValueError: if the document holds a number that is not finite, or the chunk's size is no multiple of 4.
+    """
+    if binary_bytes % 4:
+        raise ValueError(f"a chunk of {binary_bytes} bytes does not end at a multiple of 4")
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
+    text += b" " * (padded(len(text)) - len(text))
+    total = _HEADER.size + 2 * _CHUNK_HEADER.size + len(text) + binary_bytes
+    if total > MOST_BYTES:
+        raise SplatpipeError(
+            f"A GLB of {total / 1e9:.1f} GB cannot be: its length is told in 32 bits, which end at 4.3 GB.",
+            hint="Reduce the splat, crop it, or take another format: ply, spz or 3dtiles.",
+        )
+    file.write(_HEADER.pack(MAGIC, VERSION, total))
+    file.write(_CHUNK_HEADER.pack(len(text), JSON_CHUNK) + text)
+    file.write(_CHUNK_HEADER.pack(binary_bytes, BINARY_CHUNK))
+
+
+@dataclass(frozen=True)
+class Accessor:
+    """Where an attribute's rows lie in a file, known to be inside it.
+
+    Attributes:
+        count: Of the rows.
+        components: Of a row.
+        number: Of a component.
+        normalized: Whether integers stand for 0..1, or −1..1.
+        offset: Of the first row, from the file's beginning, bytes.
+        stride: From row to row, bytes.
+    """
+
+    count: int
+    components: int
+    number: np.dtype[Any]
+    normalized: bool
+    offset: int
+    stride: int
+
+    def rows(self, path: Path, file: BufferedIOBase, start: int, count: int) -> Float32[np.ndarray, "n c"]:
+        """Some of the rows.
+
+        Args:
+            path: For the error.
+            file: That the accessor lies in.
+            start: The first row.
+            count: How many, at least one: so many that their bytes are few.
+
+        Raises:
+            SplatpipeError: if the file cannot be read.
+        """
+        size = self.components * self.number.itemsize
+        file.seek(self.offset + start * self.stride)
+        data = read_exactly(path, file, (count - 1) * self.stride + size)
+        shape, strides = (count, self.components), (self.stride, self.number.itemsize)
+        values = np.ndarray(shape, self.number, data, 0, strides).astype(np.float32)
+        if self.normalized and self.number.kind in "iu":
+            values = np.maximum(values / np.float32(np.iinfo(self.number).max), np.float32(-1.0))
+        return np.ascontiguousarray(values)
+
+
+@dataclass(frozen=True)
+class Container:
+    """A GLB that was opened.
+
+    Attributes:
+        path: Its path.
+        file: Open.
+        document: glTF's JSON, whose values may be anything.
+        start: Of the binary chunk's bytes, from the file's beginning.
+        length: Of them.
+    """
+
+    path: Path
+    file: BufferedIOBase
+    document: Mapping[str, Any]
+    start: int
+    length: int
+
+    def refuse(self, what: str) -> NoReturn:
+        """Say what is wrong with it.
+
+        Raises:
+            SplatpipeError: always.
+        """
+        raise SplatpipeError(f"{self.path} is damaged: {what}.", hint=_AGAIN)
+
+    def entry(self, name: str, index: Any) -> Mapping[str, Any]:
+        """One of the document's objects.
+
+        Args:
+            name: Of the list that it is in.
+            index: Its place there, as a file states it.
+
+        Raises:
+            SplatpipeError: if there is none.
+        """
+        entries = self.document.get(name)
+        if not isinstance(entries, list) or not _is_whole(index) or index >= len(entries):
+            self.refuse(f"it has none of its {name} numbered {str(index)[:40]}")
+        entry = entries[index]
+        if not isinstance(entry, dict):
+            self.refuse(f"one of its {name} is no object")
+        return entry
+
+    def view(self, index: Any) -> tuple[int, int, int | None]:
+        """A buffer view: its offset from the file's beginning, its length and its stride, bytes.
+
+        Raises:
+            SplatpipeError: if it is not inside the file.
+        """
+        view = self.entry("bufferViews", index)
+        buffer = self.entry("buffers", view.get("buffer"))
+        if "uri" in buffer or view["buffer"] != 0:
+            raise SplatpipeError(
+                f"{self.path} keeps its data in other files, which are not read.",
+                hint="Export it as one GLB file that holds everything.",
+            )
+        if "EXT_meshopt_compression" in view.get("extensions", ()):
+            raise SplatpipeError(f"{self.path} is packed by meshopt, which is not read.", hint="Export it without.")
+        offset, length, stride = view.get("byteOffset", 0), view.get("byteLength"), view.get("byteStride")
+        if not _is_whole(offset) or not _is_whole(length) or offset + length > self.length:
+            self.refuse("a buffer view lies outside of its data")
+        if stride is not None and not (_is_whole(stride) and _LEAST_STRIDE <= stride <= _MOST_STRIDE):
+            self.refuse("a buffer view's stride is none")
+        return self.start + offset, length, stride
+
+    def accessor(self, index: Any, kinds: tuple[str, ...]) -> Accessor:
+        """An accessor whose rows lie inside the file.
+
+        Args:
+            index: As a file states it.
+            kinds: Of rows that are taken: ``SCALAR``, ``VEC3``, ``VEC4``.
+
+        Raises:
+            SplatpipeError: if there is none, of another kind, sparse, or outside of its data.
+        """
+        found = self.entry("accessors", index)
+        if "bufferView" not in found or "sparse" in found:
+            raise SplatpipeError(f"{self.path} has data that are left out or sparse: that is not read.", hint=_AGAIN)
+        kind, component = found.get("type"), found.get("componentType")
+        if kind not in kinds or not _is_whole(component) or component not in _NUMBERS:
+            self.refuse(f"an accessor is of {str(kind)[:20]} and {str(component)[:20]}")
+        number, components = np.dtype(_NUMBERS[component]), _COMPONENTS[kind]
+        start, length, stride = self.view(found["bufferView"])
+        offset, count, size = found.get("byteOffset", 0), found.get("count"), components * number.itemsize
+        stride = size if stride is None else stride
+        if not _is_whole(count) or count < 1 or not _is_whole(offset) or stride < size:
+            self.refuse("an accessor's rows cannot be")
+        if offset + (count - 1) * stride + size > length:
+            self.refuse(f"an accessor of {str(count)[:20]} rows lies outside of its data")
+        return Accessor(count, components, number, found.get("normalized") is True, start + offset, stride)
+
+
+def open_container(path: Path, file: BufferedIOBase) -> Container:
+    """Read a GLB's document, and where its data lie.
+
+    Args:
+        path: For the errors.
+        file: At its beginning.
+
+    Raises:
+        SplatpipeError: if it is no GLB, or its lengths are not of this file.
+    """
+    magic, version, total = _HEADER.unpack(read_exactly(path, file, _HEADER.size))
+    if magic != MAGIC:
+        raise SplatpipeError(f"{path} is no GLB.", hint="Of a .gltf and its files make one .glb first.")
+    if version != VERSION:
+        raise SplatpipeError(f"{path} is a GLB of version {version}, not {VERSION}.", hint=_AGAIN)
+    if total > file_bytes(file):
+        raise SplatpipeError(f"{path} is cut off: it has {file_bytes(file):,} of {total:,} bytes.", hint=_AGAIN)
+    length, kind = _CHUNK_HEADER.unpack(read_exactly(path, file, _CHUNK_HEADER.size))
+    start = _HEADER.size + _CHUNK_HEADER.size
+    if kind != JSON_CHUNK or start + length > total:
+        raise SplatpipeError(f"{path} is damaged: its first chunk is no JSON inside of it.", hint=_AGAIN)
+    if length > MOST_JSON_BYTES:
+        raise SplatpipeError(f"{path} describes itself in {length:,} bytes: no splat's file does.", hint=_AGAIN)
+    document = _parsed(path, read_exactly(path, file, length))
+    start, length = start + length, 0
+    if start + _CHUNK_HEADER.size <= total:
+        length, kind = _CHUNK_HEADER.unpack(read_exactly(path, file, _CHUNK_HEADER.size))
+        start += _CHUNK_HEADER.size
+        if kind != BINARY_CHUNK or start + length > total:
+            raise SplatpipeError(f"{path} is damaged: its second chunk is no data inside of it.", hint=_AGAIN)
+    return Container(path, file, document, start, length)
+
+
+def _parsed(path: Path, text: bytes) -> Mapping[str, Any]:
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError, and integers of thousands of digits, too
+        raise SplatpipeError(f"{path} is damaged: its JSON cannot be read.", hint=_AGAIN) from error
+    if not isinstance(document, dict):
+        raise SplatpipeError(f"{path} is damaged: its JSON is no object.", hint=_AGAIN)
+    return document
+
+
+def _is_whole(value: Any) -> TypeGuard[int]:
+    """Whether it is an integer that is not negative: JSON's true is one to Python, and 1e400 would be a float."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0

@@ -1,0 +1,187 @@
+"""The Gaussians of a GLB with `KHR_gaussian_splatting`: everything its scene draws of them, in the scene's frame.
+
+Specifications: Khronos, "KHR_gaussian_splatting" (ratified), and "KHR_gaussian_splatting_compression_spz_2", of which
+CesiumJS takes the SPZ file's axes for the glTF's: so do we.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.glb_container import Accessor, Container
+from splatpipe.pipeline.splat.glb_nodes import Drawn, drawn_primitives
+from splatpipe.pipeline.splat.sh import MAX_DEGREE, rgb_to_dc
+
+EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
+ROWS_AT_ONCE = 1 << 16
+_KNOWN = frozenset((EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"))
+_LEAST_ROW_BYTES = 12
+"""The colour's: a file of so many bytes draws no more Gaussians, unless it draws them again and again."""
+_INFINITY_LOGIT, _INFINITY_LOG_SCALE = 20.0, -20.0
+"""Stand for opacities of exactly 0 and 1, and for a scale of 0; float32 agrees, and ``splat.ply`` does the same."""
+_ROUNDING = 1e-3
+"""By which an opacity may be beyond 0..1."""
+_SIMILAR = 1e-4
+"""By which a node's axes may differ in length or from right angles."""
+_HINT = "Give a splat: points with the attributes of KHR_gaussian_splatting."
+
+
+def harmonics_names(sh_degree: int) -> list[str]:
+    """The attributes of spherical harmonics, from degree 0, in the order of ``Gaussians.sh``."""
+    degrees = range(sh_degree + 1)
+    return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
+
+
+def read_splats(container: Container) -> Gaussians:
+    """All Gaussians that the scene draws.
+
+    Args:
+        container: The file.
+
+    Raises:
+        SplatpipeError: if there are none, the file is damaged, or it asks for what is not read.
+    """
+    required = container.document.get("extensionsRequired", [])
+    unknown = [name for name in required if name not in _KNOWN] if isinstance(required, list) else ["?"]
+    if unknown:
+        raise SplatpipeError(f"{container.path} needs {str(unknown[0])[:60]}, which is not read.", hint=_HINT)
+    drawn = drawn_primitives(container, EXTENSION)
+    if not drawn:
+        raise SplatpipeError(f"{container.path} draws no splat.", hint=_HINT)
+    splats = [_splat(container, one) for one in drawn]
+    if _LEAST_ROW_BYTES * sum(splat.count for splat in splats) > container.length:
+        container.refuse("it draws more Gaussians than it holds")
+    degree = max(splat.degree for splat in splats)
+    parts = [_placed(container, splat.read(container, degree), splat.matrix) for splat in splats]
+    return parts[0] if len(parts) == 1 else Gaussians.concat(parts)
+
+
+@dataclass(frozen=True)
+class _Splat:
+    """A primitive whose attributes are known to lie inside the file.
+
+    Attributes:
+        matrix: Scene from primitive.
+        columns: Its attributes, by their short names; the harmonics' from degree 0 as they come.
+        harmonics: From degree 0; empty where there are none, not even a constant.
+    """
+
+    matrix: Float64[np.ndarray, "4 4"]
+    columns: Mapping[str, Accessor]
+    harmonics: tuple[Accessor, ...]
+
+    @property
+    def count(self) -> int:
+        return self.columns["position"].count
+
+    @property
+    def degree(self) -> int:
+        return max(math.isqrt(len(self.harmonics)) - 1, 0)
+
+    def read(self, container: Container, degree: int) -> Gaussians:
+        """Its Gaussians, with harmonics of zero up to a degree, in its own frame."""
+        gaussians = Gaussians.empty(self.count, degree)
+        for start in range(0, self.count, ROWS_AT_ONCE):
+            self._fill(container, gaussians, start, min(ROWS_AT_ONCE, self.count - start))
+        return gaussians
+
+    def _fill(self, container: Container, gaussians: Gaussians, start: int, count: int) -> None:
+        def rows(accessor: Accessor) -> torch.Tensor:
+            return torch.from_numpy(accessor.rows(container.path, container.file, start, count))
+
+        part = slice(start, start + count)
+        gaussians.means[part] = rows(self.columns["position"])
+        gaussians.quats[part] = rows(self.columns["rotation"])[:, [3, 0, 1, 2]]
+        scales = rows(self.columns["scale"])
+        if bool((scales < 0.0).any()):
+            container.refuse("scales are negative")
+        log_scales = torch.log(scales)
+        gaussians.log_scales[part] = torch.where(scales == 0.0, _INFINITY_LOG_SCALE, log_scales)
+        opacity = self.columns["opacity"]
+        opacities = rows(opacity)[:, -1].double()  # a colour's last component
+        if bool(((opacities < -_ROUNDING) | (opacities > 1.0 + _ROUNDING)).any()):
+            container.refuse("opacities are not within 0 and 1")
+        logits = torch.logit(opacities.clamp(0.0, 1.0))
+        gaussians.opacity_logits[part] = logits.clamp(-_INFINITY_LOGIT, _INFINITY_LOGIT).float()
+        if not self.harmonics:
+            gaussians.sh[part, 0] = rgb_to_dc(rows(self.columns["color"])[:, :3])
+        for term, accessor in enumerate(self.harmonics):
+            gaussians.sh[part, term] = rows(accessor)
+
+
+def _splat(container: Container, drawn: Drawn) -> _Splat:
+    """A primitive's attributes, found and checked.
+
+    Raises:
+        SplatpipeError: if one is missing, of another length, or outside of the file.
+    """
+    primitive, matrix = drawn
+    extension, names = primitive["extensions"][EXTENSION], primitive.get("attributes")
+    if not isinstance(names, dict):
+        container.refuse("a splat has no attributes")
+    for key, taken in (("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")):
+        if extension.get(key, taken) != taken:
+            told = str(extension[key])[:40]
+            raise SplatpipeError(f"{container.path}: splats of {key} {told} are not read, only {taken}.", hint=_HINT)
+    has_opacity = f"{EXTENSION}:OPACITY" in names
+    opacity = (f"{EXTENSION}:OPACITY", ("SCALAR",)) if has_opacity else ("COLOR_0", ("VEC4",))
+    wanted: dict[str, tuple[str, tuple[str, ...]]] = {
+        "position": ("POSITION", ("VEC3",)),
+        "rotation": (f"{EXTENSION}:ROTATION", ("VEC4",)),
+        "scale": (f"{EXTENSION}:SCALE", ("VEC3",)),
+        "opacity": opacity,
+    }
+    found = _harmonics(container, names)
+    if not found:
+        wanted["color"] = ("COLOR_0", ("VEC3", "VEC4"))
+    missing = [name for name, _ in wanted.values() if name not in names]
+    if missing:
+        raise SplatpipeError(f"{container.path}: a splat lacks {', '.join(missing)}.", hint=_HINT)
+    columns = {short: container.accessor(names[name], kinds) for short, (name, kinds) in wanted.items()}
+    harmonics = tuple(container.accessor(names[name], ("VEC3",)) for name in found)
+    if len({accessor.count for accessor in (*columns.values(), *harmonics)}) != 1:
+        container.refuse("a splat's attributes are of different lengths")
+    return _Splat(matrix, columns, harmonics)
+
+
+def _harmonics(container: Container, names: Mapping[str, Any]) -> list[str]:
+    """The attributes of whole degrees, from 0; none where the colour is told by COLOR_0."""
+    told = {name for name in names if name.startswith(f"{EXTENSION}:SH_DEGREE_")}
+    for degree in range(MAX_DEGREE, -1, -1):
+        wanted = harmonics_names(degree)
+        if told == set(wanted):
+            return wanted
+    if told:
+        container.refuse("its spherical harmonics are of no whole degrees 0 to 3")
+    return []
+
+
+def _placed(container: Container, gaussians: Gaussians, matrix: Float64[np.ndarray, "4 4"]) -> Gaussians:
+    """In the scene's frame.
+
+    Raises:
+        SplatpipeError: if the matrix stretches, shears or mirrors: Gaussians would be none.
+    """
+    if np.array_equal(matrix, np.eye(4)):
+        return gaussians
+    scale = float(np.cbrt(max(np.linalg.det(matrix[:3, :3]), 0.0)))
+    rotation = matrix[:3, :3] / scale if scale > 0.0 else np.zeros((3, 3))
+    straight = np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0))
+    if not straight or not np.abs(rotation.T @ rotation - np.eye(3)).max() < _SIMILAR:
+        raise SplatpipeError(
+            f"{container.path} stretches, shears or mirrors a splat, which is not read.",
+            hint="Apply its transformation in the program that made it.",
+        )
+    turn, move = torch.from_numpy(rotation.copy()), torch.from_numpy(matrix[:3, 3].copy())
+    pieces = (piece.transformed(scale, turn, move) for piece in gaussians.pieces())
+    return Gaussians.gathered(pieces, gaussians)
