@@ -38,7 +38,8 @@ from splatpipe.pipeline.survey.handover import (
     pose_in_world,
 )
 from splatpipe.pipeline.survey.sparse_scene import sparse_glb
-from splatpipe.pipeline.web.options import ExportConfig
+from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
+from splatpipe.pipeline.web.options import ExportConfig, format_names
 from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
 
 Facts = dict[str, Any]
@@ -47,7 +48,8 @@ VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", 
 
 
 def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`, `viewer/`, and a sky if wanted.
+    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`, `viewer/`; a sky and more
+    formats if wanted.
 
     The frame is georef's: local east, north, up in metres where there are positions, of arbitrary scale elsewhere. The
     sky is a file of its own: within `splat.ply` it would be most of its bounding box, by which programs place and tile.
@@ -89,7 +91,11 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     report.progress(3, 4, "writing the viewer", "files")
     write_viewer_of(inputs, gaussians, out / "viewer", config)
     report.progress(4, 4, "writing the viewer", "files")
-    summary = {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
+    (out / "formats").mkdir()
+    run = RunSplat(Scene(gaussians, facts), frame, dataset, cameras, points, held_out_names(inputs), placed)
+    sizes = write_deliverables(format_names(config.formats), run, out / "formats", report)
+    summary: dict[str, Any] = {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
+    summary |= {"formats": sizes} if sizes else {}
     return summary if sky is None else summary | {"sky_gaussians": len(dome)}
 
 
@@ -107,12 +113,16 @@ def write_viewer_of(inputs: Inputs, gaussians: Gaussians, folder: Path, config: 
         return
     options, _ = as_trained(inputs["train.rendering"], gaussians)
     look = look_of(options, read_panorama(inputs["train.sky"]))
-    held_out = {view["name"] for view in _read_json(inputs["evaluate.metrics"])["per_view"]}
     frame = load_frame(inputs["georef.frame"])
-    scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out, len(gaussians), config.title)
+    scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out_names(inputs), len(gaussians), config.title)
     if (area := read_world_area(inputs.parts.get("georef.boundary"))) is not None:
         scene = replace(scene, focus=area.contains(scene.points))
     write_viewer(folder, scene, gaussians, config.viewer_megabytes * 1e6)
+
+
+def held_out_names(inputs: Inputs) -> frozenset[str]:
+    """Names of the photos that the model was measured on."""
+    return frozenset(view["name"] for view in _read_json(inputs["evaluate.metrics"])["per_view"])
 
 
 def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: int) -> Facts:

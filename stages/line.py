@@ -218,9 +218,10 @@ EXPORT = Stage(
         "sparse": "sparse.glb",
         "sky": "sky",
         "viewer": "viewer",
+        "formats": "formats",
     },
     entry="splatpipe.stages.export:run",
-    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky", "viewer"),
+    deliverables=("splat", "georef", "cameras", "metrics", "sparse", "sky", "viewer", "formats"),
 )
 
 FLYTHROUGH = Stage(

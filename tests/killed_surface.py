@@ -17,7 +17,7 @@ from splatpipe.pipeline.surface.contour_files import write_dxf, write_geojson
 from splatpipe.pipeline.surface.contours import Contour, Contours
 from splatpipe.pipeline.surface.geotiff import COLOURS, CONFIDENCE, HEIGHTS, RasterForm, raster_file
 from splatpipe.pipeline.surface.grid import Grid
-from splatpipe.pipeline.surface.point_cloud import CloudChunk, write_cloud
+from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 
@@ -56,7 +56,7 @@ def write_points(path: Path, grid: Grid, halfway: Halfway) -> None:
             if number == 2:
                 halfway()
 
-    write_cloud(path, chunks(), grid)
+    write_cloud(path, chunks(), CloudFrame.of_grid(grid))
 
 
 def write_lines(path: Path, grid: Grid, halfway: Halfway) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.surface.grid import make_grid
-from splatpipe.pipeline.surface.point_cloud import CloudChunk, write_cloud
+from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -40,7 +40,7 @@ def test_points_are_read_back_where_proj_has_them(tmp_path: Path) -> None:
     path = tmp_path / "cloud.laz"
     grid = hill_grid()
     chunks = [some_points(700, 1), some_points(0), some_points(300, 2)]
-    assert write_cloud(path, iter(chunks), grid, date(2024, 5, 17)) == 1000
+    assert write_cloud(path, iter(chunks), CloudFrame.of_grid(grid), date(2024, 5, 17)) == 1000
     cloud = laspy.read(path)
     positions = np.concatenate([chunk.positions for chunk in chunks])
     assert np.abs(cloud.xyz - grid.crs.crs_from_local(positions)).max() < HALF_STEP_M
@@ -59,7 +59,7 @@ def test_points_are_read_back_where_proj_has_them(tmp_path: Path) -> None:
 def test_normals_turn_with_the_grid(tmp_path: Path) -> None:
     grid = make_grid(placed("EPSG:25832", "ellipsoidal", Origin(52.2, 11.9, 110.0)), box(20.0, 15.0), 0.1)
     chunk = some_points(500)
-    write_cloud(tmp_path / "cloud.laz", [chunk], grid)
+    write_cloud(tmp_path / "cloud.laz", [chunk], CloudFrame.of_grid(grid))
     cloud = laspy.read(tmp_path / "cloud.laz")
     read = np.stack([np.asarray(cloud[f"Normal{axis}"]) for axis in "XYZ"], axis=1)
     ahead = grid.crs.crs_from_local(chunk.positions + chunk.normals) - grid.crs.crs_from_local(chunk.positions)
@@ -80,7 +80,7 @@ def test_normals_turn_with_the_grid(tmp_path: Path) -> None:
 )
 def test_crs_is_wkt_that_proj_reads(tmp_path: Path, frame: Frame, codes: list[str | None], about: str) -> None:
     path = tmp_path / "cloud.laz"
-    write_cloud(path, [some_points(10)], make_grid(frame, box(20.0, 15.0), 0.1))
+    write_cloud(path, [some_points(10)], CloudFrame.of_grid(make_grid(frame, box(20.0, 15.0), 0.1)))
     with laspy.open(path) as file:
         header = file.header
     assert header.global_encoding.wkt
@@ -94,7 +94,7 @@ def test_crs_is_wkt_that_proj_reads(tmp_path: Path, frame: Frame, codes: list[st
 
 def test_cloud_of_no_points_is_one(tmp_path: Path) -> None:
     path = tmp_path / "cloud.laz"
-    assert write_cloud(path, [], hill_grid()) == 0
+    assert write_cloud(path, [], CloudFrame.of_grid(hill_grid())) == 0
     cloud = laspy.read(path)
     assert len(cloud.points) == 0 and (cloud.header.mins == 0.0).all()
 
@@ -106,8 +106,8 @@ def test_same_points_give_the_same_bytes_however_they_come(tmp_path: Path) -> No
         for rows in (slice(0, 1), slice(1, 640), slice(640, None)):
             yield CloudChunk(whole.positions[rows], whole.colours[rows], whole.normals[rows], whole.confidence[rows])
 
-    write_cloud(tmp_path / "one.laz", [whole], hill_grid())
-    write_cloud(tmp_path / "two.laz", split(), hill_grid())
+    write_cloud(tmp_path / "one.laz", [whole], CloudFrame.of_grid(hill_grid()))
+    write_cloud(tmp_path / "two.laz", split(), CloudFrame.of_grid(hill_grid()))
     content = (tmp_path / "one.laz").read_bytes()
     assert content == (tmp_path / "two.laz").read_bytes()
     day, year = struct.unpack("<HH", content[90:94])
@@ -121,5 +121,5 @@ def test_point_that_is_nowhere_is_refused_and_leaves_the_old_file(tmp_path: Path
     chunk = some_points(5)
     chunk.positions[3, 1] = bad
     with pytest.raises(SplatpipeError, match="not finite"), np.errstate(invalid="ignore"):
-        write_cloud(path, [chunk], hill_grid())
+        write_cloud(path, [chunk], CloudFrame.of_grid(hill_grid()))
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]

@@ -100,6 +100,26 @@ def test_a_place_that_cannot_be_written_is_said(tmp_path: Path):
         write_scene(tmp_path / "file" / "a.ply", Scene(some_gaussians(2)))
 
 
+def test_a_file_is_there_whole_or_as_before(tmp_path: Path):
+    path = _written(tmp_path)
+    before = path.read_bytes()
+    broken = Scene(some_gaussians(4))
+    broken.gaussians.means[2] = torch.nan
+    with pytest.raises(ValueError, match="not finite"):
+        write_scene(path, broken)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path):
+    write_scene(tmp_path / "model", Scene(some_gaussians(4)))
+    with pytest.raises(UsageError, match="is there"):
+        write_scene(tmp_path / "model", Scene(some_gaussians(5)))
+    with pytest.raises(UsageError, match="is there"):
+        write_scene(tmp_path / "model", Scene(some_gaussians(5)), format_named("ply"))
+    assert len(read_scene(tmp_path / "model").gaussians) == 4
+
+
 def test_quaternions_get_unit_length_and_none_is_no_rotation():
     made = some_gaussians(3)
     made.quats[1] = 0.0

@@ -12,6 +12,7 @@ import typer
 
 from splatpipe.pipeline.app.cli_batch import batch
 from splatpipe.pipeline.app.cli_check import check
+from splatpipe.pipeline.app.cli_formats import convert, export
 from splatpipe.pipeline.app.cli_options import (
     BoundaryOption,
     ConfigOption,
@@ -260,6 +261,10 @@ def surface(
             if wanted.anything:
                 measured = measure_surface(out, wanted, threads or available_cores())
                 done.told, done.news = {"surface": measured}, measured_lines(out, measured)
+
+
+app.command()(export)
+app.command()(convert)
 
 
 @app.command()

@@ -17,7 +17,7 @@ from splatpipe.pipeline.surface.fusion import FusedPoints, finest_of_cubes, fuse
 from splatpipe.pipeline.surface.grid import make_grid
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_set import PhotoSet
-from splatpipe.pipeline.surface.point_cloud import UNDATED, CloudChunk, write_cloud
+from splatpipe.pipeline.surface.point_cloud import UNDATED, CloudChunk, CloudFrame, write_cloud
 from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
 from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.site import Site
@@ -75,7 +75,7 @@ def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict
             chunk = _part(task, photos, (lattice, relief), part)
             save_arrays(path, **vars(chunk))
         report.progress(done + 1, len(parts), "dense cloud", "parts")
-    count = write_cloud(out / "cloud.laz", _kept(work, len(parts)), grid, UNDATED)
+    count = write_cloud(out / "cloud.laz", _kept(work, len(parts)), CloudFrame.of_grid(grid), UNDATED)
     return {"points": count, "spacing_m": task.spacing_m, "crs": grid.crs.horizontal.name}
 
 

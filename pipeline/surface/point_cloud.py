@@ -8,7 +8,7 @@ it cannot say of the heights stands in a text beside.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -21,6 +21,7 @@ from laspy.vlrs.vlr import VLR
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.surface.grid import Grid
+from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.whole_file import whole_file
 
 SCALE = 0.001  # of coordinates: a millimetre, or a thousandth of a foot
@@ -51,13 +52,44 @@ class CloudChunk:
     confidence: UInt8[np.ndarray, " n"]
 
 
-def write_cloud(path: Path, chunks: Iterable[CloudChunk], grid: Grid, taken_on: date = UNDATED) -> int:
+@dataclass(frozen=True, eq=False)
+class CloudFrame:
+    """The way from a scene's metres to a cloud's coordinates.
+
+    Attributes:
+        crs: Of the file.
+        crs_from_local: East, north, up (metres) to its coordinates.
+        corner: Whole numbers near all of them, which the file counts from.
+        middle: Of the scene, east, north, up: where directions are turned by.
+    """
+
+    crs: MapCrs
+    crs_from_local: Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
+    corner: Float64[np.ndarray, " 3"]
+    middle: Float64[np.ndarray, "1 3"]
+
+    @staticmethod
+    def of_grid(grid: Grid) -> CloudFrame:
+        """Of a raster that covers the points."""
+        west, south, _, _ = grid.bounds
+        middle = grid.local_from_cells(np.array([[grid.width / 2.0, grid.height / 2.0, 0.0]]))
+        return CloudFrame(grid.crs, grid.crs_from_local, np.array([np.floor(west), np.floor(south), 0.0]), middle)
+
+    @staticmethod
+    def of_crs(crs: MapCrs) -> CloudFrame:
+        """Of points anywhere: by PROJ itself, a few seconds a million."""
+        middle = np.zeros((1, 3))
+        corner = np.floor(crs.crs_from_local(middle)[0])
+        return CloudFrame(crs, crs.crs_from_local, np.array([corner[0], corner[1], 0.0]), middle)
+
+
+def write_cloud(path: Path, chunks: Iterable[CloudChunk], frame: CloudFrame, taken_on: date = UNDATED) -> int:
     """Write a cloud; it is there when all chunks are in it, and not if that fails.
 
     Args:
         path: Where: a name that ends in .laz.
         chunks: Asked for one by one.
-        grid: Whose CRS it is written in; it covers the points.
+        frame: The way to its CRS.
         taken_on: The date in the file: the photos', for one.
 
     Returns:
@@ -67,7 +99,7 @@ def write_cloud(path: Path, chunks: Iterable[CloudChunk], grid: Grid, taken_on: 
         SplatpipeError: if a point is not finite, or too far away for the format.
         OSError: if the disk is full or not writable.
     """
-    header = _header(grid, taken_on)
+    header = _header(frame, taken_on)
     count = 0
     with (
         whole_file(path) as aside,
@@ -75,16 +107,15 @@ def write_cloud(path: Path, chunks: Iterable[CloudChunk], grid: Grid, taken_on: 
         laspy.LasWriter(file, header, laz_backend=laspy.LazBackend.Lazrs, closefd=False) as writer,
     ):
         for chunk in _pieces(chunks):
-            writer.write_points(_record(chunk, grid, header))
+            writer.write_points(_record(chunk, frame, header))
             count += len(chunk.positions)
     return count
 
 
-def _header(grid: Grid, taken_on: date) -> laspy.LasHeader:
+def _header(frame: CloudFrame, taken_on: date) -> laspy.LasHeader:
     header = laspy.LasHeader(version="1.4", point_format=7)
-    west, south, _, _ = grid.bounds
     header.scales = np.full(3, SCALE)
-    header.offsets = np.array([np.floor(west), np.floor(south), 0.0])
+    header.offsets = frame.corner
     header.creation_date = taken_on
     header.system_identifier = header.generating_software = PROGRAM
     for name in NORMAL_FIELDS:
@@ -93,9 +124,9 @@ def _header(grid: Grid, taken_on: date) -> laspy.LasHeader:
     header.add_extra_dim(laspy.ExtraBytesParams(CONFIDENCE_FIELD, "uint8", "photos that confirm it"))
     for field in header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs:
         field.options &= ~LIMITS_KNOWN
-    header.vlrs.append(WktCoordinateSystemVlr(grid.crs.compound.to_wkt("WKT1_GDAL")))
+    header.vlrs.append(WktCoordinateSystemVlr(frame.crs.compound.to_wkt("WKT1_GDAL")))
     header.global_encoding.wkt = True
-    about = f"Heights: {grid.crs.described_heights()}".encode() + b"\0"
+    about = f"Heights: {frame.crs.described_heights()}".encode() + b"\0"
     header.vlrs.append(VLR("LASF_Spec", 3, "Text area description", about))
     return header
 
@@ -108,14 +139,14 @@ def _pieces(chunks: Iterable[CloudChunk]) -> Iterator[CloudChunk]:
             yield CloudChunk(chunk.positions[rows], chunk.colours[rows], chunk.normals[rows], chunk.confidence[rows])
 
 
-def _record(chunk: CloudChunk, grid: Grid, header: laspy.LasHeader) -> laspy.ScaleAwarePointRecord:
+def _record(chunk: CloudChunk, frame: CloudFrame, header: laspy.LasHeader) -> laspy.ScaleAwarePointRecord:
     record = laspy.ScaleAwarePointRecord.zeros(len(chunk.positions), header=header)
-    steps = _steps(grid.crs_from_local(chunk.positions), header)
+    steps = _steps(frame.crs_from_local(chunk.positions), header)
     for axis, name in enumerate(("X", "Y", "Z")):
         record[name] = steps[:, axis]
     for band, name in enumerate(("red", "green", "blue")):
         record[name] = chunk.colours[:, band].astype(np.uint16) * SIXTEEN_BITS
-    normals = chunk.normals @ _turn(grid).T
+    normals = chunk.normals @ _turn(frame).T
     for axis, name in enumerate(NORMAL_FIELDS):
         record.array[name] = np.rint(np.clip(normals[:, axis], -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
     record.array[CONFIDENCE_FIELD] = chunk.confidence
@@ -131,13 +162,12 @@ def _steps(coordinates: Float64[np.ndarray, "n 3"], header: laspy.LasHeader) -> 
     return np.asarray(steps.astype(np.int64))
 
 
-def _turn(grid: Grid) -> Float64[np.ndarray, "3 3"]:
+def _turn(frame: CloudFrame) -> Float64[np.ndarray, "3 3"]:
     """The rotation of directions from the local frame to the CRS's axes: by the convergence, above all.
 
-    It is the one at the grid's middle: 3 km away it is another by 0.03°.
+    It is the one at the scene's middle: 3 km away it is another by 0.03°.
     """
-    middle = grid.local_from_cells(np.array([[grid.width / 2.0, grid.height / 2.0, 0.0]]))
-    there = grid.crs_from_local(middle + np.concatenate([np.eye(3), -np.eye(3)]))
-    derivative = (there[:3] - there[3:]).T * np.array([[grid.crs.unit_m]] * 2 + [[grid.crs.height_unit_m]])
+    there = frame.crs_from_local(frame.middle + np.concatenate([np.eye(3), -np.eye(3)]))
+    derivative = (there[:3] - there[3:]).T * np.array([[frame.crs.unit_m]] * 2 + [[frame.crs.height_unit_m]])
     u, _, vt = np.linalg.svd(derivative)
     return np.asarray(u @ vt)

@@ -4,13 +4,38 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from splatpipe.pipeline.engine.ranges import NonNegativeFloat
 from splatpipe.pipeline.engine.stage import StageConfig
+from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
+
+EXPORT = "export"
+"""Folder of the formats below OUT."""
+FORMATS = (*(each.name for each in SPLAT_FORMATS if each.name != "ply"), "laz", "colmap", "transforms")
+"""All that `export.formats` can name: a splat's, and those that take a run; `splat.ply` is always there."""
+
+
+def format_names(text: str) -> tuple[str, ...]:
+    """The formats of a list like ``spz, glb``, each once, in the order of ``FORMATS``.
+
+    Raises:
+        ValueError: if there is none of that name.
+    """
+    asked = {name.strip() for name in text.split(",")} - {"", "ply"}
+    unknown = sorted(asked - set(FORMATS))
+    if unknown:
+        raise ValueError(f"there is no format {unknown[0][:40]!r}; choose of {', '.join(('ply', *FORMATS))}")
+    return tuple(name for name in FORMATS if name in asked)
+
+
+def _checked(text: str) -> str:
+    return ",".join(format_names(text))
 
 
 class ExportConfig(StageConfig):
+    formats: Annotated[str, AfterValidator(_checked)] = ""
+    """Further formats, separated by commas, into `export/`: docs/formats.md lists them. `splat.ply` is always made."""
     sky: bool = False
     """Hand over the sky of `train.sky`, too: `sky.ply`, a dome of Gaussians around the splat, in its frame."""
     title: Annotated[str, Field(max_length=200)] = "3D model"

@@ -26,6 +26,7 @@ class SplatFormat:
         module: In this package.
         writer: The module's function that writes it.
         reads: Whether the module's ``read`` is to be asked for it: formats may share one.
+        exact: Whether every number comes back as it was, quaternions of any length, too.
     """
 
     name: str
@@ -33,6 +34,7 @@ class SplatFormat:
     module: str
     writer: str = "write"
     reads: bool = True
+    exact: bool = False
 
     @property
     def ending(self) -> str:
@@ -50,9 +52,9 @@ class SplatFormat:
 
 
 SPLAT_FORMATS = (
-    SplatFormat("ply", "splat.ply", "plain_ply"),
+    SplatFormat("ply", "splat.ply", "plain_ply", exact=True),
     SplatFormat("viewer-ply", "splat.viewer.ply", "plain_ply", "write_for_viewers", reads=False),
-    SplatFormat("model", "model", "model_folder"),
+    SplatFormat("model", "model", "model_folder", exact=True),
     SplatFormat("sog", "splat.sog", "sog", reads=False),
     SplatFormat("glb", "splat.glb", "glb"),
 )

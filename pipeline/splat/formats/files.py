@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from splatpipe.pipeline.engine.durable import sync_folder, sync_tree
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -87,24 +90,38 @@ def format_of_name(path: Path, asked: str | None = None) -> SplatFormat:
 
 
 def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> None:
-    """Write a splat: quaternions of unit length, in the axes that the format's readers expect.
+    """Write a splat in the axes that the format's readers expect, its quaternions of unit length unless it is exact.
 
     Args:
-        path: Where; not there in part if this fails.
+        path: Where: it is there whole or as before. A folder must be new or empty.
         scene: What to write; finite.
         kind: Its format; None for the one that the name ends in.
 
     Raises:
-        UsageError: if the name ends in no format's ending.
+        UsageError: if the name ends in no format's ending, or a folder has something in it.
         SplatpipeError: if the format cannot hold it.
         MachineError: if it cannot be written.
     """
     kind = format_of_name(path) if kind is None else kind
+    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        kind.write(path, scene)
+        if path.is_dir() and (kind.ending or any(path.iterdir())):
+            raise UsageError(f"{path} is a folder that is there.", hint="Name a new file or folder.")
+        try:
+            kind.write(aside, scene if kind.exact else in_unit_quats(scene))
+            sync_tree(aside) if aside.is_dir() else _sync_file(aside)
+            aside.replace(path)
+        finally:
+            shutil.rmtree(aside) if aside.is_dir() else aside.unlink(missing_ok=True)
+        sync_folder(path.parent)
     except OSError as error:
         raise MachineError(f"Cannot write {path}: {error.strerror or error}.", hint="Check the free space.") from error
+
+
+def _sync_file(path: Path) -> None:
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
 
 
 def in_unit_quats(scene: Scene) -> Scene:

@@ -1,0 +1,77 @@
+"""``splatpipe export`` and ``splatpipe convert``: a splat in the formats that other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from splatpipe.pipeline.app.cli_options import (
+    DeviceOption,
+    JsonOption,
+    NotifyOption,
+    OutArgument,
+    SetOption,
+    ThreadsOption,
+    WaitOption,
+    expanded,
+)
+from splatpipe.pipeline.app.cli_runs import RunSession, existing, overrides
+from splatpipe.pipeline.app.ending import Ending
+from splatpipe.pipeline.engine.errors import UsageError
+
+FormatsOption = Annotated[
+    str,
+    typer.Option("--format", "-f", metavar="NAMES", help="What to make, separated by commas; what the run has stays."),
+]
+FormatOption = Annotated[
+    str | None, typer.Option("--format", "-f", metavar="NAME", help="Where OUT's ending does not say it: spz2, model.")
+]
+SplatArgument = Annotated[
+    Path,
+    typer.Argument(metavar="IN", callback=expanded, help="PLY, SPZ, SOG or GLB; a model's folder."),
+]
+TargetArgument = Annotated[Path, typer.Argument(metavar="OUT", callback=expanded, help="Its ending says the format.")]
+
+
+def export(
+    out: OutArgument,
+    formats: FormatsOption,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    wait: WaitOption = False,
+    notify: NotifyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Hand a finished run over in more formats, into OUT/export: docs/formats.md says which program reads which."""
+    from splatpipe.pipeline.app.formats import check_possible, with_formats
+
+    with Ending(out, as_json) as done:
+        done.notify_by(notify)
+        tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
+        check_possible(out, formats)
+        with RunSession(existing(out, tables, device, threads), wait) as runner:
+            done.outcome = runner.outcome
+            runner.walk()
+
+
+def convert(
+    source: SplatArgument,
+    target: TargetArgument,
+    format_name: FormatOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a splat in another format; what it says of its place on the earth goes along."""
+    with Ending(target, as_json) as done:
+        from splatpipe.pipeline.app.console import say
+        from splatpipe.pipeline.app.formats import convert_file
+        from splatpipe.pipeline.splat.formats.files import format_of_name
+
+        kind = format_of_name(target, format_name)
+        if target.exists() and target.samefile(source):
+            raise UsageError(f"{target} is what is read.", hint="Name another file to write.")
+        told: dict[str, Any] = convert_file(source, target, kind)
+        done.told = {"convert": told}
+        say(f"{told['gaussians']:,} Gaussians, {told['bytes'] / 1e6:.1f} MB: {target}")

@@ -1,0 +1,78 @@
+"""A run or a file in more formats: what is asked for, whether it can be made, and the conversion of files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.web.options import FORMATS, format_names
+from splatpipe.stages.line import GEOREF, LINE
+from splatpipe.stages.options import LineConfig
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.splat.formats import SplatFormat
+
+NEED_METRES, NEED_PLACE = {"laz"}, {"tiles"}
+
+
+def with_formats(out: Path, asked: str) -> dict[str, Any]:
+    """The option that asks for formats beside those that a run makes already.
+
+    Raises:
+        UsageError: if there is no such format.
+    """
+    before = open_run_folder(out, LINE).config(LineConfig)[1].export.formats
+    return {"export": {"formats": ",".join(dict.fromkeys((*format_names(before), *_parsed(asked))))}}
+
+
+def check_possible(out: Path, asked: str) -> None:
+    """Say what cannot be made of a run before anything is begun.
+
+    Raises:
+        SplatpipeError: if the run has no scale, or no place on the earth, and a format needs it.
+    """
+    from splatpipe.pipeline.survey.frames import load_frame
+
+    part = open_run_folder(out, LINE).lineage(GEOREF).get("georef.frame")
+    if part is None:
+        return
+    frame, names = load_frame(part.path), set(_parsed(asked))
+    for missing, needing in ((not frame.in_metres, NEED_METRES), (frame.origin is None, NEED_PLACE)):
+        if missing and names & needing:
+            raise SplatpipeError(
+                f"{min(names & needing)} needs to know where the run lies on the earth, which nothing says.",
+                hint=f"Give it control points (splatpipe georef {out} --gcp FILE), or photos with positions.",
+            )
+
+
+def _parsed(text: str) -> tuple[str, ...]:
+    try:
+        names = format_names(text)
+    except ValueError as error:
+        raise UsageError(f"--format: {error}.") from error
+    if not text.strip(", "):
+        raise UsageError("No format is named.", hint=f"Choose of: {', '.join(FORMATS)}.")
+    return names
+
+
+def convert_file(source: Path, target: Path, kind: SplatFormat) -> dict[str, Any]:
+    """Read a splat and write it.
+
+    Returns:
+        Its figures: Gaussians, bytes, and the format's name.
+
+    Raises:
+        SplatpipeError: if it cannot be read, or the format cannot hold it.
+        MachineError: if it cannot be written.
+    """
+    from splatpipe.pipeline.splat.formats.files import read_scene, write_scene
+
+    scene = read_scene(source)
+    if not len(scene.gaussians):
+        raise SplatpipeError(f"{source} has no Gaussians.", hint="There is nothing to write.")
+    write_scene(target, scene, kind)
+    files = [target] if target.is_file() else [path for path in target.rglob("*") if path.is_file()]
+    size = sum(path.stat().st_size for path in files)
+    return {"format": kind.name, "gaussians": len(scene.gaussians), "bytes": size, "file": str(target)}

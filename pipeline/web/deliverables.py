@@ -1,0 +1,128 @@
+"""What a run hands over beside `splat.ply`: files and folders by the names that people ask for them by."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.dataset import Points
+from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
+from splatpipe.pipeline.splat.formats.files import write_scene
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.sh import C0
+from splatpipe.pipeline.surface.map_crs import open_map
+from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
+from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.handover import cameras_json
+from splatpipe.pipeline.survey.trainer_dataset import write_colmap, write_points_ply, write_transforms
+from splatpipe.pipeline.web.options import EXPORT
+
+DATASET, CENTRES, SPARSE = "dataset", "centres.laz", "sparse.laz"
+MOST_CONFIDENCE = 255  # photos that a byte can count
+
+
+@dataclass(frozen=True, eq=False)
+class RunSplat:
+    """A run's splat with what it was made from.
+
+    Attributes:
+        scene: In the world frame, finite.
+        frame: georef's.
+        dataset: The folder that `undistort` left.
+        cameras: Of its photos, in the model's frame.
+        points: Its sparse points, the same.
+        held_out: Names of the photos that were not trained on.
+        georeference: What `georef.json` says.
+    """
+
+    scene: Scene
+    frame: Frame
+    dataset: Path
+    cameras: Sequence[Camera]
+    points: Points
+    held_out: frozenset[str]
+    georeference: Mapping[str, object]
+
+
+def write_deliverables(names: Sequence[str], run: RunSplat, out: Path, report: Reporter) -> dict[str, int]:
+    """Write each into `export/` below a folder.
+
+    Args:
+        names: Of formats, each once.
+        run: What is handed over.
+        out: The folder, as OUT.
+        report: Told of progress and of what cannot be made of this run.
+
+    Returns:
+        Bytes of each.
+
+    Raises:
+        MachineError: if the disk is full or not writable.
+    """
+    sizes, folder = {}, out / EXPORT
+    for done, name in enumerate(names):
+        report.progress(done, len(names), f"writing {name}", "formats")
+        folder.mkdir(parents=True, exist_ok=True)
+        before = _bytes_below(out)
+        try:
+            _write(name, run, folder)
+        except SplatpipeError as error:
+            if error.exit_code != SplatpipeError.exit_code:
+                raise
+            report.warning(f"{name} is left out: {error.message}", hint=error.hint)
+            continue
+        sizes[name] = _bytes_below(out) - before
+    return sizes
+
+
+def _write(name: str, run: RunSplat, folder: Path) -> None:
+    kind = next((each for each in SPLAT_FORMATS if each.name == name), None)
+    if kind is not None:
+        write_scene(folder / kind.file, run.scene, kind)
+    if name == "model":
+        _complete_model_folder(run, folder / "model")
+    elif name == "colmap":
+        write_colmap(run.dataset, run.frame, folder / DATASET)
+    elif name == "transforms":
+        write_transforms(run.dataset, run.frame, run.held_out, folder / DATASET)
+    elif name == "laz":
+        _write_clouds(run, folder)
+    if name in ("model", "colmap", "transforms"):  # these have no place of their own for it
+        write_json(folder / ("model" if name == "model" else DATASET) / "georef.json", dict(run.georeference))
+
+
+def _complete_model_folder(run: RunSplat, folder: Path) -> None:
+    """What trainers leave beside the splat."""
+    write_json(folder / "cameras.json", cameras_json(run.cameras, run.frame))
+    write_points_ply(folder / "input.ply", run.points, run.frame)
+
+
+def _write_clouds(run: RunSplat, folder: Path) -> None:
+    """The splat's centres and the sparse points, in the run's CRS."""
+    frame = CloudFrame.of_crs(open_map(run.frame))
+    write_cloud(folder / CENTRES, _centres(run.scene.gaussians), frame)
+    usable = np.isfinite(run.points.xyz).all(axis=1)
+    xyz = run.frame.world_from_model.apply(run.points.xyz[usable])
+    seen = np.minimum(run.points.track_lengths[usable], MOST_CONFIDENCE).astype(np.uint8)
+    chunk = CloudChunk(xyz, run.points.rgb[usable], np.zeros(xyz.shape, np.float32), seen)
+    write_cloud(folder / SPARSE, [chunk], frame)
+
+
+def _centres(gaussians: Gaussians) -> Iterator[CloudChunk]:
+    """Where Gaussians are, in the colour that they have from everywhere; which photos confirm one is not known."""
+    for piece in gaussians.pieces():
+        xyz = piece.means.double().numpy()
+        colours = np.rint((0.5 + C0 * piece.sh[:, 0].double().numpy()).clip(0.0, 1.0) * 255.0).astype(np.uint8)
+        yield CloudChunk(xyz, colours, np.zeros(xyz.shape, np.float32), np.zeros(len(xyz), np.uint8))
+
+
+def _bytes_below(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
