@@ -1,0 +1,73 @@
+"""`splatpipe export` and `splatpipe convert`: finished runs and files in more formats."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import laspy
+import pytest
+
+from splatpipe.pipeline.app.formats import check_possible, with_formats
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.splat.formats.files import read_scene
+
+
+def splatpipe(*arguments: str) -> tuple[int, dict[str, Any]]:
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *arguments, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.returncode, json.loads(done.stdout)
+
+
+def test_a_finished_run_is_handed_over_in_more_formats_and_keeps_those_it_has(demo_run: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(demo_run, tmp_path / "out")
+    before = (out / "splat.ply").read_bytes()
+    code, told = splatpipe("export", str(out), "--format", "laz,model")
+    assert code == 0
+    assert [stage["name"] for stage in told["stages"] if stage["state"] != "reused"] == ["export"]
+    assert (out / "splat.ply").read_bytes() == before
+    place = read_scene(out / "splat.ply").facts.place
+    assert place is not None and place.crs == "EPSG:32633"
+    assert read_scene(out / "export/model").facts.place == place
+    crs = json.loads((out / "georef.json").read_text())["origin"]["in_crs"]
+    centres = laspy.read(out / "export/centres.laz")
+    assert abs(float(centres.x.mean()) - crs[0]) < 200.0 and abs(float(centres.y.mean()) - crs[1]) < 200.0
+    code, told = splatpipe("export", str(out), "-f", "colmap")
+    assert code == 0
+    assert (out / "export/dataset/sparse/0/images.bin").is_file() and (out / "export/model").is_dir()
+
+
+def test_formats_that_are_none_or_impossible_are_told_at_once(demo_run: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(demo_run, tmp_path / "out")
+    with pytest.raises(UsageError, match="no format 'obj'"):
+        with_formats(out, "obj")
+    with pytest.raises(UsageError, match="No format is named"):
+        with_formats(out, " , ")
+    for path in out.glob("stages/georef-*/frame.json"):
+        frame = json.loads(path.read_text()) | {"kind": "arbitrary", "origin": None}
+        path.write_text(json.dumps(frame))
+    with pytest.raises(SplatpipeError, match="laz needs to know where"):
+        check_possible(out, "laz")
+    check_possible(out, "model")
+
+
+def test_a_file_is_converted_and_says_what_it_became(demo_run: Path, tmp_path: Path) -> None:
+    code, told = splatpipe("convert", str(demo_run / "splat.ply"), str(tmp_path / "made.viewer.ply"))
+    assert code == 0
+    read = read_scene(tmp_path / "made.viewer.ply")
+    assert told["convert"]["gaussians"] == len(read.gaussians)
+    assert told["convert"]["bytes"] == (tmp_path / "made.viewer.ply").stat().st_size
+    assert read.facts.axes == "y down" and read.facts.place == read_scene(demo_run / "splat.ply").facts.place
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "code"), [("no.ply", "a.ply", 1), ("bad.ply", "a.ply", 1), ("bad.ply", "a.xyz", 2)]
+)
+def test_what_cannot_be_converted_is_told(tmp_path: Path, source: str, target: str, code: int) -> None:
+    (tmp_path / "bad.ply").write_bytes(b"ply\nnonsense\n")
+    found, told = splatpipe("convert", str(tmp_path / source), str(tmp_path / target))
+    assert found == code
+    assert told["error"]["message"]
+    assert not (tmp_path / target).exists()
