@@ -55,7 +55,7 @@ SPLAT_FORMATS = (
     SplatFormat("ply", "splat.ply", "plain_ply", exact=True),
     SplatFormat("viewer-ply", "splat.viewer.ply", "plain_ply", "write_for_viewers", reads=False),
     SplatFormat("model", "model", "model_folder", exact=True),
-    SplatFormat("sog", "splat.sog", "sog", reads=False),
+    SplatFormat("sog", "splat.sog", "sog"),
     SplatFormat("glb", "splat.glb", "glb"),
 )
 """All of them."""

@@ -12,16 +12,27 @@ For who builds files of several of them, without a file of its own::
 
 from __future__ import annotations
 
+import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
-from splatpipe.pipeline.splat.formats.sog_images import SogImages, encode_sog
-from splatpipe.pipeline.splat.scene import Axes, Scene
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.formats.bounded import open_file
+from splatpipe.pipeline.splat.formats.sog_decoder import SogDecoder
+from splatpipe.pipeline.splat.formats.sog_images import META, RECORD, SogImages, encode_sog
+from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record
 
-__all__ = ["AXES", "SogImages", "encode_sog", "write"]
+__all__ = ["AXES", "SogImages", "encode_sog", "read", "write"]
 
 AXES: Axes = "y down"
 _FIRST_DAY = (1980, 1, 1, 0, 0, 0)  # of a ZIP's calendar: the same bytes on any day
+_MOST_META_BYTES = 1 << 20  # three codebooks and a record are 80 kB
+_MOST_DIRECTORY_BYTES = 1 << 16  # of a ZIP: a SOG has 9 files
+_END, _END_OF_LARGE = b"PK\5\6", b"PK\6\7"  # begin a ZIP's last record, and the one before it in a ZIP of ≥ 4 GB
+_END_BYTES, _MOST_COMMENT_BYTES = 22, 65_535  # of that record
+_HINT = "Give a .sog file, or the meta.json beside its pictures."
+_AGAIN = "Copy or export it again."
 
 
 def write(path: Path, scene: Scene) -> None:
@@ -40,3 +51,107 @@ def write(path: Path, scene: Scene) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in files.items():
             archive.writestr(zipfile.ZipInfo(name, _FIRST_DAY), data)
+
+
+def read(path: Path) -> Scene:
+    """Read one; without a record of ours it is taken for y down, as viewers do, and for nowhere on the earth.
+
+    Args:
+        path: A `.sog`, a `meta.json` beside its pictures, or their folder.
+
+    Raises:
+        SplatpipeError: if it is missing, damaged, of another version, or made to fill memory.
+    """
+    source = path / META if path.is_dir() else path
+    with open_file(source) as file:
+        bundled = file.read(2) == b"PK"
+    return _read_bundle(source) if bundled else _read_folder(source)
+
+
+def _read_bundle(path: Path) -> Scene:
+    _check_directory(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+
+            def load(name: str, most_bytes: int) -> bytes:
+                if names.count(name) != 1:
+                    raise SplatpipeError(f"{path}: there is not one {name[:60]} in it.", hint=_HINT)
+                info = archive.getinfo(name)
+                if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise SplatpipeError(f"{path}: {name[:60]} is packed in an unusual way.", hint=_AGAIN)
+                with archive.open(info) as file:
+                    return _at_most(path, name, file.read(most_bytes + 1), most_bytes)
+
+            meta = _meta(path, load(META, _MOST_META_BYTES))
+            return _scene(SogDecoder(path, meta, load, path.stat().st_size))
+    except SplatpipeError:
+        raise
+    except Exception as error:  # zipfile raises almost anything on broken archives
+        reason = " ".join(str(error).split())[:120]
+        raise SplatpipeError(f"{path} is damaged or no ZIP: {reason}.", hint=_AGAIN) from error
+
+
+def _check_directory(path: Path) -> None:
+    """Refuse a ZIP whose list of files alone would take seconds and memory."""
+    with open_file(path) as file:
+        size = file.seek(0, 2)
+        file.seek(max(0, size - _END_BYTES - _MOST_COMMENT_BYTES))
+        end = file.read()
+    at = end.rfind(_END)
+    if at < 0 or at + _END_BYTES > len(end):
+        raise SplatpipeError(f"{path} is cut off: its ZIP does not end.", hint=_AGAIN)
+    listed = int.from_bytes(end[at + 12 : at + 16], "little")
+    if listed > _MOST_DIRECTORY_BYTES or _END_OF_LARGE in end[max(0, at - 20) : at]:
+        raise SplatpipeError(f"{path} is a ZIP of far more than a SOG.", hint=_HINT)
+
+
+def _read_folder(path: Path) -> Scene:
+    def load(name: str, most_bytes: int) -> bytes:
+        if not _is_plain(name):
+            raise SplatpipeError(f"{path}: {name[:60]!r} is no name of a picture beside it.", hint=_AGAIN)
+        beside = path.with_name(name)
+        if not beside.is_file():
+            raise SplatpipeError(f"{path}: there is no {name[:60]} beside it.", hint=_HINT)
+        with open_file(beside) as file:
+            return _at_most(path, name, file.read(most_bytes + 1), most_bytes)
+
+    meta = _meta(path, load(path.name, _MOST_META_BYTES))
+    pictures = {name for part in meta.values() if isinstance(part, dict) for name in _files(part) if _is_plain(name)}
+    there = (path.with_name(name) for name in pictures)
+    stored = sum(picture.stat().st_size for picture in there if picture.is_file())
+    return _scene(SogDecoder(path, meta, load, stored))
+
+
+def _is_plain(name: str) -> bool:
+    """Whether it names a file in the same folder, on any system."""
+    return name.isprintable() and name not in ("", ".", "..") and not set(name) & set("/\\:") and len(name) < 256
+
+
+def _files(part: dict[str, Any]) -> list[str]:
+    files = part.get("files")
+    return [name for name in files if isinstance(name, str)] if isinstance(files, list) else []
+
+
+def _scene(decoder: SogDecoder) -> Scene:
+    """With our record, which may be an object or a string."""
+    found = decoder.meta.get(RECORD)
+    record = found if isinstance(found, str | None) else json.dumps(found)
+    otherwise = SceneFacts(AXES, antialias=decoder.meta.get("antialias") is True)
+    return Scene(decoder.gaussians(), facts_of_record(record, otherwise))
+
+
+def _meta(path: Path, data: bytes) -> dict[str, Any]:
+    try:
+        meta = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise SplatpipeError(f"{path}: its {META} is no JSON.", hint=_HINT) from error
+    if not isinstance(meta, dict):
+        raise SplatpipeError(f"{path}: its {META} is not one of a SOG.", hint=_HINT)
+    return meta
+
+
+def _at_most(path: Path, name: str, data: bytes, most_bytes: int) -> bytes:
+    if len(data) > most_bytes:
+        raise SplatpipeError(f"{path}: {name[:60]} is larger than it can be.", hint=_AGAIN)
+    return data

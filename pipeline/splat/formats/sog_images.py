@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from dataclasses import dataclass
@@ -11,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8, UInt16
-from PIL import Image
 from torch import Tensor
 
 from splatpipe.pipeline.splat.codebooks import fit_codebook, nearest_codes
+from splatpipe.pipeline.splat.formats.lossless_pictures import webp_of_pixels
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.morton import morton_keys
 from splatpipe.pipeline.splat.palettes import fit_palette, nearest_entries
@@ -28,7 +27,6 @@ FIRST_MODE = 252  # of a quaternion: 252 + which of w, x, y, z is the largest
 ENTRIES_A_ROW = 64  # of the picture of the palette
 MOST_ENTRIES = 65_536
 _SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
-_QUALITY, _METHOD = 70, 4  # libwebp's own for lossless; more takes 5 times as long for 1 % of the size
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def encode_sog(gaussians: Gaussians, antialias: bool = False, record: str = "", 
     images: dict[str, bytes] = {}
     for name, (facts, pictures) in _parts(gaussians).items():
         meta[name] = {**facts, "files": [f"{picture}.webp" for picture in pictures]}
-        images |= {f"{picture}.webp": _webp(pixels) for picture, pixels in pictures.items()}
+        images |= {f"{picture}.webp": webp_of_pixels(pixels) for picture, pixels in pictures.items()}
     return SogImages(meta, images)
 
 
@@ -166,12 +164,6 @@ def _picture(pixels: UInt8[np.ndarray, "n c"]) -> UInt8[np.ndarray, "h w c"]:
     room = np.zeros((width * height, pixels.shape[1]), np.uint8)
     room[: len(pixels)] = pixels
     return room.reshape(height, width, pixels.shape[1])
-
-
-def _webp(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "WEBP", lossless=True, quality=_QUALITY, method=_METHOD, exact=True)
-    return file.getvalue()
 
 
 def _numbers(values: Float32[np.ndarray, " n"]) -> list[float]:
