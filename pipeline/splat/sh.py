@@ -33,6 +33,8 @@ _OFFSET = 0.5
 """3DGS stores colours about mid-grey."""
 _ROTATION_TOLERANCE = 1e-4
 """What a rotation matrix rounded to float32 and multiplied a few times is still within."""
+_ROUNDING = 1e-13
+"""What a weight of nothing may come out as."""
 
 _CHUNK_ROWS = 8192
 """Rows multiplied at a time: what one product needs stays in the cache."""
@@ -138,6 +140,7 @@ def rotate_sh(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Flo
     for band in range(1, degree + 1):
         columns = slice(band**2, (band + 1) ** 2)
         new_from_old = _least_squares(basis[:, columns], basis_back[:, columns])
+        new_from_old[new_from_old.abs() < _ROUNDING] = 0.0  # of quarter turns most are nothing, and not multiplied
         result[:, columns] = multiply_rows(new_from_old, sh[:, columns])
     return result
 
@@ -173,7 +176,8 @@ def multiply_rows(matrix: Float[Tensor, "i j"], rows: Float[Tensor, "n j ..."]) 
         for i, weights in enumerate(matrix.tolist()):
             product = weights[0] * columns[0]
             for column, weight in zip(columns[1:], weights[1:], strict=True):
-                product += weight * column
+                if weight != 0.0:
+                    product += weight * column
             result[part, i] = product
     return result
 

@@ -43,7 +43,18 @@ def write_for_viewers(path: Path, scene: Scene) -> None:
 
 
 def _write(path: Path, scene: Scene, comments: Sequence[str] = ()) -> None:
-    write_splat(path, scene.gaussians, [*frame_comments(scene.facts), f"{RECORD}{scene.facts.record()}", *comments])
+    write_splat(path, scene.gaussians, [*header_comments(scene.facts), *comments])
+
+
+def header_comments(facts: SceneFacts) -> list[str]:
+    """Comments of a PLY's header that keep a splat's facts, for people and for ``facts_of_comments``."""
+    return [*frame_comments(facts), f"{RECORD}{facts.record()}"]
+
+
+def facts_of_comments(comments: Sequence[str]) -> SceneFacts:
+    """What a PLY's header says; without a record of ours y down, as viewers take it, and nowhere on the earth."""
+    record = next((text.removeprefix(RECORD) for text in comments if text.startswith(RECORD)), None)
+    return facts_of_record(record, SceneFacts("y down", antialias=MIP_COMMENT in comments))
 
 
 def frame_comments(facts: SceneFacts) -> list[str]:
@@ -71,6 +82,4 @@ def read(path: Path) -> Scene:
     Raises:
         SplatpipeError: as ``read_splat``.
     """
-    comments = read_splat_header(path).comments
-    record = next((text.removeprefix(RECORD) for text in comments if text.startswith(RECORD)), None)
-    return Scene(read_splat(path), facts_of_record(record, SceneFacts("y down", antialias=MIP_COMMENT in comments)))
+    return Scene(read_splat(path), facts_of_comments(read_splat_header(path).comments))
