@@ -1,4 +1,4 @@
-"""OUT/viewer.html with what was measured on the surface model.
+"""OUT/viewer.html, and OUT/web/index.html, with what was measured on the surface model.
 
 The stage `export` makes the page before there is a surface model, and sections are cut on finished runs, at any time.
 So what was measured is put into the page as it lies in OUT; the artifact that it is a copy of stays as it is. The page
@@ -15,7 +15,7 @@ from typing import IO, Any
 from splatpipe.pipeline.app.measurements import any_measured, is_number, read_measurements, title_of
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.web.measured_page import PAGE, with_measurements
+from splatpipe.pipeline.web.measured_page import PAGE, SITE_PAGE, with_measurements
 
 SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
@@ -25,7 +25,7 @@ LARGEST = 1e9  # of a coordinate, metres: beyond it there is no earth, and a cha
 
 
 def renew_viewer(out: Path) -> str:
-    """Let OUT/viewer.html show what was measured and still holds, no less and no more.
+    """Let the viewers in OUT show what was measured and still holds, no less and no more.
 
     Only who holds the lock of OUT may call this.
 
@@ -36,26 +36,34 @@ def renew_viewer(out: Path) -> str:
         What the user should know; empty where all is well, or there is nothing to do.
 
     Raises:
-        OSError: if the disk is full or not writable; the page is as before.
+        OSError: if the disk is full or not writable; each page is as before or renewed.
     """
-    path = out / PAGE
-    if not path.is_file() or not any_measured(out):
+    pages = [name for name in (PAGE, SITE_PAGE) if (out / name).is_file()]
+    if not pages or not any_measured(out):
         return ""
+    shown, trouble = shown_measurements(out), ""
+    for name in pages:
+        try:
+            _renew(out / name, shown)
+        except ValueError:
+            trouble = f"{name} is of an earlier version and cannot show what was measured: splatpipe stage export {out}"
+    return trouble
+
+
+def _renew(path: Path, shown: Mapping[str, Any] | None) -> None:
+    """Put it into a page; as it is, and with the time that it had, where it shows that already."""
     page = path.read_bytes()
-    try:
-        renewed = with_measurements(page, shown_measurements(out))
-    except ValueError:
-        return f"{PAGE} is of an earlier version and cannot show what was measured: splatpipe stage export {out}"
-    if renewed != page:
-        stamp = path.stat()
+    renewed = with_measurements(page, shown)
+    if renewed == page:
+        return
+    stamp = path.stat()
 
-        def fill(file: IO[bytes]) -> None:
-            file.write(renewed)
-            file.flush()  # what is written later would change its time
-            os.utime(file.fileno(), ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    def fill(file: IO[bytes]) -> None:
+        file.write(renewed)
+        file.flush()  # what is written later would change its time
+        os.utime(file.fileno(), ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
 
-        write_durably(path, fill)
-    return ""
+    write_durably(path, fill)
 
 
 def shown_measurements(out: Path) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""The place in `viewer.html` for what is measured on the surface model, when the page is long there already."""
+"""The viewers' pages: what they are called, and the place in them for what is measured when they are there already."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import Any
 from splatpipe.pipeline.web import script_safe
 
 PAGE = "viewer.html"
+SITE = "web/"
+"""Of the viewer as a folder for web hosts, in OUT."""
+SITE_PAGE = f"{SITE}index.html"
 BEGIN, END = b'<script type="application/json" id="measurements">', b"</script>"  # as in the template, with null
 NOTHING = b"null"
 SIZES = 4096  # pages that differ differ in their sizes as well, for programs that compare no more than size and time

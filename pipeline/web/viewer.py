@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,24 +108,52 @@ def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
         ValueError: if there is no camera.
         MachineError: if this installation was built without the page's script.
     """
-    if not scene.cameras:
-        raise ValueError("a viewer needs a camera to begin from")
     inlined = isinstance(splat, bytes)
     carried = f'<script type="text/plain" id="splat">{_base64(splat)}</script>' if isinstance(splat, bytes) else ""
-    facts = _facts(scene) | {"splat": {"inlined": inlined, "address": "" if inlined else splat}}
+    points, colours = thinned(scene)
+    facts = scene_facts(scene, [None if shown.thumb is None else _jpeg_address(shown.thumb) for shown in scene.cameras])
+    facts["points"] = {"xyz": _base64(points.astype("<f4").tobytes()), "rgb": _base64(colours.tobytes())}
+    facts["splat"] = {"inlined": inlined, "address": "" if inlined else splat}
+    script = asset("viewer.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    style, script = f"<style>{asset('viewer.css')}</style>", f"{carried}\n<script>{script}</script>"
+    return page_of(scene, facts, PageParts(POLICY, style, script))
+
+
+@dataclass(frozen=True)
+class PageParts:
+    """How a page brings what draws it.
+
+    Attributes:
+        policy: What the page may do (Content-Security-Policy).
+        style: HTML of the head.
+        script: HTML of the body's end.
+    """
+
+    policy: str
+    style: str
+    script: str
+
+
+def page_of(scene: ViewerScene, facts: Mapping[str, Any], parts: PageParts) -> str:
+    """The page's HTML.
+
+    Args:
+        scene: What it shows.
+        facts: The same for its script.
+        parts: How it brings what draws it.
+    """
     environment = Environment(autoescape=True, keep_trailing_newline=True)
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     return template.render(
-        policy=POLICY,
+        policy=parts.policy,
         title=scene.title,
         subtitle=_subtitle(scene),
         crs=_crs_line(scene),
         note=scene.note,
         north=scene.metres and scene.placed,
-        style=Markup(asset("viewer.css")),
+        style=Markup(parts.style),
         facts=Markup(script_safe(json.dumps(facts, ensure_ascii=False, allow_nan=False))),
-        splat=Markup(carried),
-        script=Markup(asset("viewer.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")),
+        script=Markup(parts.script),
     )
 
 
@@ -142,10 +171,20 @@ def start_camera(scene: ViewerScene) -> int:
     return int(np.argmin([np.median(depths) if len(depths) >= max(enough, 1.0) else np.inf for depths in seen]))
 
 
-def _facts(scene: ViewerScene) -> dict[str, Any]:
-    points, colours = _thinned(scene)
+def scene_facts(scene: ViewerScene, thumbs: Sequence[str | None]) -> dict[str, Any]:
+    """What a page's script has to know of a scene, but for the splat and the sparse points.
+
+    Args:
+        scene: The scene.
+        thumbs: Where each camera's picture is.
+
+    Raises:
+        ValueError: if there is no camera.
+    """
+    if not scene.cameras:
+        raise ValueError("a viewer needs a camera to begin from")
     centres = np.array([shown.camera.centre() for shown in scene.cameras])
-    shown = points if scene.focus is None or not scene.focus.any() else scene.points[scene.focus]
+    shown = thinned(scene)[0] if scene.focus is None or not scene.focus.any() else scene.points[scene.focus]
     least, most = np.quantile(shown if len(shown) else centres, SIZE_QUANTILES, axis=0)
     size = float(np.linalg.norm(most - least)) or 1.0
     return {
@@ -157,21 +196,20 @@ def _facts(scene: ViewerScene) -> dict[str, Any]:
         "size": size,
         "centre": ((least + most) / 2.0).tolist(),
         "start": start_camera(scene),
-        "cameras": [_camera(shown) for shown in scene.cameras],
-        "points": {"xyz": _base64(points.astype("<f4").tobytes()), "rgb": _base64(colours.tobytes())},
+        "cameras": [_camera(shown, thumb) for shown, thumb in zip(scene.cameras, thumbs, strict=True)],
         "crs": None if scene.crs is None else scene.crs.facts(),
         "sky": None if scene.sky is None else _sky(scene.sky),
     }
 
 
-def _camera(shown: ViewerCamera) -> dict[str, Any]:
+def _camera(shown: ViewerCamera, thumb: str | None) -> dict[str, Any]:
     camera = shown.camera
     return {
         "name": camera.name,
         **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "rotation": camera.cam_from_world[:3, :3].T.ravel().tolist(),
         "centre": camera.centre().tolist(),
-        "thumb": None if shown.thumb is None else f"data:image/jpeg;base64,{_base64(shown.thumb)}",
+        "thumb": thumb,
         "held_out": shown.held_out,
     }
 
@@ -185,7 +223,8 @@ def _sky(sky: ViewerSky) -> dict[str, Any]:
     }
 
 
-def _thinned(scene: ViewerScene) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+def thinned(scene: ViewerScene) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """The sparse points that a page shows, and their colours."""
     usable = np.flatnonzero(np.isfinite(scene.points).all(axis=1))
     step = max(1, -(-len(usable) // MOST_POINTS))
     return scene.points[usable[::step]], scene.point_colours[usable[::step]]
@@ -203,6 +242,10 @@ def _crs_line(scene: ViewerScene) -> str:
     if scene.metres and not scene.placed:
         return "metres by scale bars; place and heading are arbitrary"
     return "local east, north, up, metres" if scene.metres else "arbitrary units: the photos say nothing of the scale"
+
+
+def _jpeg_address(picture: bytes) -> str:
+    return f"data:image/jpeg;base64,{_base64(picture)}"
 
 
 def _base64(data: bytes) -> str:

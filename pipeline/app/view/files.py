@@ -18,6 +18,8 @@ CHUNK_BYTES = 1 << 18
 RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 TYPES = {
     ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
     ".json": "application/json",
     ".ply": "application/octet-stream",
     ".spz": "application/octet-stream",

@@ -35,6 +35,11 @@ CSP_OF_RUN = (
     " img-src 'self' data: blob:; media-src 'self' data: blob:; font-src data:; connect-src 'self' data: blob:;"
     " worker-src blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
+# The run's folder for the web: as its own page states it.
+CSP_OF_SITE = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; style-src 'self'; img-src 'self' data: blob:;"
+    " connect-src 'self' data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
 HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",

@@ -12,6 +12,7 @@ from splatpipe.pipeline.app.view.files import NotThereError, is_inside, open_ins
 from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE
 
 REPORT = "report.html"  # the one thing for people in OUT that no stage delivers
 VIEWER = "viewer.html"
@@ -19,6 +20,7 @@ LARGEST_METRICS = 64 << 20
 WHAT = {
     REPORT: "what was done, and how good it is",
     VIEWER: "the splat in 3D, in one page",
+    SITE_PAGE: "the splat in 3D, in levels of detail: put the folder web/ on any web host",
     "splat.ply": "the splat, in the layout that every viewer reads",
     "splat.spz": "the splat, compressed, as the viewer draws it",
     "sky.ply": "the sky, as a dome of Gaussians",
@@ -54,7 +56,7 @@ def landing(run: RunFolder, marking: bool) -> dict[str, Any]:
         "state": state,
         "figures": _figures(_read_json(run, "metrics.json")) if "metrics.json" in names else [],
         "ways": _ways(names, at_work, marking, has_log=bool(log.stages)),
-        "files": [_file(run, name) for name in names],
+        "files": [_file(run, name) for name in names if name == SITE_PAGE or not name.startswith(SITE)],
     }
 
 
@@ -80,6 +82,10 @@ def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> 
         ways.append(("/live", "Watch the training", "The latest checkpoint beside the photos, and the curves"))
     if VIEWER in names:
         ways.append((f"/{VIEWER}", "3D viewer", "Fly around, measure, read coordinates"))
+    if SITE_PAGE in names:
+        ways.append(
+            (f"/{SITE_PAGE}", "3D viewer for the web", "The same for a web host: coarse at once, finer where one looks")
+        )
     if REPORT in names:
         ways.append((f"/{REPORT}", "Report", "What was captured, what was done, how good it is"))
     if "flythrough.webm" in names:

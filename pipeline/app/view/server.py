@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ipaddress
+import math
 import secrets
 import signal
 import socket
 import threading
+import time
 import webbrowser
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,12 +25,13 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, NotThereError, open_inside
-from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, Guard
+from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, Guard
 from splatpipe.pipeline.app.view.landing import fetchable, landing
 from splatpipe.pipeline.app.view.live import Live
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, Stopped, UsageError
 from splatpipe.pipeline.engine.run_folder import RunFolder, open_run_folder
 from splatpipe.pipeline.web import asset
+from splatpipe.pipeline.web.measured_page import SITE
 from splatpipe.stages.line import LINE
 
 ADDRESS = "127.0.0.1"
@@ -43,6 +46,8 @@ ASSETS = {
     "mark.js": "text/javascript",
 }
 OF_RUN = {"content-security-policy": CSP_OF_RUN, "cache-control": "no-cache"}
+OF_SITE = {"content-security-policy": CSP_OF_SITE, "cache-control": "no-cache"}
+FETCHABLE_FOR_S = 1.0  # a page of thousands of files asks for one after another; which there are is not asked each time
 ALONE = {"cross-origin-opener-policy": "same-origin"}  # from the run's pages, which have our origin
 
 
@@ -212,6 +217,7 @@ class Pages:
 
     def __init__(self, run: RunFolder, live: Live, token: str) -> None:
         self.run, self.live, self.token = run, live, token
+        self._known: tuple[float, frozenset[str]] = (-math.inf, frozenset())
         folder = Path(__file__).parent / "pages"
         self._templates = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True)
 
@@ -275,11 +281,19 @@ class Pages:
     def _file(self, request: Request) -> Response:
         """A file that the run delivers: its name is compared, and nothing is made of it."""
         path = request.path_params["path"]
-        if path not in fetchable(self.run):
+        if path not in self._fetchable():
             raise HTTPException(404)
         try:
             file = open_inside(self.run.out, path)
         except NotThereError as error:
             raise HTTPException(404) from error
         kind = TYPES.get(PurePosixPath(path).suffix, "application/octet-stream")
-        return FileAnswer(file, kind, OF_RUN)
+        return FileAnswer(file, kind, OF_SITE if path.startswith(SITE) else OF_RUN)
+
+    def _fetchable(self) -> frozenset[str]:
+        now = time.monotonic()
+        since, names = self._known
+        if now - since > FETCHABLE_FOR_S:
+            names = frozenset(fetchable(self.run))
+            self._known = now, names
+        return names

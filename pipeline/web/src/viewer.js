@@ -1,8 +1,9 @@
-// viewer.html: the splat in any browser, without a network. viewer.py writes the page; the parts are in viewer/.
+// viewer.html: the splat in any browser, without a network; and a site's index.html, which loads it in levels of detail.
+// viewer.py and site.py write the pages; the parts are in viewer/.
 //
 // For scripts and tests there is `window.splatpipe`:
 //   ready                 a promise: the first complete frame is on the screen (rejected where loading failed)
-//   complete()            a promise: a complete frame of the present view is on the screen
+//   complete()            a promise: a complete frame of the present view, as fine as it gets, is on the screen
 //   cameraState()         {position, yaw, pitch, roll, fx, fy, cx, cy, width, height, photo}: world units, radians, CSS px
 //   setCamera({position, target} or {position, yaw, pitch, roll})   look from there, at once
 //   goToCamera(name, atOnce = true)   the view of a photo; false where there is none of that name
@@ -12,19 +13,26 @@
 //   measure(from, to, kind = "distance")   {distance, horizontal, height}, drawn like one made by hand
 //   showPoints(on), showCameras(on), showInterface(on)
 //   picture()             a promise: the present view as a PNG data URL
+//   shown()               {gaussians, files}: what is drawn; files of the levels of detail, where it is in such
 //   facts                 what the page was made with
 
 import { Box3, Vector3 } from "three";
 import { fillStrip, Frusta, frustumDepth } from "./viewer/cameras.js";
 import { told, toCrs } from "./viewer/crs.js";
+import { LoadError } from "./viewer/error.js";
+import { fetchBytes } from "./viewer/files.js";
+import { readLevels } from "./viewer/levels.js";
 import { Measuring } from "./viewer/measure.js";
+import { acceptFile, loaded, note, progress, tell } from "./viewer/messages.js";
 import { Navigation } from "./viewer/navigation.js";
-import { bytesOf, LoadError, readFacts, readMeasurements, readSplat } from "./viewer/page.js";
-import { makePoints, nearestPoint } from "./viewer/points.js";
-import { RayCaster } from "./viewer/ray.js";
+import { bytesOf, readFacts, readMeasurements, readPoints, readSplat } from "./viewer/page.js";
+import { readPart } from "./viewer/part.js";
+import { fillPoints, makePoints, nearestPoint } from "./viewer/points.js";
+import { meet } from "./viewer/ray.js";
 import { Results } from "./viewer/results.js";
 import { makeSky } from "./viewer/sky.js";
 import { Stage } from "./viewer/stage.js";
+import { LevelStream } from "./viewer/stream.js";
 import { View } from "./viewer/view.js";
 
 const FAR_PER_SIZE = 1e4; // of the scene: what is behind everything else must not be cut off
@@ -52,7 +60,7 @@ class Viewer {
     const moved = () => this.stage.invalidate(true);
     view.changed = () => {
       this.photo = null;
-      this.choose?.(null);
+      this.strip?.choose(null);
       moved();
     };
     this.frusta = new Frusta(this.photos, frustumDepth(this.photos), () => this.stage.invalidate());
@@ -63,11 +71,23 @@ class Viewer {
     this.stage.failed = (error) => tell(`Drawing failed: ${error.message}`, "Reload this page, or try another browser.");
     this.stage.canvas.addEventListener("webglcontextlost", () => tell("The graphics card stopped drawing.", "Reload this page."));
     new ResizeObserver(() => this.stage.resize()).observe(this.stage.canvas);
-    await this.addSmallParts();
+    if (facts.sky) this.stage.scene.add(makeSky(await bytesOf(facts.sky.colours), facts.sky, facts.background));
+    this.points = makePoints();
+    this.stage.scene.add(this.points);
     this.goTo(this.photos[facts.start], true);
     this.controls();
-    const bytes = this.given ?? (await readSplat(facts, progress));
-    await this.show(bytes);
+    if (!facts.levels) {
+      await this.addSmallParts();
+      return this.show(await readSplat(facts, progress));
+    }
+    await this.stream();
+    this.addSmallParts(); // files of their own: nobody waits for them
+  }
+
+  async addSmallParts() {
+    this.strip.paint();
+    fillPoints(this.points, await readPoints(this.facts.points));
+    this.stage.invalidate();
   }
 
   /** Sections and volumes; null where none were measured. */
@@ -83,26 +103,39 @@ class Viewer {
     return results;
   }
 
-  async addSmallParts() {
-    const { facts } = this;
-    if (facts.sky) this.stage.scene.add(makeSky(await bytesOf(facts.sky.colours), facts.sky, facts.background));
-    const [xyz, rgb] = [await bytesOf(facts.points.xyz), await bytesOf(facts.points.rgb)];
-    this.points = makePoints(new Float32Array(xyz.buffer, xyz.byteOffset, xyz.length / 4), rgb);
-    this.stage.scene.add(this.points);
+  /** Show a splat, all of it. */
+  async show(bytes) {
+    this.part = await readPart(bytes);
+    this.stage.show([this.part]);
+    await this.stage.complete();
+    loaded();
   }
 
-  async show(bytes) {
-    this.rays = new RayCaster(await this.stage.load(bytes));
-    this.stage.invalidate();
+  /** Show a splat in levels of detail: all of it, coarse, then finer where one looks. */
+  async stream() {
+    const nodes = await readLevels(this.facts.levels);
+    const bytes = await fetchBytes(nodes[0].file, { total: nodes[0].bytes, progress });
+    const stream = new LevelStream(nodes, this.stage, (error) => note(`Some of the model stays coarse: ${error.message} Reload to try again.`));
+    await stream.begin(bytes);
     await this.stage.complete();
-    document.body.classList.add("ready");
-    $("loading").hidden = true;
+    this.levels = stream;
+    this.stage.invalidate();
+    loaded();
+  }
+
+  /** Resolves when the present view is on the screen, as fine as it gets. */
+  async complete() {
+    do {
+      await this.stage.complete();
+      await this.levels?.settled();
+    } while (!this.stage.whole);
   }
 
   beforeDraw() {
     const { view, stage } = this;
     view.size = { width: stage.width, height: stage.height };
     view.apply(stage.camera);
+    this.levels?.update(view);
     this.frusta.update(view);
     this.measuring.update(view);
     this.results?.traces.update(view);
@@ -119,8 +152,8 @@ class Viewer {
       hover: (x, y) => this.hover(x, y),
       leave: () => this.leave(),
     });
-    this.choose = fillStrip($("strip"), this.photos, (photo) => this.goTo(photo));
-    this.choose(this.photo);
+    this.strip = fillStrip($("strip"), this.photos, (photo) => this.goTo(photo));
+    this.strip.choose(this.photo);
     const actions = {
       home: () => this.goTo(this.photos[facts.start]),
       fly: () => this.setFlying(!this.navigation.flying),
@@ -161,7 +194,7 @@ class Viewer {
     this.last = photo;
     this.view.travel(this.view.poseOf(photo), atOnce, () => {
       this.photo = photo;
-      this.choose?.(photo);
+      this.strip?.choose(photo);
     });
     return true;
   }
@@ -202,9 +235,14 @@ class Viewer {
   pick(x, y) {
     const { view } = this;
     if (this.points.visible) return nearestPoint(this.points, view, x, y);
-    if (!this.rays) return null;
     const { forward } = view.axes();
-    return this.rays.meet(view.position, view.ray(x, y), forward, { near: this.facts.near, pixel: 1 / view.intrinsics().fx });
+    const limits = { near: this.facts.near, pixel: 1 / view.intrinsics().fx };
+    return meet(this.parts().map((part) => part.caster), view.position, view.ray(x, y), forward, limits);
+  }
+
+  /** What is drawn of the splat. */
+  parts() {
+    return this.levels ? this.levels.parts() : this.part ? [this.part] : [];
   }
 
   click(x, y) {
@@ -289,6 +327,7 @@ class Viewer {
   }
 
   async picture() {
+    await this.complete();
     const canvas = await this.stage.picture();
     this.measuring.draw(canvas, canvas.width / this.stage.width);
     return canvas;
@@ -309,7 +348,7 @@ class Viewer {
     return {
       ready,
       facts: this.facts,
-      complete: () => this.stage.complete(),
+      complete: () => this.complete(),
       cameraState: () => {
         const { position, yaw, pitch, roll, size } = this.view;
         return { position: array(position), yaw, pitch, roll, ...this.view.intrinsics(), ...size, photo: this.photo?.name ?? null };
@@ -336,44 +375,13 @@ class Viewer {
       showPoints: (on) => this.showPoints(on),
       showCameras: (on) => this.showCameras(on),
       showInterface: (on) => document.body.classList.toggle("bare", !on),
+      shown: () => {
+        const gaussians = this.parts().reduce((sum, part) => sum + part.count, 0);
+        return { gaussians, files: this.levels?.shown.map((node) => node.file) ?? [] };
+      },
       picture: async () => (await this.picture()).toDataURL("image/png"),
     };
   }
-}
-
-function progress(share) {
-  $("bar").classList.add("known");
-  $("bar").style.width = `${Math.round(100 * share)}%`;
-}
-
-/** A message in the middle of the page. */
-function tell(message, hint, choose = false) {
-  $("loading").hidden = false;
-  $("loading").classList.add("failed");
-  $("message").textContent = message;
-  $("advice").textContent = hint;
-  $("choose").hidden = !choose;
-}
-
-/** A splat that is dropped on the page or chosen, where the page cannot read it itself. */
-function acceptFile(viewer) {
-  const take = async (file) => {
-    if (!file) return;
-    $("loading").classList.remove("failed");
-    $("message").textContent = "Reading…";
-    $("advice").textContent = "";
-    try {
-      await viewer.show(new Uint8Array(await file.arrayBuffer()));
-    } catch (error) {
-      tell(error.message, error.hint ?? "", true);
-    }
-  };
-  $("file").addEventListener("change", (event) => take(event.target.files[0]));
-  addEventListener("dragover", (event) => event.preventDefault());
-  addEventListener("drop", (event) => {
-    event.preventDefault();
-    take(event.dataTransfer.files[0]);
-  });
 }
 
 const viewer = new Viewer(readFacts());
@@ -381,6 +389,7 @@ const ready = viewer.start();
 window.splatpipe = viewer.api(ready);
 ready.catch((error) => {
   const known = error instanceof LoadError;
-  tell(known ? error.message : `The model cannot be shown: ${error.message}`, known ? error.hint : "Try another browser.", !viewer.facts.splat.inlined);
-  if (viewer.stage && !viewer.facts.splat.inlined) acceptFile(viewer);
+  const beside = viewer.facts.splat?.inlined === false;
+  tell(known ? error.message : `The model cannot be shown: ${error.message}`, known ? error.hint : "Try another browser.", beside);
+  if (viewer.stage && beside) acceptFile((bytes) => viewer.show(bytes));
 });

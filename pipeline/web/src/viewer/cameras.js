@@ -119,8 +119,11 @@ export function frustumDepth(photos) {
   return 0.3 * (known[Math.floor(known.length / 2)] ?? 1);
 }
 
-/** The strip of pictures. */
-export function fillStrip(strip, photos, choose) {
+/**
+ * The strip of pictures.
+ * @returns {{choose: (photo: object | null) => void, paint: () => void}} Marks one; loads the pictures.
+ */
+export function fillStrip(strip, photos, go) {
   const buttons = photos.map((photo) => {
     const button = document.createElement("button");
     button.type = "button";
@@ -128,7 +131,6 @@ export function fillStrip(strip, photos, choose) {
     button.className = photo.held_out ? "held-out" : "";
     if (photo.thumb) {
       const image = document.createElement("img");
-      image.src = photo.thumb;
       image.alt = photo.name;
       image.loading = "lazy";
       image.style.aspectRatio = `${photo.width} / ${photo.height}`; // its place is known before it is loaded
@@ -136,12 +138,12 @@ export function fillStrip(strip, photos, choose) {
     } else {
       button.textContent = photo.name;
     }
-    button.addEventListener("click", () => choose(photo));
+    button.addEventListener("click", () => go(photo));
     strip.append(button);
     return [photo, button];
   });
   let begun = false;
-  return (chosen) => {
+  const choose = (chosen) => {
     for (const [photo, button] of buttons) {
       const is = photo === chosen;
       button.setAttribute("aria-current", String(is));
@@ -151,4 +153,8 @@ export function fillStrip(strip, photos, choose) {
     }
     begun = true;
   };
+  const paint = () => {
+    for (const [photo, button] of buttons) if (photo.thumb) button.firstChild.src = photo.thumb;
+  };
+  return { choose, paint };
 }

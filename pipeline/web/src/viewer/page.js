@@ -1,14 +1,9 @@
-// What the page carries: the facts of the scene and, in most pages, the splat itself.
+// What the page carries: the facts of the scene and, in most pages, the splat itself; or where it lies.
+
+import { LoadError } from "./error.js";
+import { fetchBytes } from "./files.js";
 
 const CHUNK = 1 << 22; // letters decoded at a time where the browser has no decoder of its own; a multiple of 4
-
-export class LoadError extends Error {
-  /** @param {string} message What is wrong. @param {string} hint What to do about it. */
-  constructor(message, hint) {
-    super(message);
-    this.hint = hint;
-  }
-}
 
 /** The facts that viewer.py wrote; see ViewerScene there. */
 export function readFacts() {
@@ -51,28 +46,16 @@ export async function readSplat(facts, progress) {
       `Drop ${facts.splat.address} onto this page or choose it below; or run "splatpipe view" on the folder.`,
     );
   }
-  return await fetchSplat(facts.splat, progress);
+  return await fetchBytes(facts.splat.address, { progress });
 }
 
-async function fetchSplat({ address, bytes: total }, progress) {
-  let answer;
-  try {
-    answer = await fetch(address);
-  } catch {
-    throw new LoadError(`${address} cannot be reached.`, "Is the server still running? Start it again and reload this page.");
+/** The sparse points: out of the page, or from beside it, where those that cannot be had are none. */
+export async function readPoints({ xyz, rgb, address, count }) {
+  if (!address) {
+    const [places, colours] = [await bytesOf(xyz), await bytesOf(rgb)];
+    return { xyz: new Float32Array(places.buffer, places.byteOffset, places.length / 4), rgb: colours };
   }
-  if (!answer.ok) {
-    throw new LoadError(`${address} is not there (${answer.status}).`, "It has to lie beside this page: copy both.");
-  }
-  const parts = [];
-  let count = 0;
-  const reader = answer.body.getReader();
-  for (;;) {
-    const { done, value } = await reader.read();
-    if (done) break;
-    parts.push(value);
-    count += value.length;
-    progress(total ? count / total : 0);
-  }
-  return new Uint8Array(await new Blob(parts).arrayBuffer());
+  const bytes = await fetchBytes(address).catch(() => new Uint8Array(0));
+  const all = bytes.length === 15 * count ? count : 0; // three floats and three bytes each
+  return { xyz: new Float32Array(bytes.buffer, 0, 3 * all), rgb: bytes.subarray(12 * all, 15 * all) };
 }

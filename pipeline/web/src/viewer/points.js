@@ -5,10 +5,9 @@ import { BufferAttribute, BufferGeometry, Points, ShaderMaterial, Vector3 } from
 const SIZE_PX = 3.5;
 const REACH_PX = 10; // from a click
 
-export function makePoints(xyz, rgb) {
+/** None at first, and not shown. */
+export function makePoints() {
   const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(xyz, 3));
-  geometry.setAttribute("rgb", new BufferAttribute(rgb, 3, true));
   const material = new ShaderMaterial({
     uniforms: { size: { value: SIZE_PX } },
     vertexShader: `
@@ -29,9 +28,15 @@ void main() {
   return points;
 }
 
+/** Put points into their place. @param {{xyz: Float32Array, rgb: Uint8Array}} found */
+export function fillPoints(points, { xyz, rgb }) {
+  points.geometry.setAttribute("position", new BufferAttribute(xyz, 3));
+  points.geometry.setAttribute("rgb", new BufferAttribute(rgb, 3, true));
+}
+
 /** The foremost point near a place in the window; null where none is. */
 export function nearestPoint(points, view, x, y) {
-  const xyz = points.geometry.getAttribute("position").array;
+  const xyz = points.geometry.getAttribute("position")?.array ?? [];
   const { fx, fy, cx, cy } = view.intrinsics();
   const { right, up, forward } = view.axes();
   const eye = view.position;

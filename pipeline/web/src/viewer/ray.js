@@ -23,43 +23,77 @@ function halfValues() {
   return values;
 }
 
+/**
+ * @param {RayCaster[]} casters Of all the splats.
+ * @param {Vector3} origin @param {Vector3} direction Unit, world.
+ * @param {Vector3} forward The view's axis: Gaussians are passed in the order of their depth along it.
+ * @param {{near: number, pixel: number}} limits Nearest depth, and a pixel's angle.
+ * @returns {Vector3 | null} The point in the world.
+ */
+export function meet(casters, origin, direction, forward, limits) {
+  const met = casters.flatMap((caster) => caster.hits(origin, direction, forward, limits));
+  met.sort((a, b) => a.depth - b.depth);
+  const cosine = direction.dot(forward);
+  let light = 1;
+  for (const { alpha, at } of met) {
+    light *= 1 - alpha;
+    if (light <= MEDIAN) return new Vector3().copy(origin).addScaledVector(direction, at / cosine);
+  }
+  return null;
+}
+
 export class RayCaster {
-  /** @param splats Spark's ExtSplats; their frame is the world's turned to y up (x, z, -y). */
-  constructor(splats) {
+  /** @param splats Spark's ExtSplats; their frame is the world's turned to y up (x, z, -y). @param {number[]} zero Theirs, in the world. */
+  constructor(splats, zero) {
     this.splats = splats;
-    this.places = null;
+    this.zero = zero;
+    this.reach2 = null;
   }
 
-  /** Centres and squared reach, read once: the search goes through nothing else. */
+  /** Centres and squared reach, and a sphere about them all, read once: the search goes through nothing else. */
   prepare() {
     halves ??= halfValues();
     const count = this.splats.numSplats;
     const [first, second] = this.splats.extArrays;
     this.centres = new Float32Array(first.buffer, first.byteOffset, first.length);
     this.reach2 = new Float32Array(count);
+    const [least, most] = [[0, 1, 2].map(() => Infinity), [0, 1, 2].map(() => -Infinity)];
     for (let i = 0; i < count; i++) {
       const a = halves[second[4 * i + 1] >>> 16];
       const b = halves[second[4 * i + 2] & 65535];
       const c = halves[second[4 * i + 2] >>> 16];
       this.reach2[i] = Math.exp(2 * Math.max(a, b, c)) * SIGMAS2;
+      const reach = Math.sqrt(this.reach2[i]);
+      for (let axis = 0; axis < 3; axis++) {
+        least[axis] = Math.min(least[axis], this.centres[4 * i + axis] - reach);
+        most[axis] = Math.max(most[axis], this.centres[4 * i + axis] + reach);
+      }
     }
+    const [low, high] = [new Vector3(...least), new Vector3(...most)];
+    this.sphere = { centre: low.clone().add(high).multiplyScalar(0.5), radius: low.distanceTo(high) / 2 };
   }
 
-  /**
-   * @param {Vector3} origin @param {Vector3} direction Unit, world.
-   * @param {Vector3} forward The view's axis: Gaussians are passed in the order of their depth along it.
-   * @param {{near: number, pixel: number}} limits Nearest depth, and a pixel's angle.
-   * @returns {Vector3 | null} The point in the world.
-   */
-  meet(origin, direction, forward, { near, pixel }) {
+  /** Whether a ray may meet any of them; the arguments in their frame. */
+  passes(origin, direction, blur2) {
+    const offset = this.sphere.centre.clone().sub(origin);
+    const away = offset.length();
+    const farthest = away + this.sphere.radius;
+    const along = offset.dot(direction);
+    if (along < -this.sphere.radius) return false;
+    return Math.sqrt(Math.max(0, away * away - along * along)) <= this.sphere.radius + farthest * Math.sqrt(SIGMAS2 * blur2);
+  }
+
+  /** What a ray meets of them: alphas with their depths, see `meet`. */
+  hits(origin, direction, forward, { near, pixel }) {
     if (!this.reach2) this.prepare();
-    const [ox, oy, oz] = [origin.x, origin.z, -origin.y];
+    const [ox, oy, oz] = [origin.x - this.zero[0], origin.z - this.zero[2], this.zero[1] - origin.y];
     const [dx, dy, dz] = [direction.x, direction.z, -direction.y];
     const [fx, fy, fz] = [forward.x, forward.z, -forward.y];
     const { centres, reach2 } = this;
     const cosine = direction.dot(forward);
     const blur2 = BLUR_PX2 * pixel * pixel;
     const met = [];
+    if (!this.passes(new Vector3(ox, oy, oz), new Vector3(dx, dy, dz), blur2)) return met;
     for (let i = 0, j = 0; i < reach2.length; i++, j += 4) {
       const [x, y, z] = [centres[j] - ox, centres[j + 1] - oy, centres[j + 2] - oz];
       const along = x * dx + y * dy + z * dz;
@@ -72,13 +106,7 @@ export class RayCaster {
       const limit = SHIFT_MAX * depth;
       met.push({ depth, alpha: hit.alpha, at: Math.min(Math.max(hit.at * cosine, depth - limit), depth + limit) });
     }
-    met.sort((a, b) => a.depth - b.depth);
-    let light = 1;
-    for (const { alpha, at } of met) {
-      light *= 1 - alpha;
-      if (light <= MEDIAN) return new Vector3().copy(origin).addScaledVector(direction, at / cosine);
-    }
-    return null;
+    return met;
   }
 
   /** A Gaussian's alpha on a ray, and where along it it is largest. */

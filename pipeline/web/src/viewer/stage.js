@@ -1,9 +1,9 @@
 // The canvas: draws when something has changed, one frame at a time, and says when a frame is whole.
 
-import { PerspectiveCamera, Scene, WebGLRenderer } from "three";
-import { SparkRenderer, SplatMesh, ExtSplats } from "@sparkjsdev/spark";
+import { Group, PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { SparkRenderer } from "@sparkjsdev/spark";
 import { drawInBatches } from "./batches.js";
-import { LoadError } from "./page.js";
+import { LoadError } from "./error.js";
 
 const BLUR_PX2 = 0.3; // and the two below: what our rasterizer does, pipeline/raster/definitions.py
 const ALPHA_MIN = 1 / 255;
@@ -50,7 +50,8 @@ export class Stage {
     this.scene.add(this.spark);
     this.beforeDraw = () => {};
     this.failed = () => {};
-    this.mesh = null;
+    this.splats = new Group();
+    this.scene.add(this.splats);
     this.wanted = 0;
     this.movedAt = -Infinity;
     this.fullMs = 0;
@@ -60,28 +61,20 @@ export class Stage {
     this.resize();
   }
 
-  /** Decode an SPZ file (y up) and show it in the world (z up). */
-  async load(bytes) {
-    const splats = new ExtSplats({ fileBytes: bytes, fileType: "spz" }); // float32 centres: half floats are cm apart
-    try {
-      await splats.initialized;
-    } catch {
-      throw new LoadError("The splat cannot be read.", "It may be damaged or cut off: copy it again, or make it anew.");
-    }
-    if (this.mesh) this.scene.remove(this.mesh);
-    this.mesh = new SplatMesh({ extSplats: splats });
-    this.mesh.quaternion.set(Math.SQRT1_2, 0, 0, Math.SQRT1_2);
-    await this.mesh.initialized;
-    this.mesh.updateMatrixWorld(true);
-    this.scene.add(this.mesh);
-    this.showSplats(this.splatsShown);
-    return splats;
+  /**
+   * Draw these splats, and no others.
+   * @param {import("./part.js").SplatPart[]} parts
+   */
+  show(parts) {
+    const meshes = new Set(parts.map((part) => part.mesh));
+    this.splats.remove(...this.splats.children.filter((mesh) => !meshes.has(mesh)));
+    this.splats.add(...meshes);
+    this.invalidate();
   }
 
   showSplats(shown) {
     this.splatsShown = shown;
-    this.spark.visible = shown;
-    if (this.mesh) this.mesh.visible = shown;
+    this.spark.visible = this.splats.visible = shown;
     this.invalidate();
   }
 
@@ -123,7 +116,7 @@ export class Stage {
     this.beforeDraw();
     this.camera.updateMatrixWorld(true);
     const began = performance.now();
-    if (this.splatsShown && this.mesh) {
+    if (this.splatsShown && this.splats.children.length) {
       if (resting || slow) await this.sortNow();
       else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate(), this.failed);
     }
@@ -144,10 +137,15 @@ export class Stage {
     while (this.spark.sorting || this.spark.sortDirty) await pause(POLL_MS);
   }
 
+  /** The screen's pixels a CSS pixel that are drawn at rest. */
+  get fullRatio() {
+    return Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO);
+  }
+
   setQuality(draft) {
     this.setStride(draft ? Math.max(1, Math.ceil(this.spark.activeSplats / DRAFT_SPLATS)) : 1);
     const share = draft ? Math.max(LEAST_RESOLUTION, Math.sqrt(DRAFT_MS / this.fullMs)) : 1;
-    const ratio = Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO) * Math.min(1, share);
+    const ratio = this.fullRatio * Math.min(1, share);
     const { width, height } = this;
     const drawn = this.drawn;
     if (drawn && drawn.ratio === ratio && drawn.width === width && drawn.height === height) return;

@@ -1,0 +1,9 @@
+// What keeps a model from being shown, in words for people.
+
+export class LoadError extends Error {
+  /** @param {string} message What is wrong. @param {string} hint What to do about it. */
+  constructor(message, hint) {
+    super(message);
+    this.hint = hint;
+  }
+}

@@ -1,0 +1,120 @@
+// A site's levels of detail: which nodes of the tree a view wants. site.py writes the tree, levels.json.
+
+import { Vector3 } from "three";
+import { fetchBytes } from "./files.js";
+import { LoadError } from "./error.js";
+
+const KEPT_FROM = 0.5; // of the pixels at which a node is refined: a refined one stays so down to here
+const MARGIN = 1.2; // of a box's radius: what is just outside the window is refined as well
+
+/**
+ * The tree's nodes, the root first.
+ * @returns {Promise<{file: string, box: number[][], origin: number[], error: number, count: number, children: object[]}[]>}
+ */
+export async function readLevels(address) {
+  if (location.protocol === "file:") {
+    throw new LoadError(
+      "This page reads the model from the files beside it, which browsers do not allow a page that was opened from a disk.",
+      'Put the whole folder on any web host; or see it on this machine with "splatpipe view" of the run, or with ' +
+        '"python3 -m http.server" in this folder.',
+    );
+  }
+  const text = new TextDecoder().decode(await fetchBytes(address));
+  try {
+    const { nodes } = JSON.parse(text);
+    for (const node of nodes) {
+      node.children = node.children.map((index) => nodes[index]);
+      for (const child of node.children) child.parent = node;
+    }
+    if (nodes[0].file) return nodes;
+  } catch {
+    // told below
+  }
+  throw new LoadError("levels.json is damaged.", "Copy the folder again, or make it anew: splatpipe export.");
+}
+
+/** How large what a node leaves out is in the window, pixels, and whether any of it is in the window. */
+class Eye {
+  constructor(view, ratio) {
+    const { fx, fy, cx, cy } = view.intrinsics();
+    const { width, height } = view.size;
+    const { right, up, forward } = view.axes();
+    const plane = (side, across, ahead) => side.clone().multiplyScalar(across).addScaledVector(forward, ahead).normalize();
+    this.position = view.position;
+    this.sides = [plane(right, fx, cx), plane(right, -fx, width - cx), plane(up, -fy, cy), plane(up, fy, height - cy), forward];
+    this.near = view.planes.near;
+    this.scale = Math.max(fx, fy) * ratio;
+  }
+
+  pixels({ box: [least, most], error }) {
+    const distance = Math.hypot(...this.position.toArray().map((at, axis) => Math.max(least[axis] - at, at - most[axis], 0)));
+    return (error * this.scale) / Math.max(distance, this.near);
+  }
+
+  sees({ box: [least, most] }) {
+    const middle = new Vector3().addVectors(new Vector3(...least), new Vector3(...most)).multiplyScalar(0.5);
+    const radius = MARGIN * middle.distanceTo(new Vector3(...most));
+    middle.sub(this.position);
+    return this.sides.every((side) => side.dot(middle) > -radius);
+  }
+}
+
+/** Nodes by how large their error is in the window, the largest first. */
+class Ranking {
+  constructor() {
+    this.items = [];
+  }
+
+  add(node, pixels) {
+    let [low, high] = [0, this.items.length];
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (this.items[middle].pixels < pixels) low = middle + 1;
+      else high = middle;
+    }
+    this.items.splice(low, 0, { node, pixels });
+  }
+
+  take() {
+    return this.items.pop();
+  }
+}
+
+/**
+ * What a view wants of the tree.
+ *
+ * @param {object} root
+ * @param {import("./view.js").View} view
+ * @param {{pixels: number, most: number, ratio: number, refined: Set<object>}} limits Errors up to which a node will do,
+ *   in the screen's pixels; Gaussians that are drawn; the screen's pixels a CSS pixel; nodes whose descendants are shown.
+ * @returns {{inner: Set<object>, order: object[]}} Nodes that their children are to stand for, and all that have to be
+ *   loaded for that, the most important first.
+ */
+export function wantedLevels(root, view, { pixels, most, ratio, refined }) {
+  const eye = new Eye(view, ratio);
+  const [inner, order] = [new Set(), [root]];
+  let count = root.count;
+  const refine = (node, then) => {
+    const more = node.children.reduce((sum, child) => sum + child.count, -node.count);
+    if (count + more > most) return;
+    count += more;
+    inner.add(node);
+    for (const child of node.children) then(child);
+  };
+  const [seen, kept] = [new Ranking(), new Ranking()];
+  const rank = (node) => {
+    if (!node.children.length || node.children.some((child) => child.failed)) return;
+    const size = eye.pixels(node);
+    if (size > pixels && eye.sees(node)) seen.add(node, size);
+    else if (size > pixels * KEPT_FROM && refined.has(node)) kept.add(node, size);
+  };
+  rank(root);
+  for (let next = seen.take(); next; next = seen.take()) {
+    refine(next.node, (child) => {
+      order.push(child);
+      rank(child);
+    });
+  }
+  for (let next = kept.take(); next; next = kept.take()) refine(next.node, rank);
+  return { inner, order };
+}

@@ -1,0 +1,51 @@
+// Splats out of one SPZ file, as they are drawn and as rays meet them.
+
+import { ExtSplats, SplatMesh } from "@sparkjsdev/spark";
+import { LoadError } from "./error.js";
+import { RayCaster } from "./ray.js";
+
+const SH_TEXTURES = { sh1: "sh1Texture", sh2: "sh2Texture", sh3a: "sh3TextureA", sh3b: "sh3TextureB" }; // spark's names
+
+export class SplatPart {
+  /** @param {ExtSplats} splats @param {number[]} origin Their zero in the world. */
+  constructor(splats, origin) {
+    this.splats = splats;
+    this.count = splats.numSplats;
+    this.mesh = new SplatMesh({ extSplats: splats });
+    this.mesh.quaternion.set(Math.SQRT1_2, 0, 0, Math.SQRT1_2); // from the file's y up to the world's z up
+    this.mesh.position.fromArray(origin);
+    this.mesh.updateMatrixWorld(true);
+    this.caster = new RayCaster(splats, origin);
+    this.forget();
+  }
+
+  /** Once the GPU has the harmonics, nobody else needs them: two thirds of a splat's bytes. */
+  forget() {
+    const { extra } = this.splats;
+    for (const [name, its] of Object.entries(SH_TEXTURES)) {
+      const texture = extra[its]?.value;
+      if (!texture) continue;
+      texture.onUpdate = () => {
+        texture.image.data = null;
+        extra[name] = true; // that it is there, spark asks still
+      };
+    }
+  }
+
+  dispose() {
+    this.mesh.removeFromParent();
+    this.mesh.dispose();
+    this.splats.dispose();
+  }
+}
+
+/** Decode an SPZ file (y up), whose zero is at `origin` in the world. */
+export async function readPart(bytes, origin = [0, 0, 0]) {
+  const splats = new ExtSplats({ fileBytes: bytes, fileType: "spz" }); // float32 centres: half floats are cm apart
+  try {
+    await splats.initialized;
+  } catch {
+    throw new LoadError("The splat cannot be read.", "It may be damaged or cut off: copy it again, or make it anew.");
+  }
+  return new SplatPart(splats, origin);
+}

@@ -1,0 +1,130 @@
+// The splats of a site: the coarse whole first, then finer where one looks. A node stays until all of its children are
+// there to stand for it, so that there is never a hole.
+
+import { FileQueue } from "./files.js";
+import { wantedLevels } from "./levels.js";
+import { readPart } from "./part.js";
+
+const PIXELS = 4; // of the screen: a smaller error is not refined; its Gaussians stand a quarter of a pixel from the truth
+const NARROW = "(max-width: 640px), (max-height: 520px), (pointer: coarse)";
+const MOST = { wide: 3_000_000, narrow: 600_000 }; // Gaussians drawn: what a computer, and what a phone does smoothly
+const LITTLE_MEMORY_GB = 4; // of the machine: then as on a phone
+const KEPT = 2; // times as many Gaussians are kept at most, so that looking back asks for nothing
+const AT_ONCE = { wide: 4, narrow: 3 };
+
+function size() {
+  const small = matchMedia(NARROW).matches || (navigator.deviceMemory ?? Infinity) < LITTLE_MEMORY_GB;
+  return small ? "narrow" : "wide";
+}
+
+export class LevelStream {
+  /**
+   * @param {object[]} nodes As `readLevels` gives them.
+   * @param {import("./stage.js").Stage} stage
+   * @param {(error: Error) => void} failed Told of the first file that cannot be had.
+   */
+  constructor(nodes, stage, failed) {
+    this.root = nodes[0];
+    this.nodes = nodes;
+    this.byFile = new Map(nodes.map((node) => [node.file, node]));
+    this.stage = stage;
+    this.failed = failed;
+    this.most = MOST[size()];
+    this.refined = new Set();
+    this.shown = [];
+    this.loaded = 0; // Gaussians
+    this.time = 0; // counts the views
+    this.waiting = [];
+    this.queue = new FileQueue(AT_ONCE[size()], (...file) => this.take(...file), (...file) => this.miss(...file));
+    addEventListener("online", () => this.retry());
+  }
+
+  /** Load and show the root: the whole model, coarse. */
+  async begin(bytes) {
+    await this.take(this.root.file, bytes);
+    this.shown = [this.root];
+    this.stage.show([this.root.part]);
+  }
+
+  /** Ask for what a view wants, and show of it what is there. */
+  update(view) {
+    this.time++;
+    const ratio = this.stage.fullRatio;
+    const { inner, order } = wantedLevels(this.root, view, { pixels: PIXELS, most: this.most, ratio, refined: this.refined });
+    for (const node of order) node.touched = this.time;
+    const shown = this.cover(this.root, inner);
+    this.refined = new Set();
+    for (const node of shown) {
+      node.touched = this.time;
+      for (let above = node.parent; above && !this.refined.has(above); above = above.parent) this.refined.add(above);
+    }
+    if (shown.length !== this.shown.length || shown.some((node, i) => node !== this.shown[i])) {
+      this.shown = shown;
+      this.stage.show(this.parts());
+    }
+    this.queue.want(order.filter((node) => !node.part && !node.failed && !this.refined.has(node)).map((node) => node.file));
+    this.unload();
+    this.settle();
+  }
+
+  /** Loaded nodes that together stand for a node, as fine as wanted; null where there are none. */
+  cover(node, inner) {
+    if (node.part && !inner.has(node)) return [node];
+    const parts = [];
+    for (const child of node.children) {
+      const part = this.cover(child, inner);
+      if (!part) return node.part ? [node] : null;
+      parts.push(...part);
+    }
+    return parts.length ? parts : null;
+  }
+
+  async take(file, bytes, signal) {
+    const node = this.byFile.get(file);
+    const part = await readPart(bytes, node.origin);
+    if (signal?.aborted || node.part) return part.dispose();
+    node.part = part;
+    this.loaded += part.count;
+    this.stage.invalidate();
+  }
+
+  miss(file, error) {
+    this.byFile.get(file).failed = true;
+    if (!this.told) this.failed(error);
+    this.told = true;
+    this.stage.invalidate();
+  }
+
+  /** The network is back. */
+  retry() {
+    for (const node of this.nodes) node.failed = false;
+    this.stage.invalidate();
+  }
+
+  /** Let go of what has not been wanted for longest. */
+  unload() {
+    if (this.loaded <= KEPT * this.most) return;
+    const idle = this.nodes.filter((node) => node.part && node.touched !== this.time && node !== this.root);
+    for (const node of idle.sort((a, b) => a.touched - b.touched)) {
+      if (this.loaded <= KEPT * this.most) return;
+      this.loaded -= node.part.count;
+      node.part.dispose();
+      node.part = null;
+    }
+  }
+
+  /** What is shown. */
+  parts() {
+    return this.shown.map((node) => node.part);
+  }
+
+  settle() {
+    if (this.queue.pending.size) return;
+    for (const resolve of this.waiting.splice(0)) resolve();
+  }
+
+  /** Resolves when nothing more is to come for the present view. */
+  settled() {
+    return this.queue.pending.size ? new Promise((resolve) => this.waiting.push(resolve)) : Promise.resolve();
+  }
+}

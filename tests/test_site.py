@@ -1,0 +1,292 @@
+"""The viewer as a folder for web hosts, in a real browser: coarse and whole at first, in full in the end."""
+
+import gzip
+import io
+import json
+import struct
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from playwright.sync_api import Page
+
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.rendering import render_pixels
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.levels import LevelNode, build_levels
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts
+from splatpipe.pipeline.survey.frames import Frame, Similarity
+from splatpipe.pipeline.web.measured_page import with_measurements
+from splatpipe.pipeline.web.site import write_site
+from splatpipe.pipeline.web.viewer import ViewerScene
+from splatpipe.pipeline.web.viewer_scene import Look, viewer_scene, write_viewer
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+import tiny_scene
+
+COUNT, MOST_PER_NODE = 1200, 100
+UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up
+LIKE_OURS_DB = 25.0
+LIKE_THE_PAGE_DB = 40.0
+COARSE_DB = 14.0
+WIDTH, HEIGHT = 640, 400
+
+
+class Host(ThreadingHTTPServer):
+    """A static host of a folder, which may hold files back, or lose them."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+        self.address = f"http://127.0.0.1:{self.server_port}"
+        self.asked: Counter[str] = Counter()
+        self.held: set[str] = set()
+        self.missing: set[str] = set()
+        self.given = threading.Event()
+        self.given.set()
+
+
+class Handler(SimpleHTTPRequestHandler):
+    server: Host
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        name = self.path.split("?")[0].lstrip("/")
+        self.server.asked[name] += 1
+        if name in self.server.held:
+            self.server.given.wait(60.0)
+        if name in self.server.missing:
+            self.send_error(404)
+        else:
+            super().do_GET()
+
+
+@contextmanager
+def hosted(folder: Path) -> Iterator[Host]:
+    host = Host(folder)
+    threading.Thread(target=host.serve_forever, daemon=True).start()
+    try:
+        yield host
+    finally:
+        host.given.set()
+        host.shutdown()
+        host.server_close()
+
+
+@pytest.fixture(scope="module")
+def model() -> Gaussians:
+    """In the world frame."""
+    many = tiny_scene.true_model(COUNT)
+    many.log_scales -= 0.9
+    return many.transformed(1.0, torch.from_numpy(UP_FROM_DOWN), torch.zeros(3, dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def root(model: Gaussians) -> LevelNode:
+    return build_levels(model, MOST_PER_NODE)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> ViewerScene:
+    dataset = tiny_scene.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset")
+    frame = Frame("arbitrary", Similarity(1.0, UP_FROM_DOWN, np.zeros(3)))
+    look = Look(antialias=False, background=(0.0, 0.0, 0.0), near=0.01)
+    return viewer_scene(dataset, frame, look, (), COUNT, "Tiny </title> site")
+
+
+@pytest.fixture(scope="module")
+def site(scene: ViewerScene, model: Gaussians, root: LevelNode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, and beside it the page."""
+    folder = tmp_path_factory.mktemp("site")
+    write_site(folder / "web", scene, Scene(model, SceneFacts("z up")), root)
+    write_viewer(folder, scene, model, largest_bytes=1e9)
+    return folder
+
+
+def nodes_of(site: Path) -> list[dict]:
+    nodes: list[dict] = json.loads((site / "web/levels.json").read_text())["nodes"]
+    return nodes
+
+
+def replaced(site: Path, folder: Path, name: str, content: bytes) -> None:
+    """The same site elsewhere, with one file of another content."""
+    for file in (site / "web").iterdir():
+        if file.name != name:
+            (folder / file.name).symlink_to(file)
+    (folder / name).write_bytes(content)
+
+
+def picture(page: Page) -> np.ndarray:
+    """As it is now."""
+    page.evaluate("() => splatpipe.showInterface(false)")
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10.0 * np.log10(255.0**2 / max(np.mean((a.astype(float) - b.astype(float)) ** 2), 1e-9)))
+
+
+def wait_until(page: Page, happened: Callable[[], bool]) -> None:
+    for _ in range(2400):
+        if happened():
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError("it did not happen within four minutes")
+
+
+def test_it_is_whole_at_once_stays_whole_and_is_the_full_model_in_the_end(
+    site: Path, scene: ViewerScene, open_page: Callable
+) -> None:
+    nodes = nodes_of(site)
+    page = open_page((site / "viewer.html").as_uri(), WIDTH, HEIGHT).page
+    page.evaluate("() => splatpipe.complete()")
+    full, middle = picture(page), (WIDTH / 2, HEIGHT / 2)
+    point = page.evaluate("([x, y]) => splatpipe.pick(x, y)", middle)
+    with hosted(site / "web") as host:
+        host.held = {node["file"] for node in nodes[1:]}
+        host.given.clear()
+        watched = open_page(f"{host.address}/index.html", WIDTH, HEIGHT)
+        page = watched.page
+        page.evaluate("() => splatpipe.ready")
+        assert page.evaluate("() => splatpipe.shown()") == {"gaussians": MOST_PER_NODE, "files": [nodes[0]["file"]]}
+        first = psnr(picture(page), full)
+        assert first >= COARSE_DB
+        assert page.evaluate("([x, y]) => splatpipe.pick(x, y)", middle)
+        host.given.set()
+        page.evaluate("() => void splatpipe.complete().then(() => (window.itIsDone = true))")
+        while not page.evaluate("() => window.itIsDone"):
+            assert psnr(picture(page), full) >= first - 1.0
+        assert page.evaluate("() => splatpipe.shown().gaussians") == COUNT
+        assert psnr(picture(page), full) >= LIKE_THE_PAGE_DB
+        np.testing.assert_allclose(page.evaluate("([x, y]) => splatpipe.pick(x, y)", middle), point, atol=0.01)
+        assert page.evaluate("() => splatpipe.measure([0, 0, 0], [3, 4, 12]).distance") == 13.0
+        asked = {address for address in watched.requests if not address.startswith(host.address)}
+        assert (asked, watched.errors) == (set(), [])
+        leaves = {node["file"] for node in nodes if not node["children"]}
+        assert all(host.asked[name] == 1 for name in leaves)
+
+
+def test_the_full_model_is_what_our_rasterizer_renders(site: Path, model: Gaussians, open_page: Callable) -> None:
+    camera = tiny_scene.cameras()[4]
+    with hosted(site / "web") as host:
+        page = open_page(f"{host.address}/index.html", camera.width, camera.height).page
+        page.evaluate("() => splatpipe.ready")
+        page.evaluate("name => splatpipe.goToCamera(name)", camera.name)
+        page.evaluate("() => splatpipe.complete()")
+        down = model.transformed(1.0, torch.from_numpy(UP_FROM_DOWN.T.copy()), torch.zeros(3, dtype=torch.float64))
+        ours = render_pixels((down, None), camera, rasterizer.RenderOptions(sh_degree=3))
+        assert psnr(picture(page), ours) >= LIKE_OURS_DB
+
+
+def test_from_afar_and_out_of_sight_nothing_finer_is_asked_for(site: Path, open_page: Callable) -> None:
+    with hosted(site / "web") as host:
+        host.held = {node["file"] for node in nodes_of(site)[1:]}
+        host.given.clear()
+        page = open_page(f"{host.address}/index.html", WIDTH, HEIGHT).page
+        page.evaluate("() => splatpipe.ready")
+        page.evaluate("() => splatpipe.setCamera({position: [0, -4000, 0], target: [0, 0, 0]})")
+        page.evaluate("() => splatpipe.complete()")
+        assert len(page.evaluate("() => splatpipe.shown().files")) == 1
+        page.evaluate("() => splatpipe.setCamera({position: [0, -40, 0], target: [0, -80, 0]})")
+        page.evaluate("() => splatpipe.complete()")
+        assert len(page.evaluate("() => splatpipe.shown().files")) == 1
+
+
+def test_a_file_that_is_lost_is_told_once_and_leaves_no_hole(site: Path, open_page: Callable) -> None:
+    leaf = next(node for node in nodes_of(site) if not node["children"])
+    with hosted(site / "web") as host:
+        host.missing = {leaf["file"]}
+        watched = open_page(f"{host.address}/index.html", WIDTH, HEIGHT)
+        page = watched.page
+        page.evaluate("() => splatpipe.complete()")
+        shown = page.evaluate("() => splatpipe.shown()")
+        assert leaf["file"] not in shown["files"]
+        assert len(shown["files"]) > 3  # the others came
+        assert "is not there (404)" in page.locator("#notice").inner_text()
+        assert host.asked[leaf["file"]] == 3
+        host.missing = set()
+        page.evaluate("() => dispatchEvent(new Event('online'))")
+        wait_until(page, lambda: page.evaluate("() => splatpipe.shown().gaussians") == COUNT)
+
+
+def test_photos_points_and_what_was_measured_are_as_in_the_page(
+    site: Path, scene: ViewerScene, open_page: Callable, tmp_path: Path
+) -> None:
+    ring = {"x": [0.0, 2.0, 0.0, 0.0], "y": [0.0, 0.0, 2.0, 0.0], "z": [0.1, 0.1, 0.1, 0.1]}
+    amounts = {f"{kind}_{figure}": 2.5 for kind in ("cut", "fill", "net") for figure in ("m3", "sigma_m3")}
+    volume = {"name": "Heap", "area_m2": 2.0, "base": "rim", "trace": [ring], **amounts}
+    measured = with_measurements((site / "web/index.html").read_bytes(), {"sections": [], "volumes": [volume]})
+    replaced(site, tmp_path, "index.html", measured)
+    with hosted(tmp_path) as host:
+        page = open_page(f"{host.address}/index.html", WIDTH, HEIGHT).page
+        page.evaluate("() => splatpipe.ready")
+        assert page.title() == scene.title
+        assert page.locator("#fold").inner_text() == "1 volume"
+        wait_until(page, lambda: bool(page.evaluate("() => document.querySelector('#strip img').naturalWidth")))
+        splats = picture(page)
+        page.evaluate("() => splatpipe.complete()")
+        page.evaluate("() => splatpipe.showPoints(true)")
+        page.evaluate("() => splatpipe.complete()")
+        assert psnr(picture(page), splats) < 20.0
+
+
+@pytest.mark.parametrize("text", ['{"format": 1, "nodes": [{', "<html>not found</html>"])
+def test_a_damaged_tree_is_told(site: Path, tmp_path: Path, open_page: Callable, text: str) -> None:
+    replaced(site, tmp_path, "levels.json", text.encode())
+    with hosted(tmp_path) as host:
+        page = open_page(f"{host.address}/index.html", WIDTH, HEIGHT).page
+        page.locator("#loading.failed").wait_for()
+        assert page.locator("#message").inner_text() == "levels.json is damaged."
+
+
+def test_opened_from_a_disk_it_says_what_to_do(site: Path, open_page: Callable) -> None:
+    page = open_page((site / "web/index.html").as_uri(), WIDTH, HEIGHT).page
+    page.locator("#loading.failed").wait_for()
+    assert "do not allow a page that was opened from a disk" in page.locator("#message").inner_text()
+    assert "web host" in page.locator("#advice").inner_text()
+
+
+def test_the_same_site_has_the_same_bytes(
+    site: Path, scene: ViewerScene, model: Gaussians, root: LevelNode, tmp_path: Path
+) -> None:
+    write_site(tmp_path / "again", scene, Scene(model, SceneFacts("z up")), root)
+    for file in (tmp_path / "again").rglob("*"):
+        if file.is_file():
+            assert file.read_bytes() == (site / "web" / file.relative_to(tmp_path / "again")).read_bytes()
+
+
+def test_a_nodes_places_keep_millimetres_in_a_site_of_three_kilometres(
+    scene: ViewerScene, model: Gaussians, tmp_path: Path
+) -> None:
+    wide = model.clone()
+    wide.means = torch.rand(COUNT, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([3000.0, 3000.0, 50.0])
+    root = build_levels(wide, MOST_PER_NODE)
+    write_site(tmp_path / "web", scene, Scene(wide, SceneFacts("z up")), root)
+    found = []
+    for node in nodes_of(tmp_path):
+        if not node["children"]:
+            data = gzip.decompress((tmp_path / "web" / node["file"]).read_bytes())
+            count, _, bits = struct.unpack_from("<IBB", data, 8)
+            steps = np.frombuffer(data, np.uint8, 9 * count, 16).reshape(-1, 3).astype(np.int32)
+            places = ((steps[:, 0] | steps[:, 1] << 8 | steps[:, 2] << 16) << 8 >> 8).reshape(-1, 3) / 2.0**bits
+            found.append(np.stack([places[:, 0], -places[:, 2], places[:, 1]], axis=1) + node["origin"])
+    places, truth = np.concatenate(found), wide.means.numpy().astype(float)
+    order = [np.lexsort(np.round(each, 1).T) for each in (places, truth)]
+    assert np.abs(places[order[0]] - truth[order[1]]).max() < 0.001
+
+
+def test_a_splat_that_is_not_z_up_is_refused(
+    scene: ViewerScene, model: Gaussians, root: LevelNode, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match="z up"):
+        write_site(tmp_path / "web", scene, Scene(model, SceneFacts("y down")), root)
