@@ -1,0 +1,193 @@
+"""Floaters of known kinds in a trained model, planted between its cameras and what they see."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.reference import project
+from splatpipe.pipeline.splat.gaussians import Gaussians
+
+KINDS = ("single", "cluster", "near a surface", "haze", "oversized")
+SHARES = (1.0, 1.0, 1.0, 0.5, 0.2)  # of each kind: what is large is rare
+CLUSTER = 40  # Gaussians
+NEAREST = 0.06  # of the depth: what is nearer to a camera is haze
+SIGMAS = 2.0  # that a floater's extent keeps from the surface
+SEEN_ALPHA = 8.0 / 255.0  # at its centre: what is fainter no photo shows
+DEPTH_MARGIN = 0.03  # of a depth: so near to the surface, a Gaussian is of it
+CAMERAS = 24  # whose depths are rendered, spread over the capture
+FAR = 2.0  # times a picture's median depth: what is farther is not what it was taken for
+SURE_VIEWS = 2  # that see a Gaussian at its surface, for it to be of the building
+LARGEST_DONOR = 0.9  # quantile of sizes: backgrounds have Gaussians as large as the scene
+
+Points = Float64[np.ndarray, "n 3"]
+Depth = Float64[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What a camera sees of a model.
+
+    Attributes:
+        camera: At the size of ``depth``.
+        depth: Median depths; 0 where there is no surface.
+    """
+
+    camera: Camera
+    depth: Depth
+
+    def gaps(self, points: Points) -> Float64[np.ndarray, " n"]:
+        """How far the surface is behind each point as a share of its depth; NaN outside of the picture."""
+        found = np.full(len(points), np.nan)
+        rows, pixels, depths = self.camera.in_view(points)
+        surface = self.depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+        there = surface > 0.0
+        found[rows[there]] = 1.0 - depths[there] / surface[there]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """Floaters, and what they were planted into.
+
+    Attributes:
+        model: All of the trained model, then the floaters.
+        kinds: Of the floaters, an index into ``KINDS``.
+        trained: How many Gaussians are the trained model's.
+        building: Which of those are of a surface that photos see.
+    """
+
+    model: Gaussians
+    kinds: Int64[np.ndarray, " f"]
+    trained: int
+    building: Bool[np.ndarray, " t"]
+
+
+def sights_of(model: Gaussians, cameras: Sequence[Camera], options: rasterizer.RenderOptions) -> list[Sight]:
+    """Depths of a model from some cameras, spread evenly."""
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(CAMERAS, len(cameras))).round().astype(int))
+    found = []
+    with torch.no_grad():
+        for index in chosen:
+            depth = rasterizer.render(model, cameras[index], options.for_depths()).median_depth
+            found.append(Sight(cameras[index], depth.double().numpy()))
+    return found
+
+
+def plant(
+    model: Gaussians,
+    sights: Sequence[Sight],
+    options: rasterizer.RenderOptions,
+    per_kind: int,
+    generator: np.random.Generator,
+) -> Planted:
+    """Plant floaters of each kind, as many as are asked for or their share of that.
+
+    Each lies on a ray of a random pixel of a random camera before the surface there, as far along it as is uniform in
+    the volume that the pixel sees (near a surface: 1.5 to 5 % of the depth before it; haze: 6 to 15 % from the camera),
+    and keeps clear of the surface by twice its size. It is a copy of a Gaussian of a surface, in a size of its kind,
+    and as opaque as real ones. What none shows that sees it is planted again elsewhere.
+    """
+    building = on_surfaces(model, sights)
+    donors = _donors(model, building)
+    parts, kinds = [], []
+    for kind in range(len(KINDS)):
+        left = round(SHARES[kind] * per_kind)
+        while left > 0:
+            part = _attempt(model, donors, sights[generator.integers(len(sights))], kind, options, generator)
+            part = part.first(min(left, len(part)))
+            left -= len(part)
+            parts.append(part)
+            kinds += [kind] * len(part)
+    return Planted(Gaussians.concat([model, *parts]), np.array(kinds), len(model), building)
+
+
+def on_surfaces(model: Gaussians, sights: Sequence[Sight]) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians lie where at least two cameras see a surface."""
+    means, agreeing = model.means.double().numpy(), np.zeros(len(model), int)
+    for sight in sights:
+        agreeing += np.abs(sight.gaps(means)) < DEPTH_MARGIN  # NaN is not near
+    opaque = torch.sigmoid(model.opacity_logits).numpy() > SEEN_ALPHA
+    return np.asarray((agreeing >= min(SURE_VIEWS, len(sights))) & opaque)
+
+
+def _donors(model: Gaussians, building: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " d"]:
+    size = model.log_scales.max(dim=1).values.numpy()
+    return np.flatnonzero(building & (size < np.quantile(size[building], LARGEST_DONOR)))
+
+
+def _attempt(
+    model: Gaussians,
+    donors: Int64[np.ndarray, " d"],
+    sight: Sight,
+    kind: int,
+    options: rasterizer.RenderOptions,
+    generator: np.random.Generator,
+) -> Gaussians:
+    """Some floaters of a kind before one camera; fewer, or none, where they would not do."""
+    count = CLUSTER if KINDS[kind] == "cluster" else 8
+    rows, columns = np.nonzero((sight.depth > 0.0) & (sight.depth < FAR * np.median(sight.depth[sight.depth > 0.0])))
+    pick = generator.integers(len(rows), size=1 if KINDS[kind] == "cluster" else count)
+    pixels = np.stack([columns[pick], rows[pick]], axis=1) + generator.random((len(pick), 2))
+    surface = sight.depth[rows[pick], columns[pick]]
+    share = _share_of_way(kind, len(pick), generator)
+    centres = sight.camera.unproject(pixels, share * surface)
+    centres = np.repeat(centres, count // len(pick), axis=0)
+    surface = np.repeat(surface, count // len(pick))
+    if KINDS[kind] == "cluster":
+        centres += generator.normal(size=centres.shape) * generator.uniform(0.004, 0.02) * surface[:, None]
+    found = model.select(torch.from_numpy(donors[generator.integers(len(donors), size=count)]))
+    found = replace(
+        found,
+        means=torch.from_numpy(centres).float(),
+        log_scales=_sizes(found, kind, surface, generator),
+        opacity_logits=_logits(kind, count, generator),
+    )
+    return found.select(torch.from_numpy(_stands(found, sight, options)))
+
+
+def _share_of_way(kind: int, count: int, generator: np.random.Generator) -> Float64[np.ndarray, " n"]:
+    """Of the depth, from the camera."""
+    if KINDS[kind] == "near a surface":
+        return 1.0 - generator.uniform(0.015, 0.05, count)
+    if KINDS[kind] == "haze":
+        return generator.uniform(NEAREST, 0.15, count)
+    return np.asarray((NEAREST**3 + (1.0 - NEAREST**3) * generator.random(count)) ** (1.0 / 3.0))
+
+
+def _sizes(
+    donor: Gaussians, kind: int, surface: Float64[np.ndarray, " n"], generator: np.random.Generator
+) -> Float[torch.Tensor, "n 3"]:
+    """Logarithms of scales: the donor's, or of its shape and a size by the depth."""
+    shares = {"haze": (0.004, 0.02), "oversized": (0.04, 0.12)}.get(KINDS[kind])
+    if shares is None:
+        return donor.log_scales.clone()
+    wanted = np.log(generator.uniform(*shares, len(surface)) * surface)
+    largest = donor.log_scales.max(dim=1, keepdim=True).values
+    shape = (donor.log_scales - largest).clamp(min=math.log(0.3))  # blobs: what is thin is no haze
+    return shape + torch.from_numpy(wanted).float()[:, None]
+
+
+def _logits(kind: int, count: int, generator: np.random.Generator) -> Float[torch.Tensor, " n"]:
+    low, high = {"haze": (0.05, 0.25), "oversized": (0.05, 0.2)}.get(KINDS[kind], (0.15, 0.9))
+    opacity = generator.uniform(low, high, count)
+    return torch.from_numpy(np.log(opacity / (1.0 - opacity))).float()
+
+
+def _stands(found: Gaussians, sight: Sight, options: rasterizer.RenderOptions) -> Bool[np.ndarray, " n"]:
+    """Which are clear of the surface, before the camera, and to be seen."""
+    means = found.means.double().numpy()
+    depth = sight.camera.depths(means)
+    reach = SIGMAS * np.exp(found.log_scales.max(dim=1).values.double().numpy()) / np.maximum(depth, 1e-9)
+    with np.errstate(invalid="ignore"):
+        clear = sight.gaps(means) > np.minimum(reach, 0.5)
+    splats = project(found, sight.camera, options)
+    shown = splats.usable & (splats.opacities >= SEEN_ALPHA)
+    return np.asarray(clear & shown.numpy() & (depth > 0.0))

