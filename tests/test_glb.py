@@ -1,7 +1,6 @@
 """GLB: what is written, read by the letter of glTF; others' files, in all the ways that glTF allows; hostile files."""
 
 import io
-import json
 import struct
 import sys
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
+from glb_parts import packed, parts
 from some_splats import some_gaussians
 
 FACTS = SceneFacts("z up", True, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"), ({"step": "crop"},))
@@ -30,24 +30,6 @@ SPLATTING = "KHR_gaussian_splatting"
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MOST_FILE_BYTES = 2**32 - 1
-
-
-def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """A GLB's document and data, as section 4.4 of the specification has them."""
-    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
-    length, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON" and length % 4 == 0
-    binary_length, binary_kind = struct.unpack_from("<I4s", data, 20 + length)
-    assert binary_kind == b"BIN\0" and 28 + length + binary_length == len(data) and binary_length % 4 == 0
-    return json.loads(data[20 : 20 + length]), data[28 + length :]
-
-
-def packed(document: dict[str, Any], binary: bytes) -> bytes:
-    text = json.dumps(document).encode()
-    text, binary = text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4)
-    total = 28 + len(text) + len(binary)
-    head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON") + text
-    return head + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
 def attributes(data: bytes) -> dict[str, np.ndarray]:

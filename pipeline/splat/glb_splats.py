@@ -23,6 +23,15 @@ from splatpipe.pipeline.splat.sh import MAX_DEGREE, rgb_to_dc
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
+RECORD = "splatpipe"
+"""In `asset.extras`: the record."""
+KERNEL = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
+"""As 3D Gaussian splatting renders, on colours as displays take them."""
 ROWS_AT_ONCE = 1 << 16
 _KNOWN = frozenset((EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"))
 _LEAST_ROW_BYTES = 12

@@ -20,19 +20,10 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats.bounded import check_values, open_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import FLOAT, UNSIGNED_BYTE, open_container, write_head
-from splatpipe.pipeline.splat.glb_splats import EXTENSION, ROWS_AT_ONCE, harmonics_names, read_splats
+from splatpipe.pipeline.splat.glb_splats import EXTENSION, KERNEL, RECORD, ROWS_AT_ONCE, harmonics_names, read_splats
 from splatpipe.pipeline.splat.scene import Scene, SceneFacts, facts_of_record, turn_of
 from splatpipe.pipeline.splat.sh import C0, multiply_rows
 
-RECORD = "splatpipe"
-"""In `asset.extras`: the record."""
-KERNEL = {
-    "kernel": "ellipse",
-    "colorSpace": "srgb_rec709_display",
-    "projection": "perspective",
-    "sortingMethod": "cameraDistance",
-}
-"""As 3D Gaussian splatting renders, on colours as displays take them."""
 _ARRAY_BUFFER, _POINTS = 34962, 0
 
 

@@ -1,0 +1,207 @@
+"""3D Tiles 1.1 of a splat on the globe: a tileset of levels of detail, each tile glTF with SPZ inside, for CesiumJS.
+
+Specifications: OGC 22-025r4, "3D Tiles 1.1"; Khronos, "KHR_gaussian_splatting" and its
+"KHR_gaussian_splatting_compression_spz_2"; Esri's extension `ESRI_crs` (github.com/Esri/3D-tiles). What they leave open
+is as CesiumJS 1.145 takes it: the tileset names both glTF extensions as required, or its tiles are drawn as points; the
+scene's first node holds the splat and a matrix; the SPZ file's axes are the glTF's, y up, and no others; there is an
+attribute for each term of the harmonics but the constant one, which is COLOR_0, and none for opacities.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.glb_container import FLOAT, UNSIGNED_BYTE, padded, write_head
+from splatpipe.pipeline.splat.glb_splats import EXTENSION, KERNEL, RECORD, SPZ_EXTENSION, harmonics_names
+from splatpipe.pipeline.splat.levels import LevelNode
+from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, turn_of
+from splatpipe.pipeline.splat.spz import FIRST_THREE_VERSION, spz_bytes
+
+TILESET = "tileset.json"
+TILES = "tiles"
+GLTF_CONTENT = "3DTILES_content_gltf"
+ESRI_CRS = "ESRI_crs"
+_STEP_M = 0.001  # that boxes are rounded outwards to
+_LEAST_HALF_M = 0.001  # of a box's side: one of nothing has no inverse
+_EXTENSIONS = [EXTENSION, SPZ_EXTENSION]
+
+
+@dataclass(frozen=True, eq=False)
+class EsriCrs:
+    """A projected CRS that programs of Esri show the tiles in, instead of on the globe.
+
+    Attributes:
+        wkid: Well-known number: EPSG's, which Esri takes; None where it has none.
+        wkt: Its definition (WKT 2) where it has no number; else empty.
+        vertical_wkid: Of its heights; None where nobody knows, which Esri takes for heights above some geoid.
+        crs_from_local: From local metres, z up, to its units: the best affine map.
+    """
+
+    wkid: int | None
+    wkt: str
+    vertical_wkid: int | None
+    crs_from_local: Float64[np.ndarray, "4 4"]
+
+
+def write_tiles(
+    folder: Path,
+    scene: Scene,
+    root: LevelNode,
+    ecef_from_local: Float64[np.ndarray, "4 4"],
+    esri_crs: EsriCrs | None = None,
+) -> None:
+    """Write `tileset.json` and a tile for each node; the same bytes for the same levels.
+
+    Every tile has an origin of its own, so that SPZ's positions of 24 bits are within a millimetre in a site that is
+    kilometres across.
+
+    Args:
+        folder: Made if it is not there; tiles of an earlier one are replaced, its other files stay.
+        scene: What the levels are of; its facts go into the tileset.
+        root: Of its levels, in its frame.
+        ecef_from_local: Places the scene, turned to z up, on the earth (EPSG:4978), metres; rigid.
+        esri_crs: What the tiles are shown in by programs of Esri; None for the globe alone.
+
+    Raises:
+        SplatpipeError: if the scene lies nowhere on the earth.
+        ValueError: if a value is not finite.
+        OSError: if a file cannot be written.
+    """
+    refuse_nowhere(scene.facts)
+    (folder / TILES).mkdir(parents=True, exist_ok=True)
+    names = {}
+    for number, node in enumerate(root.nodes()):
+        if len(node.gaussians):
+            names[id(node)] = f"{TILES}/{number}.glb"
+            _write_tile(folder / names[id(node)], node.gaussians, scene.facts)
+    tile = _tile(root, names, scene.facts.axes, esri_crs)
+    tile["transform"] = _column_major(ecef_from_local)
+    if esri_crs is not None:
+        tile["extensions"][ESRI_CRS]["transform"] = _column_major(esri_crs.crs_from_local)
+    tileset = _tileset(tile, root, scene.facts, esri_crs)
+    text = json.dumps(tileset, separators=(",", ":"), allow_nan=False)
+    (folder / TILESET).write_text(text, encoding="ascii")
+
+
+def refuse_nowhere(facts: SceneFacts) -> None:
+    """Tiles lie on the globe.
+
+    Raises:
+        SplatpipeError: if a scene lies nowhere on the earth.
+    """
+    if facts.place is None:
+        raise SplatpipeError(
+            "3D Tiles lie on the globe, but where this splat lies on the earth is not known.",
+            hint="Georeference its run (GPS in the photos, --geo or --gcp), or take glb, spz or ply.",
+        )
+
+
+def box_z_up(box: Float64[np.ndarray, "2 3"], axes: Axes) -> Float64[np.ndarray, "2 3"]:
+    """A box of a scene's frame, turned to east, north, up.
+
+    Args:
+        box: Lowest and highest corner.
+        axes: Of the scene's frame.
+    """
+    corners = box @ turn_of("z up", axes).numpy().T
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def _tileset(tile: Mapping[str, Any], root: LevelNode, facts: SceneFacts, esri_crs: EsriCrs | None) -> dict[str, Any]:
+    content = {"extensionsUsed": _EXTENSIONS, "extensionsRequired": _EXTENSIONS}
+    extensions: dict[str, Any] = {GLTF_CONTENT: content}
+    if esri_crs is not None:
+        named = {"wkt2": esri_crs.wkt} if esri_crs.wkid is None else {"wkid": esri_crs.wkid}
+        heights = {} if esri_crs.vertical_wkid is None else {"vcsWkid": esri_crs.vertical_wkid}
+        extensions[ESRI_CRS] = named | heights
+    nothing_drawn = max(root.error, float(np.linalg.norm(root.box[1] - root.box[0])))
+    return {
+        "asset": {"version": "1.1", "generator": "splatpipe", "extras": {RECORD: facts.record()}},
+        "extensionsUsed": list(extensions),
+        "extensions": extensions,
+        "geometricError": nothing_drawn,
+        "root": tile,
+    }
+
+
+def _tile(node: LevelNode, names: Mapping[int, str], axes: Axes, esri_crs: EsriCrs | None) -> dict[str, Any]:
+    """A node and all below it, as the tileset states them: z up, whatever their glTF is."""
+    volume = {"box": _box(box_z_up(node.box, axes))}
+    tile: dict[str, Any] = {"boundingVolume": volume, "geometricError": float(node.error), "refine": "REPLACE"}
+    if id(node) in names:
+        tile["content"] = {"uri": names[id(node)]}
+    if esri_crs is not None:
+        tile["extensions"] = {ESRI_CRS: {"boundingVolume": volume}}
+    if node.children:
+        tile["children"] = [_tile(child, names, axes, esri_crs) for child in node.children]
+    return tile
+
+
+def _box(box: Float64[np.ndarray, "2 3"]) -> list[float]:
+    """Centre and half axes, the box rounded outwards."""
+    steps = np.stack([np.floor(box[0] / _STEP_M), np.ceil(box[1] / _STEP_M)])
+    centre = np.round(steps.mean(axis=0) * _STEP_M, 6)
+    half = np.round(np.maximum((steps[1] - steps[0]) * (_STEP_M / 2.0), _LEAST_HALF_M), 6)
+    return [*centre.tolist(), *np.diag(half).ravel().tolist()]
+
+
+def _column_major(matrix: Float64[np.ndarray, "4 4"]) -> list[float]:
+    return [float(value) for value in matrix.ravel(order="F")]
+
+
+def _write_tile(path: Path, gaussians: Gaussians, facts: SceneFacts) -> None:
+    """Write glTF, y up, about its own origin, whose only data are an SPZ file of version 2."""
+    turn = turn_of("y up", facts.axes)
+    origin = np.rint((gaussians.means.amin(dim=0) + gaussians.means.amax(dim=0)).double().numpy() / 2.0)
+    means = (gaussians.means.double() - torch.from_numpy(origin)).float()
+    about = replace(gaussians, means=means)
+    spz = spz_bytes(about, facts.antialias, turn=turn, version=FIRST_THREE_VERSION)
+    corners = np.stack([means.amin(dim=0).numpy(), means.amax(dim=0).numpy()]).astype(np.float64) @ turn.numpy().T
+    bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    matrix = np.eye(4)
+    matrix[:3, 3] = turn.numpy() @ origin
+    with path.open("wb") as file:
+        write_head(file, _document(about, matrix, bounds, len(spz)), padded(len(spz)))
+        file.write(spz + b"\0" * (padded(len(spz)) - len(spz)))
+
+
+def _document(
+    gaussians: Gaussians, matrix: Float64[np.ndarray, "4 4"], bounds: Float64[np.ndarray, "2 3"], spz_size: int
+) -> dict[str, Any]:
+    """glTF's JSON: accessors without data, which the SPZ file fills."""
+    kinds = {
+        "POSITION": {"componentType": FLOAT, "type": "VEC3", "min": bounds[0].tolist(), "max": bounds[1].tolist()},
+        "COLOR_0": {"componentType": UNSIGNED_BYTE, "type": "VEC4", "normalized": True},
+        f"{EXTENSION}:SCALE": {"componentType": FLOAT, "type": "VEC3"},
+        f"{EXTENSION}:ROTATION": {"componentType": FLOAT, "type": "VEC4"},
+    }
+    harmonics = harmonics_names(gaussians.sh_degree)[1:]  # the constant one is COLOR_0
+    kinds |= {name: {"componentType": FLOAT, "type": "VEC3"} for name in harmonics}
+    inside = {SPZ_EXTENSION: {"bufferView": 0}}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(kinds)},
+        "mode": 0,
+        "extensions": {EXTENSION: {**KERNEL, "extensions": inside}},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "splatpipe"},
+        "extensionsUsed": _EXTENSIONS,
+        "extensionsRequired": _EXTENSIONS,
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "matrix": _column_major(matrix)}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": [{"count": len(gaussians), **kind} for kind in kinds.values()],
+        "bufferViews": [{"buffer": 0, "byteLength": spz_size}],
+        "buffers": [{"byteLength": padded(spz_size)}],
+    }
