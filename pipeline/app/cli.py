@@ -12,6 +12,7 @@ import typer
 
 from splatpipe.pipeline.app.cli_batch import batch
 from splatpipe.pipeline.app.cli_check import check
+from splatpipe.pipeline.app.cli_edit import OrderedCommand, edit
 from splatpipe.pipeline.app.cli_formats import convert, export
 from splatpipe.pipeline.app.cli_options import (
     BoundaryOption,
@@ -393,6 +394,7 @@ def doctor(
 
 
 app.command()(check)
+app.command(cls=OrderedCommand)(edit)
 
 
 def _stop(number: int, _frame: FrameType | None) -> NoReturn:

@@ -1,0 +1,184 @@
+"""``splatpipe edit``: crop, clean, move, turn, scale, merge and reduce a splat, in the order in which it is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from splatpipe.pipeline.app.cli_options import JsonOption, ThreadsOption, expanded
+from splatpipe.pipeline.app.ending import Ending
+from splatpipe.pipeline.engine.errors import UsageError
+
+ORDER = "splatpipe.order"
+CROP, MOVE, REST = "Keep or take out", "Move, turn, scale", "Clean, merge, reduce"
+
+
+class OrderedCommand(TyperCommand):
+    """A command that remembers in which order its options were given, each as often as it was."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As ever; the options' names in their order are left in the context."""
+        _, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        ctx.meta[ORDER] = [parameter.name for parameter in order]
+        return super().parse_args(ctx, args)
+
+
+def _repeated(metavar: str, help_text: str, panel: str) -> Any:
+    return typer.Option(metavar=metavar, help=help_text, rich_help_panel=panel)
+
+
+SourceArgument = Annotated[
+    Path, typer.Argument(metavar="IN", callback=expanded, help="A splat of any format, or the OUT of a run.")
+]
+TargetArgument = Annotated[
+    Path, typer.Argument(metavar="OUT", callback=expanded, help="The new file; its ending says the format.")
+]
+BoxOption = Annotated[
+    list[str] | None, _repeated("X1,Y1,X2,Y2", "Keep what lies in a box; with heights X1,Y1,Z1,X2,Y2,Z2.", CROP)
+]
+PolygonOption = Annotated[
+    list[Path] | None, _repeated("FILE", "Keep what lies in the polygons of a GeoJSON, in any CRS.", CROP)
+]
+HeightsOption = Annotated[list[str] | None, _repeated("LOW,HIGH", "Keep these heights; LOW, or ,HIGH alone.", CROP)]
+CutBoxOption = Annotated[list[str] | None, _repeated("X1,Y1,X2,Y2", "Take out what lies in a box.", CROP)]
+CutPolygonOption = Annotated[list[Path] | None, _repeated("FILE", "Take out what lies in the polygons.", CROP)]
+MoveOption = Annotated[list[str] | None, _repeated("EAST,NORTH,UP", "Move by so many metres.", MOVE)]
+MoveToOption = Annotated[
+    list[str] | None, _repeated("X,Y[,Z]", "Move its middle, or the point of --about, to a place.", MOVE)
+]
+RotateOption = Annotated[
+    list[str] | None,
+    _repeated("DEGREES[,AXIS]", "Turn anticlockwise seen from above, or about x, y, z or an axis X,Y,Z.", MOVE),
+]
+ScaleOption = Annotated[
+    list[str] | None, _repeated("FACTOR", "Scale; the splat loses its place on the earth and its metres.", MOVE)
+]
+ScaleFromOption = Annotated[
+    tuple[str, str, str] | None,
+    typer.Option(
+        metavar="A B LENGTH",
+        help="Scale so that points A and B (X,Y,Z) are so far apart, as 12.40m; A stays, lengths are metres.",
+        rich_help_panel=MOVE,
+    ),
+]
+AboutOption = Annotated[
+    list[str] | None,
+    _repeated("X,Y,Z|middle", "What stays in place in the steps that follow; else the splat's middle.", MOVE),
+]
+CleanOption = Annotated[bool, typer.Option("--clean", help="Remove floaters and rough edges.", rich_help_panel=REST)]
+MergeOption = Annotated[list[Path] | None, _repeated("FILE", "Add another splat, where it lies on the earth.", REST)]
+ReduceOption = Annotated[
+    list[str] | None, _repeated("N|100MB", "Merge neighbours until so many are left, or OUT is so small.", REST)
+]
+LocalOption = Annotated[
+    bool, typer.Option("--local", help="Coordinates are metres from the splat's zero, not of its CRS.")
+]
+PicturesOption = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw it before and after.")]
+
+
+def edit(
+    context: typer.Context,
+    source: SourceArgument,
+    out: TargetArgument,
+    crop_box: BoxOption = None,
+    crop_polygon: PolygonOption = None,
+    crop_heights: HeightsOption = None,
+    cut_box: CutBoxOption = None,
+    cut_polygon: CutPolygonOption = None,
+    move: MoveOption = None,
+    move_to: MoveToOption = None,
+    rotate: RotateOption = None,
+    scale: ScaleOption = None,
+    scale_from: ScaleFromOption = None,
+    about: AboutOption = None,
+    merge: MergeOption = None,
+    reduce: ReduceOption = None,
+    local: LocalOption = False,
+    pictures: PicturesOption = True,
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Crop, clean, move, turn, scale, merge and reduce a splat: steps are taken in the order in which they are given.
+
+    splatpipe edit out/site site.sog --crop-polygon site.geojson --rotate 37 --reduce 50MB
+
+    Coordinates are of the splat's CRS, or its own where it lies nowhere on the earth.
+    """
+    with Ending(out, as_json) as done:
+        options = {
+            "crop_box": crop_box,
+            "crop_polygon": crop_polygon,
+            "crop_heights": crop_heights,
+            "cut_box": cut_box,
+            "cut_polygon": cut_polygon,
+            "move": move,
+            "move_to": move_to,
+            "rotate": rotate,
+            "scale": scale,
+            "scale_from": scale_from,
+            "about": about,
+            "merge": merge,
+            "reduce": reduce,
+        }
+        given = steps_in_order(context.meta[ORDER], options)
+        done.told = told = _edit(source, out, given, (local, pictures, threads))
+        _show(told)
+
+
+def steps_in_order(order: Sequence[str], options: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Each option with its value, as they stand on the command line.
+
+    Args:
+        order: Names of all that was given, each as often as it was.
+        options: The values of steps, a list where an option may be repeated.
+
+    Raises:
+        UsageError: if one is given twice that may be given once.
+    """
+    left = {name: list(value) if isinstance(value, list) else [value] for name, value in options.items()}
+    found = []
+    for name in order:
+        if name not in left:
+            continue  # no step
+        if not left[name]:
+            raise UsageError(f"--{name.replace('_', '-')} can be given once.", hint="Edit what comes out once more.")
+        found.append((name, left[name].pop(0)))
+    return found
+
+
+def _edit(source: Path, out: Path, given: Sequence[tuple[str, Any]], how: tuple[bool, bool, int]) -> dict[str, Any]:
+    from splatpipe.pipeline.app.console import RunConsole
+    from splatpipe.pipeline.edit.size import Output
+    from splatpipe.pipeline.edit.sources import open_source
+    from splatpipe.pipeline.edit.steps import parse_steps
+    from splatpipe.pipeline.edit.work import Task, edit_splat
+    from splatpipe.pipeline.engine.events import EventReporter
+    from splatpipe.pipeline.engine.machine import available_cores
+    from splatpipe.pipeline.raster.threads import same_bits
+    from splatpipe.pipeline.splat.formats.files import format_of_name
+
+    local, pictures, threads = how
+    output = Output(out, format_of_name(out))
+    steps = parse_steps(given, output, local)
+    task = Task(open_source(source), output, steps, pictures)
+    console = RunConsole()
+    try:
+        with same_bits(threads or available_cores()):
+            return edit_splat(task, EventReporter("edit", console))
+    finally:
+        console.close()
+
+
+def _show(told: Mapping[str, Any]) -> None:
+    from splatpipe.pipeline.app.console import say
+
+    for step in told["steps"]:
+        before, after = step["gaussians"]
+        change = f"{before:,} Gaussians" if before == after else f"{before:,} → {after:,} Gaussians"
+        say(f"{step['step']}: {change}")
+    for path in told["outputs"]:
+        say(path)

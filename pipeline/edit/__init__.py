@@ -1,0 +1,1 @@
+"""Splats as they are handed over: cleaned, cut, moved, merged, reduced."""

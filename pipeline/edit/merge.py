@@ -1,0 +1,124 @@
+"""Merges: another splat beside what there is, each where it lies on the earth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from splatpipe.pipeline.edit.crops import DIGEST_CHARACTERS
+from splatpipe.pipeline.edit.sources import open_source
+from splatpipe.pipeline.edit.workpiece import Workpiece, between
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts, turn_of
+from splatpipe.pipeline.survey.crs import UNKNOWN, describe_vertical, parse_vertical, same_datum
+from splatpipe.pipeline.survey.frames import Origin
+
+MOST_APART_M = 30_000.0  # of two splats in one file: float32's step is 2 mm there
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Another splat, as it is: earlier steps are not done to it.
+
+    Attributes:
+        path: Its file, or a run's OUT.
+    """
+
+    path: Path
+
+    def apply(self, piece: Workpiece) -> dict[str, Any]:
+        """Merge; what is recorded of it.
+
+        Raises:
+            SplatpipeError: if it cannot be read, or it is not known where the two lie to each other.
+        """
+        source = open_source(self.path)
+        digest = source.digest()
+        other = source.read()
+        ours = piece.scene()
+        moved = _frame_from_other(ours.facts, other.facts, source.name)
+        if other.facts.antialias != ours.facts.antialias:
+            piece.notes.append(
+                f"Only one of {source.name} and the splat was trained with anti-aliasing: "
+                "small Gaussians of the other are drawn too thin or too bold."
+            )
+        count = len(other.gaussians)
+        piece.take(_joined(ours, other, moved))
+        return {"step": "merge", "file": source.name[:80], "sha256": digest[:DIGEST_CHARACTERS], "added": count}
+
+
+def _joined(ours: Scene, other: Scene, moved: Similarity) -> Gaussians:
+    """Both in our axes, in one new set: nothing besides is as large."""
+    first, second = ours.gaussians, other.gaussians
+    joined = Gaussians.empty(len(first) + len(second), max(first.sh_degree, second.sh_degree))
+    to_own, to_up = turn_of(ours.facts.axes, "z up"), turn_of("z up", other.facts.axes)
+    rotation = to_own @ torch.from_numpy(np.ascontiguousarray(moved.rotation)) @ to_up
+    translation = to_own @ torch.from_numpy(np.ascontiguousarray(moved.translation))
+    stays = bool((rotation == torch.eye(3)).all() and (translation == 0.0).all())  # then not a bit changes
+    start = 0
+    for part, as_it_is in ((first, True), (second, stays)):
+        for piece in part.pieces():
+            put = piece if as_it_is else piece.transformed(1.0, rotation, translation)
+            rows = slice(start, start + len(put))
+            for name, tensor in joined.tensors().items():
+                values = getattr(put, name)
+                (tensor[rows, : values.shape[1]] if name == "sh" else tensor[rows]).copy_(values)
+            start += len(put)
+    return joined
+
+
+def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similarity:
+    """From the other's frame to ours, both turned to z up.
+
+    Raises:
+        SplatpipeError: if that is not known, or they are too far apart.
+    """
+    if (ours.place is None) != (other.place is None):
+        without = name if other.place is None else "the splat"
+        raise SplatpipeError(
+            f"{without} lies nowhere on the earth, the other one does: where they lie to each other is not known.",
+            hint="Georeference its run (splatpipe georef), and take the splat that it exports.",
+        )
+    if ours.place is not None and other.place is not None:
+        return _on_earth(ours.place, other.place, name)
+    if ours.axes != other.axes:
+        raise SplatpipeError(
+            f"{name} has its {other.axes.replace(' ', ' axis ')}, the splat its {ours.axes.replace(' ', ' axis ')}.",
+            hint="Without a place on the earth only splats of one frame can be merged.",
+        )
+    if ours.metres != other.metres:
+        raise SplatpipeError(
+            f"Only one of {name} and the splat is in metres.",
+            hint="Scale the other first: splatpipe edit IN OUT --scale-from A B 12.40m.",
+        )
+    return Similarity.identity()
+
+
+def _on_earth(ours: Place, other: Place, name: str) -> Similarity:
+    datums = parse_vertical(ours.vertical_datum), parse_vertical(other.vertical_datum)
+    known = datums[0] == datums[1] or (UNKNOWN not in datums and same_datum(*datums))
+    if not known:
+        told = [describe_vertical(datum) if datum != UNKNOWN else "an unknown datum" for datum in datums]
+        raise SplatpipeError(
+            f"Heights of the splat are in {told[0]}, those of {name} in {told[1]}: they may be tens of metres apart.",
+            hint="Give both runs one datum: --set georef.vertical=…, then splatpipe georef OUT.",
+        )
+    to_ours = between(origin_of(other), origin_of(ours))
+    apart = float(np.linalg.norm(to_ours.translation))
+    if apart > MOST_APART_M:
+        raise SplatpipeError(
+            f"{name} lies {apart / 1000.0:,.0f} km away from the splat: one file cannot hold both.",
+            hint=f"At most {MOST_APART_M / 1000.0:.0f} km: places in a file are 32-bit numbers.",
+        )
+    return to_ours
+
+
+def origin_of(place: Place) -> Origin:
+    """Where a splat has its zero."""
+    return Origin(place.latitude, place.longitude, place.height_m)

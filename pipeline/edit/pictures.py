@@ -1,0 +1,160 @@
+"""A splat before and after: side by side, from a photo of its run that shows it, else obliquely from above."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from splatpipe.pipeline.edit.workpiece import MIDDLE
+from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.scene import Scene, turn_of
+
+WIDTH, HEIGHT = 960, 720  # pixels of one picture
+FIELD_DEG = 45.0  # of an oblique view, across the picture's height
+ELEVATION_DEG, HEADING_DEG = 35.0, 30.0  # it looks down by that, and north by east by that
+SEEN = 0.3  # least share of a splat's centres within a picture that is said to show it
+AS_MANY = 0.95  # of the most: among such photos the one that shows it largest
+LARGER = 3.0  # times a splat's own size, that a picture may show and it is still to be seen
+NEAR = 0.005  # of the distance to what is looked at
+BACKGROUND = (0.82, 0.84, 0.86)  # neither white walls nor dark roofs are lost in it
+GAP_PX = 8
+LABEL_PX = 28
+
+Points = Float64[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Cameras of the two pictures, in the frame, z up."""
+
+    before: Camera
+    after: Camera
+
+
+def choose_views(cameras: Sequence[Camera], before: Points, after: Float64[np.ndarray, "m 3"]) -> Views:
+    """Where a splat is looked at from: both pictures from one place if that shows both.
+
+    Args:
+        cameras: Of the run, in the frame; none where nobody knows.
+        before: Some centres, in the frame, z up.
+        after: The same of what it has become.
+    """
+    photo = _best_photo(cameras, after)
+    if photo is not None:
+        first = photo if _share(photo, before) >= SEEN else _best_photo(cameras, before)
+        return Views(first or oblique_view(_box(before)), photo)
+    boxes = [_box(before), _box(after)]
+    both = np.array([np.minimum(*[box[0] for box in boxes]), np.maximum(*[box[1] for box in boxes])])
+    if _size(both) <= LARGER * min(_size(box) for box in boxes):
+        return Views(oblique_view(both), oblique_view(both))
+    return Views(oblique_view(boxes[0]), oblique_view(boxes[1]))
+
+
+def _best_photo(cameras: Sequence[Camera], points: Points) -> Camera | None:
+    small = [_reduced(camera) for camera in cameras]
+    shares = [_share(camera, points) for camera in small]
+    most = max(shares, default=0.0)
+    if most < SEEN:
+        return None
+    good = [camera for camera, share in zip(small, shares, strict=True) if share >= AS_MANY * most]
+    return max(good, key=lambda camera: _spread(camera, points))  # the first of equals
+
+
+def _reduced(camera: Camera) -> Camera:
+    by = min(WIDTH / camera.width, HEIGHT / camera.height)
+    return camera.scaled(max(1, round(camera.width * by)), max(1, round(camera.height * by)))
+
+
+def _seen(camera: Camera, points: Points) -> Float64[np.ndarray, "m 2"]:
+    """Where those that lie in the picture do, pixels."""
+    inside = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    inside = inside[inside[:, 2] > 0.0]
+    plan = inside[:, :2] / inside[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return np.asarray(plan[((plan >= 0.0) & (plan <= [camera.width, camera.height])).all(axis=1)])
+
+
+def _share(camera: Camera, points: Points) -> float:
+    return len(_seen(camera, points)) / max(1, len(points))
+
+
+def _spread(camera: Camera, points: Points) -> float:
+    return float(np.prod(np.std(_seen(camera, points), axis=0) / [camera.width, camera.height]))
+
+
+def oblique_view(box: Float64[np.ndarray, "2 3"]) -> Camera:
+    """All of a box, from above and the side.
+
+    Args:
+        box: Least and largest east, north, up.
+    """
+    pitch, heading = math.radians(ELEVATION_DEG), math.radians(HEADING_DEG)
+    forward = np.array([math.sin(heading) * math.cos(pitch), math.cos(heading) * math.cos(pitch), -math.sin(pitch)])
+    right = np.array([math.cos(heading), -math.sin(heading), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    distance = max(_size(box) / 2.0, 1e-9) / math.sin(math.radians(FIELD_DEG) / 2.0)
+    pose[:3, 3] = -pose[:3, :3] @ (box.mean(axis=0) - distance * forward)
+    focal = HEIGHT / 2.0 / math.tan(math.radians(FIELD_DEG) / 2.0)
+    return Camera("oblique", WIDTH, HEIGHT, focal, focal, WIDTH / 2.0, HEIGHT / 2.0, pose)
+
+
+def _box(points: Points) -> Float64[np.ndarray, "2 3"]:
+    return np.asarray(np.quantile(points, MIDDLE, axis=0))
+
+
+def _size(box: Float64[np.ndarray, "2 3"]) -> float:
+    return float(np.linalg.norm(box[1] - box[0]))
+
+
+def picture(scene: Scene, camera: Camera, points: Points, label: str) -> Pixels:
+    """A picture of a splat.
+
+    Args:
+        scene: In its own axes.
+        camera: In the frame, z up.
+        points: Some of its centres, there.
+        label: What is written on it.
+
+    Raises:
+        SplatpipeError: if it covers more pixels than memory holds.
+    """
+    pose = camera.cam_from_world.copy()
+    pose[:3, :3] = pose[:3, :3] @ turn_of("z up", scene.facts.axes).numpy()
+    away = float(np.linalg.norm(np.median(points, axis=0) - camera.centre()))
+    options = rasterizer.RenderOptions(
+        sh_degree=scene.gaussians.sh_degree,
+        background=BACKGROUND,
+        antialias=scene.facts.antialias,
+        near=max(NEAR * away, 1e-9),
+        depth=False,
+    )
+    with torch.no_grad():
+        colour = rasterizer.render(scene.gaussians, replace(camera, cam_from_world=pose), options).colour
+    pixels = (colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).numpy()
+    canvas = np.full((HEIGHT + LABEL_PX, WIDTH, 3), 255, np.uint8)
+    top, left = LABEL_PX + (HEIGHT - camera.height) // 2, (WIDTH - camera.width) // 2
+    canvas[top : top + camera.height, left : left + camera.width] = pixels
+    cv2.putText(canvas, label, (6, LABEL_PX - 9), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (40, 40, 40), 1, cv2.LINE_AA)
+    return canvas
+
+
+def write_side_by_side(path: Path, left: Pixels, right: Pixels) -> None:
+    """Write two pictures as one PNG.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    gap = np.full((left.shape[0], GAP_PX, 3), 255, np.uint8)
+    done, data = cv2.imencode(".png", np.concatenate([left, gap, right], axis=1)[:, :, ::-1])
+    assert done, path
+    write_durably(path, lambda file: file.write(data.tobytes()))

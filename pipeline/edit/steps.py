@@ -1,0 +1,61 @@
+"""Steps as they stand on a command line, read in their order and checked before anything is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from splatpipe.pipeline.edit.crops import CropBox, CropHeights, CropPolygon
+from splatpipe.pipeline.edit.merge import Merge
+from splatpipe.pipeline.edit.motions import Move, MoveTo, Pivot, Rotate, Scale, ScaleFrom
+from splatpipe.pipeline.edit.size import Output, Reduce
+from splatpipe.pipeline.edit.work import Step
+from splatpipe.pipeline.engine.errors import UsageError
+
+MOST_STEPS = 100
+
+
+def parse_steps(given: Sequence[tuple[str, Any]], output: Output, local: bool) -> list[Step]:
+    """Steps from the options that ask for them.
+
+    Args:
+        given: Names of options (`crop_box`) with what the user wrote, in their order.
+        output: What is going to be written: `reduce` may ask for its bytes.
+        local: Coordinates are metres from the splat's zero, not of its CRS.
+
+    Raises:
+        UsageError: if one makes no sense, or there are too many.
+    """
+    if len(given) > MOST_STEPS:
+        raise UsageError(f"{len(given)} steps are too many.", hint=f"At most {MOST_STEPS}; edit what comes out again.")
+    pivot, steps = Pivot(None, local), []
+    for name, value in given:
+        option = f"--{name.replace('_', '-')}"
+        if name == "about":
+            pivot = Pivot.parse(value, option, local)
+            continue
+        steps.append(_PARSERS[name](value, option, pivot, output))
+    return steps
+
+
+def _polygon(value: Path, option: str, local: bool, inside: bool) -> CropPolygon:
+    if not value.is_file():
+        raise UsageError(f"There is no file {value}.", hint=f"Give {option} a GeoJSON file of polygons.")
+    return CropPolygon(value, local, inside)
+
+
+_PARSERS: dict[str, Callable[[Any, str, Pivot, Output], Step]] = {
+    "crop_box": lambda value, option, pivot, _: CropBox.parse(value, option, pivot.local, True),
+    "cut_box": lambda value, option, pivot, _: CropBox.parse(value, option, pivot.local, False),
+    "crop_polygon": lambda value, option, pivot, _: _polygon(value, option, pivot.local, True),
+    "cut_polygon": lambda value, option, pivot, _: _polygon(value, option, pivot.local, False),
+    "crop_heights": lambda value, option, pivot, _: CropHeights.parse(value, option, pivot.local),
+    "move": lambda value, option, _, __: Move.parse(value, option),
+    "move_to": lambda value, option, pivot, _: MoveTo.parse(value, option, pivot, pivot.local),
+    "rotate": lambda value, option, pivot, _: Rotate.parse(value, option, pivot),
+    "scale": lambda value, option, pivot, _: Scale.parse(value, option, pivot),
+    "scale_from": lambda value, option, pivot, _: ScaleFrom.parse(value, option, pivot.local),
+    "merge": lambda value, _, __, ___: Merge(value),
+    "reduce": lambda value, option, _, output: Reduce.parse(value, option, output),
+}

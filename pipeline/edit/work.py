@@ -1,0 +1,217 @@
+"""An edit from a splat's file to another: its steps in their order, what is written, and the pictures of it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from splatpipe.pipeline.edit.merge import Merge, origin_of
+from splatpipe.pipeline.edit.pictures import Points, Views, choose_views, picture, write_side_by_side
+from splatpipe.pipeline.edit.record import Edit, with_edits, write_record
+from splatpipe.pipeline.edit.size import Output
+from splatpipe.pipeline.edit.sources import SPLAT, STAGES, Source, is_run, open_source
+from splatpipe.pipeline.edit.workpiece import Workpiece, between
+from splatpipe.pipeline.engine.digests import file_digest
+from splatpipe.pipeline.engine.durable import sync_folder, sync_tree
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
+from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.splat.formats.files import write_scene
+from splatpipe.pipeline.splat.scene import Place, Scene
+
+RECORD, PICTURE = ".edits.json", ".edit.png"
+
+
+@runtime_checkable
+class Step(Protocol):
+    """One step of an edit."""
+
+    def apply(self, piece: Workpiece) -> dict[str, Any]:
+        """Do it; what is recorded of it: JSON, small."""
+        ...
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is asked for.
+
+    Attributes:
+        source: What is edited.
+        output: What is written.
+        steps: In their order.
+        pictures: Whether there are to be any.
+    """
+
+    source: Source
+    output: Output
+    steps: Sequence[Step]
+    pictures: bool = True
+
+    def beside(self, ending: str) -> Path:
+        """A file beside the output, called like it."""
+        path = self.output.path
+        return path.with_name(path.name.removesuffix(self.output.kind.ending) + ending)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Where a splat lies, for pictures."""
+
+    points: Points
+    place: Place | None
+    count: int
+
+
+def edit_splat(task: Task, report: Reporter) -> dict[str, Any]:
+    """Edit a splat: read it, take the steps, write it, what was done to it, and pictures.
+
+    Args:
+        task: What is asked for.
+        report: Told of the steps, and of what may surprise.
+
+    Returns:
+        What was done, for programs.
+
+    Raises:
+        SplatpipeError: if a step cannot be taken; then nothing is written.
+        MachineError: if something cannot be written.
+    """
+    require_free(task)
+    total = len(task.steps) + 1 + task.pictures
+    report.progress(0, total, "reading", "steps")
+    digest = task.source.digest()
+    piece = Workpiece(task.source.read())
+    if not len(piece):
+        raise SplatpipeError(f"{task.source.name} has no Gaussians.", hint="Name another splat.")
+    before = _Look(piece.sample(), piece.facts.place, len(piece))
+    edits = _take_steps(task, piece, total, report)
+    scene = piece.scene()
+    _require_finite(scene)
+    scene = Scene(scene.gaussians, with_edits(scene.facts, edits))
+    after = _Look(piece.sample(), scene.facts.place, len(piece))
+    del piece
+    _write(task, scene)
+    write_record(task.beside(RECORD), task.source, digest, edits, _made(task, after.count))
+    outputs = [task.output.path, task.beside(RECORD)]
+    facts = scene.facts
+    if task.pictures:
+        report.progress(total - 1, total, "drawing", "steps")
+        views = _views(task, before, after)
+        try:
+            right = picture(scene, views.after, after.points, f"after: {after.count:,} Gaussians")
+            del scene  # the next is as large
+            _write_picture(task, views, before, right)
+            outputs.append(task.beside(PICTURE))
+        except SplatpipeError as error:
+            report.warning(f"There are no pictures: {error.message}", error.hint)
+    report.progress(total, total, "done", "steps")
+    placed = None if facts.place is None else [facts.place.latitude, facts.place.longitude, facts.place.height_m]
+    told = {"steps": edits, "gaussians": after.count, "place": placed, "metres": facts.metres}
+    return {**told, "outputs": [str(path) for path in outputs]}
+
+
+def _take_steps(task: Task, piece: Workpiece, total: int, report: Reporter) -> list[Edit]:
+    edits: list[Edit] = []
+    for number, step in enumerate(task.steps, start=1):
+        count, told = len(piece), len(piece.notes)
+        edits.append({**step.apply(piece), "gaussians": [count, len(piece)]})
+        report.progress(number, total, str(edits[-1]["step"]), "steps")
+        for note in piece.notes[told:]:
+            report.warning(note)
+    return edits
+
+
+def _made(task: Task, count: int) -> dict[str, Any]:
+    made = {"name": task.output.path.name, "format": task.output.kind.name, "gaussians": count}
+    return {**made, "sha256": file_digest(task.output.path)} if task.output.path.is_file() else made
+
+
+def require_free(task: Task) -> None:
+    """Refuse to do nothing, and to write over what is edited, what is merged, or anything of a run.
+
+    Raises:
+        UsageError: if there is no step, or the output is any of these, or a folder with something in it.
+    """
+    if not task.steps:
+        raise UsageError("There is nothing to do.", hint="Name a step, such as --crop-polygon FILE; see --help.")
+    out = task.output.path.resolve()
+    read = [task.source.path, *(open_source(step.path).path for step in task.steps if isinstance(step, Merge))]
+    if any(path.resolve() == out for path in read):
+        raise UsageError(f"{task.output.path} is read by this edit.", hint="Write to another file: IN stays as it is.")
+    if out.is_dir() and (any(out.iterdir()) or task.output.kind.ending):
+        raise UsageError(f"{task.output.path} is a folder.", hint="Name a new file, such as edited.ply.")
+    run = next((folder for folder in out.parents if is_run(folder)), None)
+    if run is None:
+        return
+    inside = out.relative_to(run)
+    own = inside.parts[0] == STAGES or any(part.startswith(".") for part in inside.parts) or inside == Path(SPLAT)
+    beside = [task.beside(RECORD), task.beside(PICTURE)]
+    if own or (any(path.exists() for path in [out, *beside]) and not task.beside(RECORD).is_file()):
+        raise UsageError(
+            f"{task.output.path} belongs to the run in {run}, which stays as it is.",
+            hint="Name a new file, such as edited.ply.",
+        )
+
+
+def _require_finite(scene: Scene) -> None:
+    bad = len(scene.gaussians) - int(scene.gaussians.finite().sum())
+    if bad:
+        raise SplatpipeError(
+            f"{bad} Gaussians have left the numbers that a file can hold.", hint="Scale or move it by less."
+        )
+
+
+def _write(task: Task, scene: Scene) -> None:
+    """Let the output take its place at once, or not at all."""
+    path = task.output.path
+    aside = path.with_name(f".{os.getpid()}.new.{path.name}")
+    try:
+        write_scene(aside, scene, task.output.kind)
+        if aside.is_dir():
+            sync_tree(aside)
+            if path.is_dir():
+                path.rmdir()  # an empty one, or this fails
+        else:
+            with aside.open("rb") as file:
+                os.fsync(file.fileno())
+        aside.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise MachineError(f"Cannot write {path}: {error.strerror}.", hint="Check the free space.") from error
+    finally:
+        if aside.is_dir():
+            shutil.rmtree(aside, ignore_errors=True)
+        else:
+            aside.unlink(missing_ok=True)
+
+
+def _views(task: Task, before: _Look, after: _Look) -> Views:
+    """Both in the frame of what it has become."""
+    to_after = _between(before.place, after.place)
+    poses = ((camera, to_after.camera_pose(camera.cam_from_world)) for camera in task.source.cameras())
+    cameras = [replace(camera, cam_from_world=pose) for camera, pose in poses]
+    views = choose_views(cameras, to_after.apply(before.points), after.points)
+    back = to_after.inverse().camera_pose(views.before.cam_from_world)
+    return replace(views, before=replace(views.before, cam_from_world=back))
+
+
+def _write_picture(task: Task, views: Views, before: _Look, right: Pixels) -> None:
+    """Read what it was once more, and draw it beside what it has become."""
+    left = picture(task.source.read(), views.before, before.points, f"before: {before.count:,} Gaussians")
+    try:
+        write_side_by_side(task.beside(PICTURE), left, right)
+    except OSError as error:
+        raise MachineError(f"Cannot write the picture: {error.strerror}.", hint="Check the free space.") from error
+
+
+def _between(before: Place | None, after: Place | None) -> Similarity:
+    if before is None or after is None:
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+    return between(origin_of(before), origin_of(after))
