@@ -72,6 +72,7 @@ GOOD = json.loads(FACTS.record())
         json.dumps(GOOD | {"format": 2}),
         json.dumps(GOOD | {"edits": [1]}),
         json.dumps(GOOD | {"edits": [{}] * 201}),
+        json.dumps(GOOD | {"edits": [{"height_m": 1}]}).replace("1}]", "1e400}]"),
         json.dumps(GOOD | {"place": {**GOOD["place"], "latitude": 91.0}}),
         json.dumps(GOOD | {"place": {**GOOD["place"], "height_m": float("nan")}}),
         json.dumps(GOOD | {"place": [1, 2]}),

@@ -102,7 +102,9 @@ def _facts(value: Mapping[str, Any]) -> SceneFacts:
     if not isinstance(edits, list) or len(edits) > MOST_EDITS or not all(isinstance(edit, dict) for edit in edits):
         raise ValueError("edits")
     place = None if value["place"] is None else _place(value["place"])
-    return SceneFacts(value["axes"], value["antialias"] is True, value["metres"] is True, place, tuple(edits))
+    facts = SceneFacts(value["axes"], value["antialias"] is True, value["metres"] is True, place, tuple(edits))
+    facts.record()  # fails where it could not be written again: JSON reads 1e400 as infinity
+    return facts
 
 
 def _place(value: Mapping[str, Any]) -> Place:
