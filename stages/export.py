@@ -40,6 +40,7 @@ from splatpipe.pipeline.survey.handover import (
 from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
 from splatpipe.pipeline.web.options import ExportConfig, format_names
+from splatpipe.pipeline.web.viewer import ViewerScene
 from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
 
 Facts = dict[str, Any]
@@ -89,35 +90,36 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     figures |= {} if within is None else {"gaussians_inside": within}
     write_json(out / "metrics.json", figures)
     report.progress(3, 4, "writing the viewer", "files")
-    write_viewer_of(inputs, gaussians, out / "viewer", config)
-    report.progress(4, 4, "writing the viewer", "files")
+    (out / "viewer").mkdir()
     (out / "formats").mkdir()
-    run = RunSplat(Scene(gaussians, facts), frame, dataset, cameras, points, held_out_names(inputs), placed)
-    sizes = write_deliverables(format_names(config.formats), run, out / "formats", report)
+    sizes: dict[str, int] = {}
+    if config.viewer_megabytes > 0.0 or config.formats:
+        shown = viewer_of(inputs, gaussians, config.title)
+        if config.viewer_megabytes > 0.0:
+            write_viewer(out / "viewer", shown, gaussians, config.viewer_megabytes * 1e6)
+        run = RunSplat(Scene(gaussians, facts), frame, dataset, cameras, points, held_out_names(inputs), placed, shown)
+        sizes = write_deliverables(format_names(config.formats), run, out / "formats", report)
+    report.progress(4, 4, "writing the viewer", "files")
     summary: dict[str, Any] = {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
     summary |= {"formats": sizes} if sizes else {}
     return summary if sky is None else summary | {"sky_gaussians": len(dome)}
 
 
-def write_viewer_of(inputs: Inputs, gaussians: Gaussians, folder: Path, config: ExportConfig) -> None:
-    """Write `viewer.html`, and `splat.spz` beside it where it is large.
+def viewer_of(inputs: Inputs, gaussians: Gaussians, title: str) -> ViewerScene:
+    """What the pages show of the run besides its splat.
 
     Args:
         inputs: The stage's.
         gaussians: In the world frame.
-        folder: Made here; empty where no viewer is wanted or nothing can be shown.
-        config: The stage's.
+        title: The pages'.
     """
-    folder.mkdir()
-    if config.viewer_megabytes == 0.0:
-        return
     options, _ = as_trained(inputs["train.rendering"], gaussians)
     look = look_of(options, read_panorama(inputs["train.sky"]))
     frame = load_frame(inputs["georef.frame"])
-    scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out_names(inputs), len(gaussians), config.title)
+    scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out_names(inputs), len(gaussians), title)
     if (area := read_world_area(inputs.parts.get("georef.boundary"))) is not None:
         scene = replace(scene, focus=area.contains(scene.points))
-    write_viewer(folder, scene, gaussians, config.viewer_megabytes * 1e6)
+    return scene
 
 
 def held_out_names(inputs: Inputs) -> frozenset[str]:

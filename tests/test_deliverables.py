@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.scene import Scene
 from splatpipe.pipeline.survey.frames import Frame, Origin
@@ -21,6 +22,7 @@ from splatpipe.pipeline.survey.handover import facts_of, in_world, pose_in_world
 from splatpipe.pipeline.survey.world import open_world
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
 from splatpipe.pipeline.web.options import ExportConfig, format_names
+from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -40,13 +42,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunSplat:
     dataset = tiny_scene.write_dataset(tmp_path_factory.mktemp("run") / "dataset")
     cameras = [view.camera for view in load_views(dataset)]
     scene = Scene(in_world(tiny_scene.true_model(), FRAME), facts_of(FRAME, antialias=False))
-    return RunSplat(scene, FRAME, dataset, cameras, load_points(dataset), frozenset({cameras[0].name}), {"format": 1})
+    shown = viewer_scene(dataset, FRAME, look_of(RenderOptions(sh_degree=3), None))
+    return RunSplat(
+        scene, FRAME, dataset, cameras, load_points(dataset), frozenset({cameras[0].name}), {"format": 1}, shown
+    )
 
 
 @pytest.fixture(scope="module")
 def delivered(run: RunSplat, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("delivered")
-    sizes = write_deliverables(("model", "laz", "colmap", "transforms"), run, out, tiny_scene.Recorder())
+    sizes = write_deliverables(
+        ("tiles", "web", "model", "laz", "colmap", "transforms"), run, out, tiny_scene.Recorder()
+    )
     assert all(size > 0 for size in sizes.values())
     return out / "export"
 
@@ -111,6 +118,15 @@ def test_clouds_lie_in_the_crs_of_the_run(run: RunSplat, delivered: Path) -> Non
     assert np.abs(sparse.xyz - expected).max() < 6e-4
     expected = world.crs_from_local(run.scene.gaussians.means.double().numpy())
     assert np.abs(centres.xyz - expected).max() < 6e-4
+
+
+def test_tiles_stand_on_the_globe_and_the_site_is_whole(delivered: Path) -> None:
+    tileset = json.loads((delivered / "tiles/tileset.json").read_text())
+    matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix, FRAME.origin.ecef_from_enu(), atol=1e-6)
+    assert tileset["extensions"]["ESRI_crs"]["wkid"] == 32634
+    assert (delivered / "tiles" / tileset["root"]["content"]["uri"]).is_file()
+    assert (delivered.parent / "web/index.html").is_file() and (delivered.parent / "web/levels.json").is_file()
 
 
 def test_what_a_run_without_scale_cannot_have_is_left_out_and_told(run: RunSplat, tmp_path: Path) -> None:

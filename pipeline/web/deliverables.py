@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,18 @@ from splatpipe.pipeline.photos.dataset import Points
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import write_scene
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.levels import LevelNode, build_levels
 from splatpipe.pipeline.splat.scene import Scene
 from splatpipe.pipeline.splat.sh import C0
 from splatpipe.pipeline.surface.map_crs import open_map
 from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
 from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.globe import write_tiles_on_globe
 from splatpipe.pipeline.survey.handover import cameras_json
 from splatpipe.pipeline.survey.trainer_dataset import write_colmap, write_points_ply, write_transforms
-from splatpipe.pipeline.web.options import EXPORT
+from splatpipe.pipeline.web.options import EXPORT, WEB
+from splatpipe.pipeline.web.site import write_site
+from splatpipe.pipeline.web.viewer import ViewerScene
 
 DATASET, CENTRES, SPARSE = "dataset", "centres.laz", "sparse.laz"
 MOST_CONFIDENCE = 255  # photos that a byte can count
@@ -41,6 +46,7 @@ class RunSplat:
         points: Its sparse points, the same.
         held_out: Names of the photos that were not trained on.
         georeference: What `georef.json` says.
+        viewer: What pages show besides the splat.
     """
 
     scene: Scene
@@ -50,10 +56,16 @@ class RunSplat:
     points: Points
     held_out: frozenset[str]
     georeference: Mapping[str, object]
+    viewer: ViewerScene
+
+    @cached_property
+    def levels(self) -> LevelNode:
+        """The splat's levels of detail, made once for all that are streamed."""
+        return build_levels(self.scene.gaussians)
 
 
 def write_deliverables(names: Sequence[str], run: RunSplat, out: Path, report: Reporter) -> dict[str, int]:
-    """Write each into `export/` below a folder.
+    """Write each into `export/` below a folder, the web's into `web/`.
 
     Args:
         names: Of formats, each once.
@@ -73,7 +85,12 @@ def write_deliverables(names: Sequence[str], run: RunSplat, out: Path, report: R
         folder.mkdir(parents=True, exist_ok=True)
         before = _bytes_below(out)
         try:
-            _write(name, run, folder)
+            if name == "web":
+                write_site(out / WEB, run.viewer, run.scene, run.levels)
+            elif name == "tiles":
+                _write_tiles(run, folder / "tiles", report)
+            else:
+                _write(name, run, folder)
         except SplatpipeError as error:
             if error.exit_code != SplatpipeError.exit_code:
                 raise
@@ -81,6 +98,12 @@ def write_deliverables(names: Sequence[str], run: RunSplat, out: Path, report: R
             continue
         sizes[name] = _bytes_below(out) - before
     return sizes
+
+
+def _write_tiles(run: RunSplat, folder: Path, report: Reporter) -> None:
+    placement = write_tiles_on_globe(folder, run.scene, run.levels)
+    if placement.approximate:
+        report.note(f"3D Tiles: {placement.note}")
 
 
 def _write(name: str, run: RunSplat, folder: Path) -> None:

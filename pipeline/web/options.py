@@ -10,9 +10,9 @@ from splatpipe.pipeline.engine.ranges import NonNegativeFloat
 from splatpipe.pipeline.engine.stage import StageConfig
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 
-EXPORT = "export"
-"""Folder of the formats below OUT."""
-FORMATS = (*(each.name for each in SPLAT_FORMATS if each.name != "ply"), "laz", "colmap", "transforms")
+EXPORT, WEB = "export", "web"
+"""Folders of the formats below OUT."""
+FORMATS = (*(each.name for each in SPLAT_FORMATS if each.name != "ply"), "tiles", "web", "laz", "colmap", "transforms")
 """All that `export.formats` can name: a splat's, and those that take a run; `splat.ply` is always there."""
 
 
@@ -35,7 +35,7 @@ def _checked(text: str) -> str:
 
 class ExportConfig(StageConfig):
     formats: Annotated[str, AfterValidator(_checked)] = ""
-    """Further formats, separated by commas, into `export/`: docs/formats.md lists them. `splat.ply` is always made."""
+    """Further formats, separated by commas, into `export/` and `web/`; docs/formats.md lists them."""
     sky: bool = False
     """Hand over the sky of `train.sky`, too: `sky.ply`, a dome of Gaussians around the splat, in its frame."""
     title: Annotated[str, Field(max_length=200)] = "3D model"
