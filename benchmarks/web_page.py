@@ -144,7 +144,7 @@ class Visit:
         name = address.rpartition("/")[2]
         began = time.perf_counter()
         page.goto(address, wait_until="commit")
-        page.wait_for_function("() => window.splatpipe")
+        page.wait_for_function("() => window.splatpipe?.facts")
         print(f"\n{name} at {self._size}: script after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
         page.evaluate("() => splatpipe.ready")
         print(f"  first whole picture after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")

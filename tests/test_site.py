@@ -208,7 +208,7 @@ def test_a_file_that_is_lost_is_told_once_and_leaves_no_hole(site: Path, open_pa
         host.missing = {leaf["file"]}
         watched = open_page(f"{host.address}/index.html", WIDTH, HEIGHT)
         page = watched.page
-        page.evaluate("() => splatpipe.complete()")
+        page.evaluate("() => splatpipe.ready.then(() => splatpipe.complete())")
         shown = page.evaluate("() => splatpipe.shown()")
         assert leaf["file"] not in shown["files"]
         assert len(shown["files"]) > 3  # the others came

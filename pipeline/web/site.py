@@ -7,6 +7,7 @@ for this one's.
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -26,6 +27,7 @@ from splatpipe.pipeline.web.viewer import PageParts, ViewerCamera, ViewerScene, 
 
 INDEX = "index.html"
 LEVELS = "levels.json"
+PACKED = "viewer.js.gz"
 FORMAT = 1
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src blob:; style-src 'self';"
@@ -68,18 +70,21 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
         "address": _write(folder, "points.bin", points.astype("<f4").tobytes() + colours.tobytes()),
         "count": len(points),
     }
-    facts["levels"] = _write(folder, LEVELS, _json({"format": FORMAT, "nodes": tree}))
-    page = page_of(scene, facts, _page_parts(folder, facts["levels"], tree[0]["file"]))
+    levels = _write(folder, LEVELS, _json({"format": FORMAT, "nodes": tree}))
+    facts["levels"] = {"tree": levels, "root": tree[0]["file"], "bytes": tree[0]["bytes"]}
+    page = page_of(scene, facts, _page_parts(folder, levels, tree[0]["file"]))
     (folder / INDEX).write_text(page, encoding="utf-8")
 
 
 def _page_parts(folder: Path, levels: str, first: str) -> PageParts:
-    """The page's head asks for all that the first picture takes; no script has to run before."""
-    script, style = (_write(folder, name, asset(name).encode()) for name in ("viewer.js", "viewer.css"))
+    """The page's head asks for what the first picture takes: `start.js` goes on from there."""
+    viewer = asset("viewer.js").encode()
+    script, packed = _write(folder, "viewer.js", viewer), _write(folder, PACKED, gzip.compress(viewer, 9, mtime=0))
+    style, start = (_write(folder, name, asset(name).encode()) for name in ("viewer.css", "start.js"))
     head = (
         f'<link rel="stylesheet" href="{style}">',
-        f'<script src="{script}" defer></script>',
-        *(f'<link rel="preload" href="{address}" as="fetch" crossorigin>' for address in (levels, first)),
+        f'<script src="{start}" defer data-script="{script}" data-packed="{packed}" data-first="{first}"></script>',
+        *(f'<link rel="preload" href="{address}" as="fetch" crossorigin>' for address in (packed, levels)),
     )
     return PageParts(POLICY, "\n".join(head), "")
 

@@ -2,7 +2,8 @@
 // viewer.py and site.py write the pages; the parts are in viewer/.
 //
 // For scripts and tests there is `window.splatpipe`:
-//   ready                 a promise: the first complete frame is on the screen (rejected where loading failed)
+//   ready                 a promise: the first whole picture is on the screen (rejected where loading failed); on a site
+//                         all else is there only then
 //   complete()            a promise: a complete frame of the present view, as fine as it gets, is on the screen
 //   cameraState()         {position, yaw, pitch, roll, fx, fy, cx, cy, width, height, photo}: world units, radians, CSS px
 //   setCamera({position, target} or {position, yaw, pitch, roll})   look from there, at once
@@ -20,7 +21,7 @@ import { Box3, Vector3 } from "three";
 import { fillStrip, Frusta, frustumDepth } from "./viewer/cameras.js";
 import { told, toCrs } from "./viewer/crs.js";
 import { LoadError } from "./viewer/error.js";
-import { fetchBytes } from "./viewer/files.js";
+import { fetchPatiently } from "./viewer/files.js";
 import { readLevels } from "./viewer/levels.js";
 import { Measuring } from "./viewer/measure.js";
 import { acceptFile, loaded, note, progress, tell } from "./viewer/messages.js";
@@ -56,12 +57,13 @@ class Viewer {
 
   async start() {
     const { facts, view } = this;
+    const levels = facts.levels && this.fetchLevels(facts.levels);
+    levels?.catch(() => null); // told where it is waited for
     this.stage = new Stage($("canvas"), facts);
-    const moved = () => this.stage.invalidate(true);
     view.changed = () => {
       this.photo = null;
       this.strip?.choose(null);
-      moved();
+      this.stage.invalidate(true);
     };
     this.frusta = new Frusta(this.photos, frustumDepth(this.photos), () => this.stage.invalidate());
     this.measuring = new Measuring($("labels"), $("lines"), facts, () => this.stage.invalidate());
@@ -80,7 +82,7 @@ class Viewer {
       await this.addSmallParts();
       return this.show(await readSplat(facts, progress));
     }
-    await this.stream();
+    await this.stream(...(await levels));
     this.addSmallParts(); // files of their own: nobody waits for them
   }
 
@@ -111,13 +113,16 @@ class Viewer {
     loaded();
   }
 
+  /** The tree and its root, asked for before WebGL holds up the page. */
+  fetchLevels({ tree, root, bytes }) {
+    return Promise.all([readLevels(tree), fetchPatiently(root, async (file) => file, { progress, total: bytes })]);
+  }
+
   /** Show a splat in levels of detail: all of it, coarse, then finer where one looks. */
-  async stream() {
-    const nodes = await readLevels(this.facts.levels);
-    const bytes = await fetchBytes(nodes[0].file, { total: nodes[0].bytes, progress });
+  async stream(nodes, bytes) {
     const stream = new LevelStream(nodes, this.stage, (error) => note(`Some of the model stays coarse: ${error.message} Reload to try again.`));
     await stream.begin(bytes);
-    await this.stage.complete();
+    await this.stage.glimpse();
     this.levels = stream;
     this.stage.invalidate();
     loaded();

@@ -35,6 +35,25 @@ export async function fetchBytes(address, { total = 0, progress = () => {}, sign
   return new Uint8Array(await new Blob(parts).arrayBuffer());
 }
 
+/**
+ * What is made of a file's bytes, tried a few times.
+ * @template T
+ * @param {string} address
+ * @param {(bytes: Uint8Array) => Promise<T>} use Rejects where the file is damaged.
+ * @param {object} how As `fetchBytes`.
+ * @returns {Promise<T>}
+ */
+export async function fetchPatiently(address, use, how = {}) {
+  for (let attempt = 1; ; attempt++) {
+    try {
+      return await use(await fetchBytes(address, { ...how, cache: attempt > 1 ? "reload" : "default" }));
+    } catch (error) {
+      if (attempt === ATTEMPTS || how.signal?.aborted) throw error;
+      await new Promise((resolve) => setTimeout(resolve, WAIT_MS * 4 ** (attempt - 1)));
+    }
+  }
+}
+
 export class FileQueue {
   /**
    * @param {number} atOnce How many requests.
@@ -70,17 +89,10 @@ export class FileQueue {
 
   async run(address, signal) {
     let trouble = null;
-    for (let attempt = 0; attempt < ATTEMPTS; attempt++) {
-      if (attempt) await new Promise((resolve) => setTimeout(resolve, WAIT_MS * 4 ** (attempt - 1)));
-      if (signal.aborted) return;
-      try {
-        const bytes = await fetchBytes(address, { signal, cache: attempt ? "reload" : "default" });
-        await this.use(address, bytes, signal);
-        trouble = null;
-        break;
-      } catch (error) {
-        trouble = error;
-      }
+    try {
+      await fetchPatiently(address, (bytes) => this.use(address, bytes, signal), { signal });
+    } catch (error) {
+      trouble = error;
     }
     if (signal.aborted) return;
     this.running.delete(address);

@@ -1,7 +1,7 @@
 // A site's levels of detail: which nodes of the tree a view wants. site.py writes the tree, levels.json.
 
 import { Vector3 } from "three";
-import { fetchBytes } from "./files.js";
+import { fetchPatiently } from "./files.js";
 import { LoadError } from "./error.js";
 
 const KEPT_FROM = 0.5; // of the pixels at which a node is refined: a refined one stays so down to here
@@ -19,7 +19,7 @@ export async function readLevels(address) {
         '"python3 -m http.server" in this folder.',
     );
   }
-  const text = new TextDecoder().decode(await fetchBytes(address));
+  const text = await fetchPatiently(address, async (bytes) => new TextDecoder().decode(bytes));
   try {
     const { nodes } = JSON.parse(text);
     for (const node of nodes) {

@@ -14,6 +14,7 @@ const SLOW_MS = 120; // a frame that takes longer is drawn as a draft while the 
 const DRAFT_MS = 150; // what a draft is to take, about
 const DRAFT_SPLATS = 150_000; // a software renderer takes 1 µs for each, however small
 const LEAST_RESOLUTION = 0.3; // of a draft
+const GLIMPSE_RESOLUTION = 0.5; // of a first picture: a quarter of the pixels, which take most of the time without a GPU
 const MOST_PIXEL_RATIO = 2;
 
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -52,12 +53,14 @@ export class Stage {
     this.failed = () => {};
     this.splats = new Group();
     this.scene.add(this.splats);
+    this.begun = false; // there is nothing to draw before the first splats
     this.wanted = 0;
     this.movedAt = -Infinity;
     this.fullMs = 0;
     this.splatsShown = true;
     this.waiting = [];
     this.whole = false;
+    this.glimpsed = null;
     this.resize();
   }
 
@@ -69,6 +72,7 @@ export class Stage {
     const meshes = new Set(parts.map((part) => part.mesh));
     this.splats.remove(...this.splats.children.filter((mesh) => !meshes.has(mesh)));
     this.splats.add(...meshes);
+    this.begun = true;
     this.invalidate();
   }
 
@@ -97,8 +101,13 @@ export class Stage {
     return this.whole ? Promise.resolve() : new Promise((resolve) => this.waiting.push(resolve));
   }
 
+  /** Resolves when what is shown is on the screen, coarser than it will be: the next frame is in full. */
+  glimpse() {
+    return new Promise((resolve) => (this.glimpsed = resolve));
+  }
+
   schedule() {
-    if (this.scheduled || this.drawing) return;
+    if (this.scheduled || this.drawing || !this.begun) return;
     this.scheduled = true;
     const begin = () => {
       this.scheduled = false;
@@ -110,7 +119,7 @@ export class Stage {
 
   async draw() {
     this.drawing = true;
-    const wanted = this.wanted;
+    const { wanted, glimpsed } = this;
     const resting = performance.now() - this.movedAt > REST_MS;
     const slow = this.fullMs > SLOW_MS;
     this.beforeDraw();
@@ -120,9 +129,10 @@ export class Stage {
       if (resting || slow) await this.sortNow();
       else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate(), this.failed);
     }
-    this.setQuality(!resting && slow);
+    this.setQuality(!resting && slow, glimpsed ? GLIMPSE_RESOLUTION : 1);
     this.renderer.render(this.scene, this.camera);
     await this.fence();
+    if (glimpsed) return this.endGlimpse();
     if (resting) this.fullMs = performance.now() - began;
     this.drawing = false;
     if (wanted !== this.wanted) this.schedule();
@@ -142,10 +152,17 @@ export class Stage {
     return Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO);
   }
 
-  setQuality(draft) {
+  endGlimpse() {
+    this.glimpsed();
+    this.glimpsed = null;
+    this.drawing = false;
+    this.schedule();
+  }
+
+  setQuality(draft, most) {
     this.setStride(draft ? Math.max(1, Math.ceil(this.spark.activeSplats / DRAFT_SPLATS)) : 1);
     const share = draft ? Math.max(LEAST_RESOLUTION, Math.sqrt(DRAFT_MS / this.fullMs)) : 1;
-    const ratio = this.fullRatio * Math.min(1, share);
+    const ratio = this.fullRatio * Math.min(most, share);
     const { width, height } = this;
     const drawn = this.drawn;
     if (drawn && drawn.ratio === ratio && drawn.width === width && drawn.height === height) return;
