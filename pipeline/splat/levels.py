@@ -101,10 +101,10 @@ def box_distance(box: Float64[np.ndarray, "2 3"], point: Float64[np.ndarray, " 3
 
 @dataclass(frozen=True, eq=False)
 class _Branch:
-    """A node, and the spreads of its Gaussians."""
+    """A node, and what its Gaussians stand for."""
 
     node: LevelNode
-    spreads: Float64[np.ndarray, " n"]
+    held: Reduction
 
 
 def _branch(
@@ -113,7 +113,7 @@ def _branch(
     """The tree of a part: as low as nodes of this size allow, its leaves alike in number."""
     if len(part) <= most:
         own = gaussians.select(torch.from_numpy(np.sort(part)))
-        return _Branch(LevelNode(_box(own), 0.0, own, ()), np.zeros(len(own)))
+        return _Branch(LevelNode(_box(own), 0.0, own, ()), Reduction.none_yet(own))
     height = 0
     while most * CHILDREN**height < len(part):
         height += 1
@@ -124,15 +124,11 @@ def _branch(
 def _joined(branches: Sequence[_Branch], most: int) -> _Branch:
     """The node over some: what they hold, merged until it fits."""
     children = tuple(branch.node for branch in branches)
-    joined = Reduction(
-        Gaussians.concat([child.gaussians for child in children]),
-        np.concatenate([branch.spreads for branch in branches]),
-    )
-    reduced = reduce_further(joined, most)
+    reduced = reduce_further(Reduction.joined([branch.held for branch in branches]), most)
     boxes = np.stack([child.box for child in children])
     box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
     error = max(_ERROR_STEP * max(child.error for child in children), ERROR_PER_SPREAD * _spread(reduced))
-    return _Branch(LevelNode(box, error, reduced.gaussians, children), reduced.spreads)
+    return _Branch(LevelNode(box, error, reduced.gaussians, children), reduced)
 
 
 def _spread(reduced: Reduction) -> float:

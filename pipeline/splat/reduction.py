@@ -1,9 +1,9 @@
-"""Fewer Gaussians that look the same: neighbours are merged, the least visible merge first."""
+"""Fewer Gaussians that look the same: neighbours are merged, those most alike first."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,14 +20,15 @@ from splatpipe.pipeline.splat.morton import morton_keys
 
 NEIGHBOURS = 8
 """Of each Gaussian that it may merge with."""
-ROUND_SHARE = 0.2
-"""Of the Gaussians, at most so many merge in a round: the less, the nearer to always taking the very cheapest."""
+ROUND_SHARE = 0.3
+"""Of the Gaussians, at most so many vanish in a round: the less, the nearer to always taking the very cheapest."""
 PIECE = 200_000
 """Gaussians looked at together: bounds the memory."""
 _ROWS_AT_ONCE = 1 << 15
 _CROWD = 1e-9  # of the extent: keeps points at one place apart in the tree, which is slow of many of them else
 _CROWD_SEED = 1
-_EDGE_ON = 1e-6  # standard deviation of what is flat, as a share of the extent
+_FLAT = 1e-3  # standard deviation of what is flat, as a share of the median of the largest ones
+_LOG_SCALE_LEAST = -30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +39,26 @@ class Reduction:
         gaussians: Those left, in the order of the first of what each stands for.
         spreads: How far what each stands for lies from its centre, root mean square by mass, world units; 0 for one
             that stands for itself.
+        counts: How many each stands for.
     """
 
     gaussians: Gaussians
     spreads: Float64[np.ndarray, " n"]
+    counts: Int64[np.ndarray, " n"]
+
+    @classmethod
+    def none_yet(cls, gaussians: Gaussians) -> Reduction:
+        """All of them, each for itself."""
+        return cls(gaussians, np.zeros(len(gaussians)), np.ones(len(gaussians), dtype=np.int64))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Reduction]) -> Reduction:
+        """One after another; all of one SH degree, at least one."""
+        return cls(
+            Gaussians.concat([part.gaussians for part in parts]),
+            np.concatenate([part.spreads for part in parts]),
+            np.concatenate([part.counts for part in parts]),
+        )
 
 
 def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
@@ -57,7 +74,7 @@ def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
     Raises:
         ValueError: if the count is less than 1.
     """
-    return reduce_further(Reduction(gaussians, np.zeros(len(gaussians))), count).gaussians
+    return reduce_further(Reduction.none_yet(gaussians), count).gaussians
 
 
 def reduce_further(start: Reduction, count: int) -> Reduction:
@@ -74,19 +91,27 @@ def reduce_further(start: Reduction, count: int) -> Reduction:
         raise ValueError(f"{count} Gaussians are no splat")
     if len(start.gaussians) <= count:
         return start
-    given = start.gaussians.detach()
-    work, spreads = given.clone(), start.spreads.copy()
-    alive = np.flatnonzero(_drawn(work))
+    work = Reduction(start.gaussians.detach().clone(), start.spreads.copy(), start.counts.copy())
+    alive = np.flatnonzero(_drawn(work.gaussians))
+    least_variance = _least_variance(work.gaussians, alive)
     turn = 0
     while len(alive) > count:
         quota = min(len(alive) - count, max(1, math.ceil(ROUND_SHARE * len(alive))))
-        pairs = _cheapest_pairs(work, alive, quota, turn)
-        _merge_into_first(work, spreads, pairs)
-        gone = np.zeros(len(work), dtype=bool)
+        pairs = _cheapest_pairs(work, alive, quota, turn, least_variance)
+        _merge_into_first(work, pairs)
+        gone = np.zeros(len(work.counts), dtype=bool)
         gone[pairs[:, 1]] = True
         alive = alive[~gone[alive]]
         turn += 1
-    return Reduction(work.select(torch.from_numpy(alive)), spreads[alive])
+    return Reduction(work.gaussians.select(torch.from_numpy(alive)), work.spreads[alive], work.counts[alive])
+
+
+def _least_variance(gaussians: Gaussians, alive: Int64[np.ndarray, " n"]) -> float:
+    """Of what is flat, beside the median size of all; world units squared."""
+    if not len(alive):
+        return 1.0
+    largest = gaussians.log_scales[torch.from_numpy(alive)].amax(1).to(torch.float64)
+    return math.exp(2.0 * max(float(largest.median()), _LOG_SCALE_LEAST)) * _FLAT**2
 
 
 def _drawn(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
@@ -105,11 +130,14 @@ def _drawn(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     return np.asarray(fine.numpy())
 
 
-def _cheapest_pairs(work: Gaussians, alive: Int64[np.ndarray, " n"], quota: int, turn: int) -> Int64[np.ndarray, "m 2"]:
+def _cheapest_pairs(
+    work: Reduction, alive: Int64[np.ndarray, " n"], quota: int, turn: int, least_variance: float
+) -> Int64[np.ndarray, "m 2"]:
     """Pairs without conflict, the cheapest of all pieces; at least one."""
     found, costs = [], []
-    for piece in _pieces(work, alive, turn):
-        pairs, paid = _piece_pairs(work.select(torch.from_numpy(piece)))
+    for piece in _pieces(work.gaussians, alive, turn):
+        part = work.gaussians.select(torch.from_numpy(piece))
+        pairs, paid = _piece_pairs(part, work.counts[piece], least_variance)
         found.append(piece[pairs])
         costs.append(paid)
     order = np.argsort(np.concatenate(costs), kind="stable")[:quota]
@@ -129,13 +157,14 @@ def _pieces(work: Gaussians, alive: Int64[np.ndarray, " n"], turn: int) -> Itera
     yield from np.array_split(sorted_alive, count)
 
 
-def _piece_pairs(piece: Gaussians) -> tuple[Int64[np.ndarray, "m 2"], Float64[np.ndarray, " m"]]:
-    """A matching of neighbours, and what each pair costs."""
+def _piece_pairs(
+    piece: Gaussians, counts: Int64[np.ndarray, " n"], least_variance: float
+) -> tuple[Int64[np.ndarray, "m 2"], Float64[np.ndarray, " m"]]:
+    """A matching of neighbours, and what each pair costs all that it stands for."""
     moments = moments_of(piece)
     edges = _neighbours(moments.means)
-    extent = float(np.ptp(moments.means, axis=0).max())
     colours = piece.sh.to(torch.float32).reshape(len(piece), -1).numpy()
-    costs = merge_costs(moments, colours, edges, (_EDGE_ON * extent) ** 2)
+    costs = merge_costs(moments, colours, edges, least_variance) * counts[edges].sum(1)
     chosen = match_cheapest(edges, costs, len(piece))
     return edges[chosen], costs[chosen]
 
@@ -157,16 +186,18 @@ def _neighbours(means: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "e 2"]:
     return np.stack(np.divmod(codes, count), axis=1)
 
 
-def _merge_into_first(work: Gaussians, spreads: Float64[np.ndarray, " n"], pairs: Int64[np.ndarray, "m 2"]) -> None:
+def _merge_into_first(work: Reduction, pairs: Int64[np.ndarray, "m 2"]) -> None:
     """Put each pair's merged Gaussian in its first one's place."""
+    gaussians, spreads = work.gaussians, work.spreads
     for start in range(0, len(pairs), _ROWS_AT_ONCE):
         i, j = pairs[start : start + _ROWS_AT_ONCE].T
         first, second = torch.from_numpy(i), torch.from_numpy(j)
-        one, other = work.select(first), work.select(second)
+        one, other = gaussians.select(first), gaussians.select(second)
         ours, theirs = moments_of(one), moments_of(other)
         share = shares(ours, theirs)
         apart = ((ours.means - theirs.means) ** 2).sum(1)
         within = share * spreads[i] ** 2 + (1.0 - share) * spreads[j] ** 2
         spreads[i] = np.sqrt(within + share * (1.0 - share) * apart)
+        work.counts[i] += work.counts[j]
         for name, tensor in merge_pairs(one, other).tensors().items():
-            work.tensors()[name][first] = tensor
+            gaussians.tensors()[name][first] = tensor
