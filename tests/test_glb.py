@@ -27,6 +27,7 @@ from some_splats import some_gaussians
 
 FACTS = SceneFacts("z up", True, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"), ({"step": "crop"},))
 SPLATTING = "KHR_gaussian_splatting"
+SPZ = "KHR_gaussian_splatting_compression_spz_2"
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MOST_FILE_BYTES = 2**32 - 1
@@ -288,6 +289,9 @@ HOSTILE = [
     (at("nodes", 1, "matrix"), [0.0] * 16, "stretches"),
     (at("extensionsRequired"), ["KHR_draco_mesh_compression"], "KHR_draco"),
     (at("extensionsRequired"), 5, "which is not read"),
+    (at("extensionsRequired"), [[1]], "which is not read"),
+    (at(*PRIMITIVE, "extensions", SPLATTING, "extensions"), {SPZ: {"bufferView": 9}}, "bufferViews"),
+    (at(*PRIMITIVE, "extensions", SPLATTING, "extensions"), {SPZ: {"bufferView": 0}}, "SPZ"),
     (at("scenes"), [], "scenes"),
     (at("scene"), "0", "scenes"),
 ]
@@ -297,6 +301,15 @@ HOSTILE = [
 def test_hostile_documents_are_refused(tmp_path: Path, put, value, message):
     with pytest.raises(SplatpipeError, match=message):
         read(tmp_path, foreign(lambda document: put(document, value)))
+
+
+def test_what_is_of_no_matter_may_be_anything(tmp_path: Path):
+    def anything(document: dict[str, Any]) -> None:
+        document["bufferViews"][0]["extensions"] = 5
+        document["meshes"][0]["primitives"] += [7, {"extensions": []}]
+        document["asset"] = None
+
+    assert len(read(tmp_path, foreign(anything)).gaussians) == 2
 
 
 def test_many_splats_of_the_same_few_bytes_are_refused(tmp_path: Path):

@@ -164,7 +164,8 @@ class Container:
                 f"{self.path} keeps its data in other files, which are not read.",
                 hint="Export it as one GLB file that holds everything.",
             )
-        if "EXT_meshopt_compression" in view.get("extensions", ()):
+        extensions = view.get("extensions")
+        if isinstance(extensions, dict) and "EXT_meshopt_compression" in extensions:
             raise SplatpipeError(f"{self.path} is packed by meshopt, which is not read.", hint="Export it without.")
         offset, length, stride = view.get("byteOffset", 0), view.get("byteLength"), view.get("byteStride")
         if not _is_whole(offset) or not _is_whole(length) or offset + length > self.length:

@@ -7,8 +7,10 @@ CesiumJS takes the SPZ file's axes for the glTF's: so do we.
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +18,12 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
+from splatpipe.pipeline.splat.formats.bounded import read_exactly
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import Accessor, Container
-from splatpipe.pipeline.splat.glb_nodes import Drawn, drawn_primitives
-from splatpipe.pipeline.splat.sh import MAX_DEGREE, rgb_to_dc
+from splatpipe.pipeline.splat.glb_nodes import drawn_primitives
+from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count, rgb_to_dc
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
@@ -33,7 +37,7 @@ KERNEL = {
 }
 """As 3D Gaussian splatting renders, on colours as displays take them."""
 ROWS_AT_ONCE = 1 << 16
-_KNOWN = frozenset((EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"))
+_KNOWN = (EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit")
 _LEAST_ROW_BYTES = 12
 """The colour's: a file of so many bytes draws no more Gaussians, unless it draws them again and again."""
 _INFINITY_LOGIT, _INFINITY_LOG_SCALE = 20.0, -20.0
@@ -61,18 +65,59 @@ def read_splats(container: Container) -> Gaussians:
         SplatpipeError: if there are none, the file is damaged, or it asks for what is not read.
     """
     required = container.document.get("extensionsRequired", [])
-    unknown = [name for name in required if name not in _KNOWN] if isinstance(required, list) else ["?"]
+    unknown = [name for name in required if name not in _KNOWN] if isinstance(required, list) else [required]
     if unknown:
         raise SplatpipeError(f"{container.path} needs {str(unknown[0])[:60]}, which is not read.", hint=_HINT)
     drawn = drawn_primitives(container, EXTENSION)
     if not drawn:
         raise SplatpipeError(f"{container.path} draws no splat.", hint=_HINT)
-    splats = [_splat(container, one) for one in drawn]
-    if _LEAST_ROW_BYTES * sum(splat.count for splat in splats) > container.length:
+    splats = [_splat(container, primitive) for primitive, _ in drawn]
+    if sum(splat.least_bytes for splat in splats) > container.length:
         container.refuse("it draws more Gaussians than it holds")
-    degree = max(splat.degree for splat in splats)
-    parts = [_placed(container, splat.read(container, degree), splat.matrix) for splat in splats]
-    return parts[0] if len(parts) == 1 else Gaussians.concat(parts)
+    matrices = [matrix for _, matrix in drawn]
+    parts = [_placed(container, one.read(container), at) for one, at in zip(splats, matrices, strict=True)]
+    degree = max(part.sh_degree for part in parts)
+    return parts[0] if len(parts) == 1 else Gaussians.concat([_of_degree(part, degree) for part in parts])
+
+
+def _of_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same with harmonics of zero up to a degree."""
+    sh = torch.zeros(len(gaussians), coefficient_count(degree), 3)
+    sh[:, : gaussians.sh.shape[1]] = gaussians.sh
+    return replace(gaussians, sh=sh)
+
+
+@dataclass(frozen=True)
+class _SpzSplat:
+    """A primitive whose Gaussians are an SPZ file inside the file.
+
+    Attributes:
+        start: Of that, from the file's beginning, bytes.
+        length: Of it.
+    """
+
+    start: int
+    length: int
+
+    @property
+    def least_bytes(self) -> int:
+        return self.length
+
+    def read(self, container: Container) -> Gaussians:
+        """Its Gaussians, by the reader of such files, which takes a file."""
+        reader = next((each for each in SPLAT_FORMATS if each.name == "spz" and each.reads), None)
+        if reader is None:
+            raise SplatpipeError(f"{container.path} holds an SPZ file, which is not read.", hint=_HINT)
+        container.file.seek(self.start)
+        data = read_exactly(container.path, container.file, self.length)
+        with tempfile.TemporaryDirectory(prefix="splatpipe-") as folder:
+            path = Path(folder) / "inside.spz"
+            path.write_bytes(data)
+            try:
+                return reader.read(path).turned("y up").gaussians
+            except SplatpipeError as error:
+                told = error.message.replace(str(path), f"The SPZ file in {container.path}")
+                raise SplatpipeError(told, hint=error.hint) from error
 
 
 @dataclass(frozen=True)
@@ -80,28 +125,23 @@ class _Splat:
     """A primitive whose attributes are known to lie inside the file.
 
     Attributes:
-        matrix: Scene from primitive.
         columns: Its attributes, by their short names; the harmonics' from degree 0 as they come.
         harmonics: From degree 0; empty where there are none, not even a constant.
     """
 
-    matrix: Float64[np.ndarray, "4 4"]
     columns: Mapping[str, Accessor]
     harmonics: tuple[Accessor, ...]
 
     @property
-    def count(self) -> int:
-        return self.columns["position"].count
+    def least_bytes(self) -> int:
+        return _LEAST_ROW_BYTES * self.columns["position"].count
 
-    @property
-    def degree(self) -> int:
-        return max(math.isqrt(len(self.harmonics)) - 1, 0)
-
-    def read(self, container: Container, degree: int) -> Gaussians:
-        """Its Gaussians, with harmonics of zero up to a degree, in its own frame."""
-        gaussians = Gaussians.empty(self.count, degree)
-        for start in range(0, self.count, ROWS_AT_ONCE):
-            self._fill(container, gaussians, start, min(ROWS_AT_ONCE, self.count - start))
+    def read(self, container: Container) -> Gaussians:
+        """Its Gaussians, in its own frame."""
+        count = self.columns["position"].count
+        gaussians = Gaussians.empty(count, max(math.isqrt(len(self.harmonics)) - 1, 0))
+        for start in range(0, count, ROWS_AT_ONCE):
+            self._fill(container, gaussians, start, min(ROWS_AT_ONCE, count - start))
         return gaussians
 
     def _fill(self, container: Container, gaussians: Gaussians, start: int, count: int) -> None:
@@ -128,13 +168,12 @@ class _Splat:
             gaussians.sh[part, term] = rows(accessor)
 
 
-def _splat(container: Container, drawn: Drawn) -> _Splat:
+def _splat(container: Container, primitive: Mapping[str, Any]) -> _Splat | _SpzSplat:
     """A primitive's attributes, found and checked.
 
     Raises:
         SplatpipeError: if one is missing, of another length, or outside of the file.
     """
-    primitive, matrix = drawn
     extension, names = primitive["extensions"][EXTENSION], primitive.get("attributes")
     if not isinstance(names, dict):
         container.refuse("a splat has no attributes")
@@ -142,6 +181,10 @@ def _splat(container: Container, drawn: Drawn) -> _Splat:
         if extension.get(key, taken) != taken:
             told = str(extension[key])[:40]
             raise SplatpipeError(f"{container.path}: splats of {key} {told} are not read, only {taken}.", hint=_HINT)
+    inside = extension.get("extensions")
+    packed = inside.get(SPZ_EXTENSION) if isinstance(inside, dict) else None
+    if isinstance(packed, dict):
+        return _SpzSplat(*container.view(packed.get("bufferView"))[:2])
     has_opacity = f"{EXTENSION}:OPACITY" in names
     opacity = (f"{EXTENSION}:OPACITY", ("SCALAR",)) if has_opacity else ("COLOR_0", ("VEC4",))
     wanted: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -160,7 +203,7 @@ def _splat(container: Container, drawn: Drawn) -> _Splat:
     harmonics = tuple(container.accessor(names[name], ("VEC3",)) for name in found)
     if len({accessor.count for accessor in (*columns.values(), *harmonics)}) != 1:
         container.refuse("a splat's attributes are of different lengths")
-    return _Splat(matrix, columns, harmonics)
+    return _Splat(columns, harmonics)
 
 
 def _harmonics(container: Container, names: Mapping[str, Any]) -> list[str]:
