@@ -1,0 +1,142 @@
+"""What of a splat is no part of the scene: floaters, haze, and what no photo vouches for.
+
+Where the photos are known, a Gaussian is suspected of floating if it lies before all that is around it in most of what
+is seen of it (``depth_islands``), and does not hang together with the scene (``isolation``). Where their pictures are
+known, too, they decide: what makes renders less like them goes, and nothing else. Without photos, what goes are the few
+that hang together apart from all others.
+
+All limits keep real things rather than find every floater: leaves, wires, and what only one photo shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from splatpipe.pipeline.edit.isolation import Shapes, Touch, far_groups, held
+from splatpipe.pipeline.edit.sightings import Photos, Sightings, look_through
+from splatpipe.pipeline.edit.worth import worth_in_photos
+from splatpipe.pipeline.splat.gaussians import Gaussians
+
+Flags = Bool[np.ndarray, " n"]
+Told = Callable[[int, int], None]
+
+TRANSPARENT = 0.01
+"""Opacity that nobody sees, two and a half steps of an 8-bit picture, and that no overlap of a few makes visible."""
+SOLID = 0.1  # opacity that things are made of: haze holds nothing
+SEEN_PIXELS = 1.0  # of all photos' pictures, that say anything of a Gaussian
+UNSEEN_PIXELS = 0.1
+FLOATING = 0.5  # share of what is seen of one that is before all around it
+SUSPECTED = Touch(sigmas=2.0, size_ratio=1.0, needed=3)
+"""What does not hang together like this is suspected, where pictures decide: most of it is real, and they keep it."""
+LOOSE = Touch(sigmas=2.0, size_ratio=4.0)
+"""What does not hang together even like this floats, where nothing else decides."""
+WORTH = (-0.015, -0.005, -0.003)
+"""Of a pixel's squared error (0..3), that it is smaller without a Gaussian, by mean weight. The worst go first: they
+make what is behind them look bad, and those left are judged anew."""
+FEW_PHOTOS = 2.0  # that see what hangs loosely: one photo makes up anything before its own picture
+OVERSIZED = 0.2  # times the distance to the nearest camera, that a floating Gaussian's standard deviation is large
+BORDER = 0.8  # share of what is seen of one at the borders of pictures: hardly covered
+FEW = 100  # that hang together and are no scene
+LOOKS = 1 + len(WORTH)  # passes over the photos, with pictures
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """What is to be removed.
+
+    Attributes:
+        keep: Which Gaussians stay.
+        removed: How many go, by reason; every reason that was looked at.
+    """
+
+    keep: Bool[Tensor, " n"]
+    removed: dict[str, int]
+
+
+def clean_scene(gaussians: Gaussians, photos: Photos | None = None, told: Told | None = None) -> Cleaned:
+    """Tell which Gaussians are floaters, haze, or beyond the photos.
+
+    Args:
+        gaussians: Finite; where they are to be rendered if there are photos, else on the CPU.
+        photos: That it was trained on, and no others; None where nobody knows them.
+        told: Called with steps done, of how many.
+
+    Raises:
+        ValueError: if a Gaussian is not finite.
+    """
+    if not bool(gaussians.finite().all()):
+        raise ValueError("Gaussians that are not finite are to be left out before")
+    keep, removed = np.ones(len(gaussians), np.bool_), {}
+    for reason, flags in _found(gaussians, photos, told or _untold):
+        removed[reason] = int((flags & keep).sum())
+        keep &= ~flags
+    return Cleaned(torch.from_numpy(keep), removed)
+
+
+def _untold(_done: int, _total: int) -> None:
+    """Where nobody listens."""
+
+
+def _found(gaussians: Gaussians, photos: Photos | None, told: Told) -> Iterator[tuple[str, Flags]]:
+    """Reasons, and whom they hit."""
+    opacity = torch.sigmoid(gaussians.opacity_logits.detach()).numpy(force=True)
+    yield "transparent", opacity < TRANSPARENT
+    shapes, solid = Shapes.of(gaussians), opacity >= SOLID
+    if photos is None or not photos.cameras:
+        yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
+        return
+    steps = len(photos.cameras) * (1 if photos.picture is None else LOOKS)
+    found = look_through(gaussians, photos, lambda done: told(done, steps))
+    seen = found.weight >= SEEN_PIXELS
+    floats = seen & (found.floating > FLOATING)
+    ground = seen & ~floats & solid
+    loose = floats & ~held(shapes, LOOSE, ground, floats & solid)
+    yield "oversized", floats & _oversized(shapes, photos)
+    yield "seen by too few photos", loose & (found.photos < FEW_PHOTOS)
+    unseen = found.weight < UNSEEN_PIXELS
+    yield "seen by none", unseen & ~held(shapes, LOOSE, seen & solid, unseen & solid)
+    yield "beyond the photos", _at_edges(found, shapes, seen & solid)
+    if photos.picture is None:
+        yield "floating", loose & solid
+        return
+    suspected = floats & solid & ~held(shapes, SUSPECTED, ground, floats & solid)
+    looked = len(photos.cameras)
+    yield "floating", _unwanted(gaussians, suspected, photos, found, lambda done: told(looked + done, steps))
+    told(steps, steps)
+
+
+def _oversized(shapes: Shapes, photos: Photos) -> Flags:
+    """Which Gaussians are very large for where they are."""
+    nearest = np.full(len(shapes.centres), np.inf)
+    for camera in photos.cameras:
+        np.minimum(nearest, np.linalg.norm(shapes.centres - camera.centre(), axis=1), out=nearest)
+    return np.asarray(shapes.largest > OVERSIZED * nearest)
+
+
+def _at_edges(found: Sightings, shapes: Shapes, solid: Flags) -> Flags:
+    """Which Gaussians only the borders of a photo or two show, and what is better covered does not hold."""
+    rough = solid & (found.border > BORDER) & (found.photos < FEW_PHOTOS)
+    return np.asarray(rough & ~held(shapes, LOOSE, solid & ~rough, rough))
+
+
+def _unwanted(
+    gaussians: Gaussians, suspected: Flags, photos: Photos, found: Sightings, told: Callable[[int], None]
+) -> Flags:
+    """Which of the suspected make renders less like the photos."""
+    gone = np.zeros(len(gaussians), np.bool_)
+    for number, limit in enumerate(WORTH):
+        left = np.flatnonzero(~gone)
+        asked = suspected[left] & ~gone[left]
+        if not asked.any():
+            break
+        of_left = gaussians.select(torch.from_numpy(left).to(gaussians.means.device)) if gone.any() else gaussians
+        looks = number * len(photos.cameras)
+        worth = worth_in_photos(of_left, asked, photos, lambda done, looks=looks: told(looks + done))  # type: ignore[misc]
+        gone[left[asked & (worth < limit * found.weight[left])]] = True
+    return gone

@@ -1,0 +1,156 @@
+"""What photos see of each Gaussian: how much of it, in how many of them, over what angle, and whether it floats there.
+
+A photo sees of a Gaussian what it blends in: its weights α T, summed over the pixels. What lies in a photo's frustum
+may be hidden, so that projecting centres would not do. The sum is the derivative of the picture's sum by the Gaussian's
+colour, since a pixel is Σ αᵢ Tᵢ cᵢ (Kerbl et al. 2023, eq. 3): one backward pass a photo. Red, green and blue may each
+have weights in that sum, so that the same pass tells means over what is seen of a Gaussian, such as the depth there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64
+from torch import Tensor
+
+from splatpipe.pipeline.edit.depth_islands import without_islands
+from splatpipe.pipeline.edit.isolation import half_axes
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.images import Mask, Pixels
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import Panorama
+from splatpipe.pipeline.splat.sh import C0
+
+SEEN_MEGAPIXELS = 0.3
+"""Of the pictures that tell: a floater that hides something is larger than their pixels."""
+LEAST_SEEN = 1e-3  # of a pixel: less is rounding
+BORDER_SHARE = 0.08  # of a picture's shorter side, that is its border: what only borders show was hardly covered
+BEFORE_SHARE = 0.005  # of the depth, that a Gaussian is before what is behind islands: depths are as good as that
+BEFORE_SIGMAS = 2.0  # and of its own standard deviations along the view axis
+
+
+@dataclass(frozen=True, eq=False)
+class Photos:
+    """The photos that a splat was trained on.
+
+    Attributes:
+        cameras: Small (``SEEN_MEGAPIXELS``), whole pictures.
+        options: As the splat is rendered.
+        picture: A photo, (h, w, 3) RGB, and its mask, of its camera's size; None where only cameras are known.
+        sky: What is behind the splat.
+    """
+
+    cameras: Sequence[Camera]
+    options: rasterizer.RenderOptions
+    picture: Callable[[int], tuple[Pixels, Mask | None]] | None = None
+    sky: Panorama | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """What all photos together see of each Gaussian.
+
+    Attributes:
+        weight: Σ w, of the pictures' pixels; w is a photo's sum of α T.
+        photos: (Σ w)² / Σ w², in how many photos it is seen, those that hardly show it hardly counted; 0 where unseen.
+        angle_deg: Of the rays from it to those photos about their mean, root mean square by weight; 0 where unseen.
+        border: Share of its weight that lies at the pictures' borders.
+        floating: Share of the area in which it is seen where it lies before all that is around it.
+    """
+
+    weight: Float32[np.ndarray, " n"]
+    photos: Float32[np.ndarray, " n"]
+    angle_deg: Float32[np.ndarray, " n"]
+    border: Float32[np.ndarray, " n"]
+    floating: Float32[np.ndarray, " n"]
+
+
+class _Sums:
+    """Sums over the photos, of which ``Sightings`` are made."""
+
+    def __init__(self, n: int) -> None:
+        self.weight, self.square, self.border, self.area, self.before = (np.zeros(n, np.float32) for _ in range(5))
+        self.towards = np.zeros((n, 3), np.float32)
+
+    def sightings(self) -> Sightings:
+        def part(value: Float32[np.ndarray, " n"], of: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
+            return np.asarray(np.divide(value, of, out=np.zeros_like(value), where=of > 0.0))
+
+        together = np.minimum(part(np.linalg.norm(self.towards, axis=1), self.weight), 1.0)  # 1 where all rays are one
+        angle = np.rad2deg(np.sqrt(2.0 * (1.0 - together), dtype=np.float32))
+        angle[self.weight == 0.0] = 0.0
+        photos = part(self.weight * self.weight, self.square)
+        return Sightings(self.weight, photos, angle, part(self.border, self.weight), part(self.before, self.area))
+
+
+def look_through(gaussians: Gaussians, photos: Photos, told: Callable[[int], None]) -> Sightings:
+    """Sum up what photos see.
+
+    Args:
+        gaussians: Where they are rendered, on the CPU or a device; finite.
+        photos: That see them.
+        told: Called with the number of photos that were looked through.
+    """
+    grey = grey_of(gaussians)
+    plain = replace(photos.options, sh_degree=0, depth=True, magnitudes=False)
+    centres, axes = gaussians.means.detach().numpy(force=True), half_axes(gaussians)
+    sums = _Sums(len(gaussians))
+    for done, camera in enumerate(photos.cameras, start=1):
+        rendered = rasterizer.render(grey, camera, plain)
+        behind = without_islands(rendered.median_depth.numpy(force=True))
+        picture = np.stack([np.ones_like(behind), _border(camera), behind], axis=2)
+        found = weights_of(rendered, grey, picture)
+        rows = np.flatnonzero(found[:, 0] > LEAST_SEEN)
+        _add(sums, rows, found[rows], camera, (centres[rows], axes[rows]))
+        told(done)
+    return sums.sightings()
+
+
+def weights_of(
+    rendered: rasterizer.Render, grey: Gaussians, picture: Float32[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Sums over a render's pixels of each Gaussian's weights α T times a picture's values."""
+    values = torch.from_numpy(picture).to(rendered.colour)
+    (found,) = torch.autograd.grad(rendered.colour, grey.sh, values)
+    return np.asarray((found[:, 0] / C0).numpy(force=True))
+
+
+def grey_of(gaussians: Gaussians) -> Gaussians:
+    """The same of one colour, by which is derived."""
+    colours: Float[Tensor, "n 1 3"] = torch.zeros_like(gaussians.sh[:, :1])
+    return replace(gaussians.detach(), sh=colours.requires_grad_())
+
+
+def _border(camera: Camera) -> Float32[np.ndarray, "h w"]:
+    """1 at a picture's border, 0 elsewhere."""
+    picture = np.ones((camera.height, camera.width), np.float32)
+    width = max(1, round(BORDER_SHARE * min(camera.height, camera.width)))
+    picture[width:-width, width:-width] = 0.0
+    return picture
+
+
+def _add(
+    sums: _Sums,
+    rows: Int64[np.ndarray, " m"],
+    found: Float32[np.ndarray, "m 3"],
+    camera: Camera,
+    placed: tuple[Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3 3"]],
+) -> None:
+    """Add what a photo sees."""
+    weight, border, behind = found.T
+    centres, axes = placed
+    rays = (camera.centre() - centres).astype(np.float32)
+    depths = camera.depths(centres.astype(np.float64)).astype(np.float32)
+    spread = np.linalg.norm(np.einsum("mij,i->mj", axes, camera.cam_from_world[2, :3].astype(np.float32)), axis=1)
+    is_before = behind / weight - depths > np.maximum(BEFORE_SHARE * depths, BEFORE_SIGMAS * spread)
+    area = weight * depths * depths / np.float32(camera.fx * camera.fy)
+    sums.weight[rows] += weight
+    sums.square[rows] += weight * weight
+    sums.border[rows] += border
+    sums.towards[rows] += rays * (weight / np.maximum(np.linalg.norm(rays, axis=1), 1e-30))[:, None]
+    sums.area[rows] += area
+    sums.before[rows] += area * is_before

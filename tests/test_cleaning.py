@@ -1,0 +1,210 @@
+"""Cleaning against truth: a box on a plain made of Gaussians, cameras around it, and what does or does not belong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Bool, Float32, Float64
+
+from splatpipe.pipeline.edit.cleaning import Cleaned, clean_scene
+from splatpipe.pipeline.edit.depth_islands import without_islands
+from splatpipe.pipeline.edit.sightings import Photos, look_through
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.images import Mask, Pixels
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.sh import rgb_to_dc
+
+SPACING = 0.1
+OPTIONS = rasterizer.RenderOptions(sh_degree=0)
+Points = Float64[np.ndarray, "n 3"]
+
+
+def made_of(
+    points: Points, scale: float | tuple[float, float, float], colour: float, opacity: float = 0.95
+) -> Gaussians:
+    """Gaussians at points, unturned."""
+    found = Gaussians.empty(len(points), 0)
+    found.means[:] = torch.from_numpy(points).float()
+    found.log_scales[:] = torch.log(torch.tensor(scale if isinstance(scale, tuple) else (scale,) * 3))
+    found.opacity_logits[:] = torch.logit(torch.tensor(opacity))
+    found.sh[:, 0] = rgb_to_dc(torch.full((3,), colour))
+    return found
+
+
+def grid(low: tuple[float, float, float], high: tuple[float, float, float]) -> Points:
+    """Points between two corners; a side without length is a plane."""
+    axes = [np.arange(a, b + 1e-9, SPACING) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@cache
+def scene() -> Gaussians:
+    """A plain of 8 m, a box of 2 m on it, a pole of 2 m beside it, and a wire from the pole to the box's roof."""
+    thin = 0.2 * SPACING
+    ground = made_of(grid((-4, -4, 0), (4, 4, 0)), (0.07, 0.07, thin), 0.4)
+    roof = made_of(grid((-1, -1, 2), (1, 1, 2)), (0.07, 0.07, thin), 0.7)
+    walls = [made_of(grid((side, -1, 0), (side, 1, 2)), (thin, 0.07, 0.07), 0.6) for side in (-1.0, 1.0)] + [
+        made_of(grid((-1, side, 0), (1, side, 2)), (0.07, thin, 0.07), 0.5) for side in (-1.0, 1.0)
+    ]
+    pole = made_of(grid((2.5, 0, 0), (2.5, 0, 2)), (0.03, 0.03, 0.06), 0.9)
+    wire = made_of(grid((1, 0, 2), (2.5, 0, 2)), (0.06, 0.015, 0.015), 0.1)
+    return Gaussians.concat([ground, roof, *walls, pole, wire])
+
+
+def camera(eye: tuple[float, float, float], name: str) -> Camera:
+    """One that looks at the middle of the scene."""
+    centre = np.array(eye)
+    forward = np.array([0.0, 0.0, 0.7]) - centre
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    turn = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, -turn @ centre
+    return Camera(name, 160, 120, 150.0, 150.0, 80.0, 60.0, pose)
+
+
+def cameras() -> list[Camera]:
+    """Twelve around it, at two heights."""
+    turns = [(2.0 * np.pi * k / 12, 4.0 if k % 2 else 6.5) for k in range(12)]
+    return [camera((7.0 * np.cos(a), 7.0 * np.sin(a), height), f"{a:.2f}") for a, height in turns]
+
+
+def photos(pictures: bool) -> Photos:
+    """Of the scene as it is."""
+
+    def picture(index: int) -> tuple[Pixels, Mask | None]:
+        with torch.no_grad():
+            colour = rasterizer.render(scene(), cameras()[index], OPTIONS).colour
+        return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).numpy().astype(np.uint8), None
+
+    return Photos(cameras(), OPTIONS, picture if pictures else None)
+
+
+def planted(kind: str) -> Gaussians:
+    """What does not belong to the scene."""
+    rng = np.random.default_rng(3)
+    air = np.stack([rng.uniform(-3, 3, 40), rng.uniform(-3, 3, 40), rng.uniform(2.6, 3.4, 40)], axis=1)
+    if kind == "single":
+        return made_of(air, 0.05, 1.0)
+    if kind == "clusters":
+        return made_of((air[:6, None] + rng.normal(0, 0.08, (6, 8, 3))).reshape(-1, 3), 0.05, 1.0)
+    if kind == "near surfaces":
+        beside = np.stack([np.full(30, -1.5), rng.uniform(-0.9, 0.9, 30), rng.uniform(0.5, 1.8, 30)], axis=1)
+        return made_of(beside[::3], 0.04, 1.0)
+    if kind == "transparent":
+        return made_of(air, 0.05, 1.0, opacity=0.005)
+    assert kind == "oversized"
+    return made_of(np.array([[0.0, 0.0, 4.0]]), (1.5, 1.5, 0.1), 1.0, opacity=0.2)
+
+
+def shares(cleaned: Cleaned) -> tuple[float, float]:
+    """Of the planted that are found, and of the scene that is lost."""
+    real = len(scene())
+    return 1.0 - float(cleaned.keep[real:].float().mean()), 1.0 - float(cleaned.keep[:real].float().mean())
+
+
+@pytest.mark.parametrize("known", ["pictures", "cameras", "nothing"])
+@pytest.mark.parametrize("kind", ["single", "clusters", "near surfaces", "transparent"])
+def test_planted_floaters_are_found_and_the_scene_is_kept(kind: str, known: str) -> None:
+    both = Gaussians.concat([scene(), planted(kind)])
+    seen = None if known == "nothing" else photos(pictures=known == "pictures")
+    found, lost = shares(clean_scene(both, seen))
+    assert found >= 0.95
+    assert lost <= 0.005
+
+
+@pytest.mark.parametrize("known", ["pictures", "cameras", "nothing"])
+def test_thin_things_are_kept(known: str) -> None:
+    seen = None if known == "nothing" else photos(pictures=known == "pictures")
+    thin = grid((2.5, 0, 0), (2.5, 0, 2)).shape[0] + grid((1, 0, 2), (2.5, 0, 2)).shape[0]
+    assert clean_scene(scene(), seen).keep[-thin:].all()
+
+
+def test_large_haze_before_everything_is_found() -> None:
+    cleaned = clean_scene(Gaussians.concat([scene(), planted("oversized")]), photos(pictures=True))
+    assert not cleaned.keep[-1] and cleaned.keep[:-1].float().mean() >= 0.995
+
+
+def test_what_no_photo_sees_goes_unless_the_scene_holds_it() -> None:
+    inside = made_of(np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9]]), 0.02, 0.5)  # far below
+    behind = made_of(np.array([[0.0, 0.0, -0.03]]), 0.05, 0.5)  # under the box, on its floor's ground
+    cleaned = clean_scene(Gaussians.concat([scene(), inside, behind]), photos(pictures=False))
+    assert cleaned.keep[-3:].tolist() == [False, False, True]
+    assert cleaned.removed["seen by none"] == 2
+
+
+def test_pictures_keep_what_floats_and_is_real() -> None:
+    balloon = made_of(np.array([[1.8, -1.5, 1.9], [-1.9, 1.6, 1.5]]), 0.08, 0.9)
+    real = Gaussians.concat([scene(), balloon])
+
+    def picture(index: int) -> tuple[Pixels, Mask | None]:
+        with torch.no_grad():
+            colour = rasterizer.render(real, cameras()[index], OPTIONS).colour
+        return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).numpy().astype(np.uint8), None
+
+    assert clean_scene(real, Photos(cameras(), OPTIONS, picture)).keep[-2:].all()
+    assert not clean_scene(real, photos(pictures=True)).keep[-2:].any()  # on photos without them
+
+
+def test_cleaning_twice_is_cleaning_once_and_gives_the_same_bits() -> None:
+    both = Gaussians.concat([scene(), planted("single"), planted("clusters")])
+    first = clean_scene(both, photos(pictures=True))
+    assert torch.equal(first.keep, clean_scene(both, photos(pictures=True)).keep)
+    again = clean_scene(both.select(first.keep), photos(pictures=True))
+    assert again.keep.all() and not any(again.removed.values())
+
+
+def test_nothing_is_taken_from_a_few_gaussians_and_none() -> None:
+    for few in (scene().first(0), scene().first(1), scene().first(9)):
+        assert clean_scene(few).keep.all()
+
+
+def test_what_is_not_finite_is_refused() -> None:
+    broken = scene().clone()
+    broken.means[3, 0] = float("nan")
+    with pytest.raises(ValueError, match="not finite"):
+        clean_scene(broken)
+
+
+def test_weights_are_those_of_the_definition() -> None:
+    """Two Gaussians, one before the other: the sums of α T by the slow definition, rendered in white on black."""
+    two = made_of(np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 1.0]]), 0.2, 0.5, opacity=0.6)
+    above = camera((0.01, 0.0, 7.0), "above")
+    found = look_through(two, Photos([above], OPTIONS), lambda _done: None)
+    for row in range(2):
+        colours = torch.zeros(2, 3)
+        colours[row] = 1.0
+        lit = replace(two, sh=rgb_to_dc(colours)[:, None].contiguous())
+        light = rasterizer.render(lit, above, OPTIONS, backend="reference").colour[..., 0].sum()
+        assert found.weight[row] == pytest.approx(float(light), rel=1e-3)
+    assert found.photos.tolist() == pytest.approx([1.0, 1.0])
+    assert found.angle_deg == pytest.approx([0.0, 0.0], abs=0.1)  # float32 of a cosine near 1
+
+
+def test_the_angle_between_photos_is_told() -> None:
+    one = made_of(np.array([[0.0, 0.0, 0.7]]), 0.2, 0.5)
+    pair = [camera((5.0 * np.sin(a), 0.0, 0.7 + 5.0 * np.cos(a)), str(a)) for a in (-0.2, 0.2)]
+    found = look_through(one, Photos(pair, OPTIONS), lambda _done: None)
+    assert found.photos[0] == pytest.approx(2.0, abs=0.01)
+    assert found.angle_deg[0] == pytest.approx(np.rad2deg(0.2), rel=0.02)
+
+
+def test_islands_are_filled_and_long_things_are_not() -> None:
+    depth: Float32[np.ndarray, "h w"] = np.full((120, 160), 10.0, np.float32)
+    depth[50:56, 40:46] = 5.0  # an island
+    depth[:90, 100:102] = 6.0  # a pole
+    depth[90:] = 8.0  # the ground
+    filled = without_islands(depth)
+    island: Bool[np.ndarray, "h w"] = depth == 5.0
+    assert (filled[island] == 10.0).all()
+    assert (filled[~island] == depth[~island]).mean() > 0.995  # but for corners
+
+
+def test_without_a_surface_nothing_is_near() -> None:
+    assert (without_islands(np.zeros((20, 30), np.float32)) > 0.0).all()
