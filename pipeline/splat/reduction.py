@@ -22,6 +22,9 @@ NEIGHBOURS = 8
 """Of each Gaussian that it may merge with."""
 ROUND_SHARE = 0.3
 """Of the Gaussians, at most so many vanish in a round: the less, the nearer to always taking the very cheapest."""
+BALANCE = 2.0
+"""Power of the number that a merged Gaussian stands for by which its cost grows: at 1 it is that of all of them, at 0
+some swallow all that is around them."""
 PIECE = 200_000
 """Gaussians looked at together: bounds the memory."""
 _ROWS_AT_ONCE = 1 << 15
@@ -164,7 +167,7 @@ def _piece_pairs(
     moments = moments_of(piece)
     edges = _neighbours(moments.means)
     colours = piece.sh.to(torch.float32).reshape(len(piece), -1).numpy()
-    costs = merge_costs(moments, colours, edges, least_variance) * counts[edges].sum(1)
+    costs = merge_costs(moments, colours, edges, least_variance) * counts[edges].sum(1) ** BALANCE
     chosen = match_cheapest(edges, costs, len(piece))
     return edges[chosen], costs[chosen]
 

@@ -1,0 +1,186 @@
+"""PlayCanvas' streamed SOG: `lod-meta.json`, and folders of SOG pictures that it says what to find in.
+
+The format is what splat-transform's writer makes and PlayCanvas' engine reads (splat-transform 2.7, playcanvas 2.23,
+both MIT): a tree of boxes whose leaves name, for each level of detail, a file and the run of its Gaussians that lies in the
+leaf; level 0 is the finest; a level that is missing in a leaf is shown by the next finer one. Boxes and pictures are in
+the frame of a 3DGS PLY, y down.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.splat.formats.sog import AXES, encode_sog
+from splatpipe.pipeline.splat.formats.sog_images import META, RECORD
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.levels import LevelNode
+from splatpipe.pipeline.splat.moments import moments_of
+from splatpipe.pipeline.splat.morton import morton_keys
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts
+
+LOD_META = "lod-meta.json"
+VERSION = 1
+FULL_FILE = 100_000
+"""Gaussians after which a level's next leaf begins another file: what is fetched at once stays some megabytes."""
+_DIGITS = 7  # of a number in the tree: a float32's
+
+
+@dataclass(frozen=True, eq=False)
+class _Share:
+    """Gaussians of one node that lie in one of those below it."""
+
+    level: int
+    node: LevelNode
+    rows: Int64[np.ndarray, " n"]
+
+    def gaussians(self) -> Gaussians:
+        return self.node.gaussians.select(torch.from_numpy(self.rows))
+
+
+@dataclass(eq=False)
+class _Files:
+    """What is written: for each level the parts of the file that is being filled, and what the tree says of all."""
+
+    folder: Path
+    facts: SceneFacts
+    names: list[str] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)
+    open: dict[int, tuple[int, list[Gaussians]]] = field(default_factory=dict)  # number in names, parts
+    begun: dict[int, int] = field(default_factory=dict)  # files of a level
+
+    def add(self, level: int, part: Gaussians) -> dict[str, int]:
+        """Put a leaf's Gaussians of a level in its file; where that is."""
+        if level not in self.open:
+            number = self.begun.get(level, 0)
+            self.begun[level] = number + 1
+            self.open[level] = (len(self.names), [])
+            self.names.append(f"{level}_{number}/{META}")
+        file, parts = self.open[level]
+        offset = sum(len(each) for each in parts)
+        parts.append(part)
+        self.counts[level] = self.counts.get(level, 0) + len(part)
+        if offset + len(part) >= FULL_FILE:
+            self.close(level)
+        return {"file": file, "offset": offset, "count": len(part)}
+
+    def close(self, level: int) -> None:
+        """Write a level's file."""
+        file, parts = self.open.pop(level)
+        folder = (self.folder / self.names[file]).parent
+        folder.mkdir(parents=True, exist_ok=True)
+        turned = Scene(Gaussians.concat(parts), self.facts).turned(AXES).gaussians
+        for name, data in encode_sog(turned, self.facts.antialias, in_order=True).files().items():
+            (folder / name).write_bytes(data)
+
+    def close_all(self) -> None:
+        """Write what is left."""
+        for level in sorted(self.open):
+            self.close(level)
+
+
+def write_streamed_sog(folder: Path, scene: Scene, root: LevelNode) -> None:
+    """Write `lod-meta.json` and its SOG folders; the same bytes for the same levels.
+
+    Args:
+        folder: Made if it is not there; files of an earlier one are replaced, others stay.
+        scene: What the levels are of: its facts go into `lod-meta.json` under ``splatpipe``.
+        root: Of its levels, in its frame, with finite parameters.
+
+    Raises:
+        ValueError: if a parameter is not finite.
+        OSError: if a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    levels = _height(root) + 1
+    files = _Files(folder, scene.facts)
+    tree = _tree(root, [], levels - 1, files)
+    files.close_all()
+    counts = [files.counts.get(level, 0) for level in range(levels)]
+    meta = {
+        "version": VERSION,
+        "asset": {"generator": "splatpipe"},
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": levels,
+        RECORD: json.loads(scene.facts.record()),
+        "filenames": files.names,
+        "tree": tree,
+    }
+    text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
+    (folder / LOD_META).write_text(text, encoding="ascii")
+
+
+def _height(node: LevelNode) -> int:
+    return 1 + max(_height(child) for child in node.children) if node.children else 0
+
+
+def _tree(node: LevelNode, above: Sequence[_Share], level: int, files: _Files) -> dict[str, Any]:
+    """What the tree says of a node, with the parts in it of those above, coarsest first.
+
+    Levels are counted from the root down, but that the full model is level 0: a leaf nearer the root than others lacks
+    levels between, and not the coarsest, without which a reader would show nothing there.
+    """
+    if not node.children:
+        return _leaf([*above, _whole(node, 0)], files)
+    divided = [_divided(share, node.children) for share in [*above, _whole(node, level)]]
+    children = [
+        _tree(child, [parts[k] for parts in divided], level - 1, files) for k, child in enumerate(node.children)
+    ]
+    low = np.min([child["bound"]["min"] for child in children], axis=0)
+    high = np.max([child["bound"]["max"] for child in children], axis=0)
+    return {"bound": _bound(low, high), "children": children}
+
+
+def _whole(node: LevelNode, level: int) -> _Share:
+    return _Share(level, node, np.arange(len(node.gaussians)))
+
+
+def _divided(share: _Share, children: Sequence[LevelNode]) -> list[_Share]:
+    """A node's Gaussians, each to the child in the box of whose centres it lies, or to the nearest."""
+    means = share.node.gaussians.means.detach().to(torch.float64).numpy()[share.rows]
+    outside, off = np.empty((2, len(children), len(means)))
+    for k, child in enumerate(children):
+        centres = child.gaussians.means.detach().to(torch.float64).numpy()
+        low, high = centres.min(0), centres.max(0)
+        outside[k] = np.linalg.norm(np.maximum(np.maximum(low - means, means - high), 0.0), axis=1)
+        off[k] = np.abs((means - 0.5 * (low + high)) / np.maximum(high - low, np.finfo(np.float32).tiny)).max(1)
+    nearest = np.lexsort((off, outside), axis=0)[0]
+    return [_Share(share.level, share.node, share.rows[nearest == k]) for k in range(len(children))]
+
+
+def _leaf(shares: Sequence[_Share], files: _Files) -> dict[str, Any]:
+    lods: dict[str, dict[str, int]] = {}
+    corners: list[Float64[np.ndarray, "2 3"]] = []
+    for share in reversed(shares):
+        if len(share.rows):
+            part = _sorted(share.gaussians())
+            lods[str(share.level)] = files.add(share.level, part)
+            corners.append(_box(Scene(part, files.facts).turned(AXES).gaussians))
+    boxes = np.stack(corners)
+    return {"bound": _bound(boxes[:, 0].min(0), boxes[:, 1].max(0)), "lods": lods}
+
+
+def _sorted(gaussians: Gaussians) -> Gaussians:
+    """Along a Morton curve: pictures of neighbours pack better."""
+    lowest = gaussians.means.amin(0)
+    keys = morton_keys(gaussians.means, lowest, gaussians.means.amax(0) - lowest)
+    return gaussians.select(torch.argsort(keys, stable=True))
+
+
+def _box(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
+    """Around centres and one standard deviation, as PlayCanvas' are."""
+    moments = moments_of(gaussians)
+    reach = np.sqrt(moments.covariances[:, [0, 3, 5]])
+    return np.stack([(moments.means - reach).min(0), (moments.means + reach).max(0)])
+
+
+def _bound(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> dict[str, list[float]]:
+    return {name: [float(f"{x:.{_DIGITS}g}") for x in corner] for name, corner in (("min", low), ("max", high))}
