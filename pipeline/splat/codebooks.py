@@ -12,7 +12,7 @@ _ITERATIONS = 200  # from a start that is near the best the last ones move value
 
 
 def fit_codebook(
-    values: Float32[np.ndarray, " n"], weights: Float32[np.ndarray, " n"] | None = None
+    values: Float32[np.ndarray, " n"], weights: Float32[np.ndarray, " n"] | None = None, size: int = CODEBOOK_SIZE
 ) -> Float32[np.ndarray, 256]:
     """The values whose squares of distances to all numbers sum up to little.
 
@@ -24,6 +24,7 @@ def fit_codebook(
     Args:
         values: Numbers, finite.
         weights: Of each, positive; alike without.
+        size: Most different values.
 
     Returns:
         Ascending; the last one again where fewer are needed.
@@ -33,11 +34,11 @@ def fit_codebook(
     order = np.argsort(values, kind="stable")
     ordered = values[order].astype(np.float64)
     changes = np.flatnonzero(np.diff(ordered)) + 1
-    if len(changes) < CODEBOOK_SIZE:
+    if len(changes) < size:
         return _filled(ordered[np.concatenate(([0], changes))])
     mass = np.concatenate(([0.0], np.cumsum(np.ones(len(ordered)) if weights is None else weights[order], dtype=float)))
     moment = np.concatenate(([0.0], np.cumsum(np.diff(mass) * ordered)))
-    found = _start(ordered, mass)
+    found = _start(ordered, mass, size)
     for _ in range(_ITERATIONS):
         bounds = _bounds(ordered, found)
         inside, sums = np.diff(mass[bounds]), np.diff(moment[bounds])
@@ -52,16 +53,18 @@ def nearest_codes(
     return np.asarray(np.searchsorted((codebook[1:] + codebook[:-1]) / 2, values).astype(np.uint8))
 
 
-def _start(ordered: Float64[np.ndarray, " n"], mass: Float64[np.ndarray, " n1"]) -> Float64[np.ndarray, 256]:
+def _start(
+    ordered: Float64[np.ndarray, " n"], mass: Float64[np.ndarray, " n1"], size: int
+) -> Float64[np.ndarray, " k"]:
     """In stretches of equal mass and width w there are best w^(2/3) of all values."""
     ends = np.searchsorted(mass[1:], np.linspace(0.0, mass[-1], _STRETCHES + 1)).clip(0, len(ordered) - 1)
     edges = ordered[ends]
     share = np.concatenate(([0.0], np.cumsum(np.diff(edges) ** (2.0 / 3.0))))
-    at = (np.arange(CODEBOOK_SIZE) + 0.5) * (share[-1] / CODEBOOK_SIZE)
+    at = (np.arange(size) + 0.5) * (share[-1] / size)
     return np.asarray(np.interp(at, share, edges))
 
 
-def _bounds(ordered: Float64[np.ndarray, " n"], found: Float64[np.ndarray, 256]) -> Int64[np.ndarray, 257]:
+def _bounds(ordered: Float64[np.ndarray, " n"], found: Float64[np.ndarray, " k"]) -> Int64[np.ndarray, " k1"]:
     middles = (found[1:] + found[:-1]) / 2
     return np.concatenate(([0], np.searchsorted(ordered, middles), [len(ordered)])).astype(np.int64)
 

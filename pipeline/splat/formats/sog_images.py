@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, Int64, UInt8, UInt16
 from torch import Tensor
 
 from splatpipe.pipeline.splat.codebooks import fit_codebook, nearest_codes
@@ -26,6 +26,10 @@ LEVELS = 65_535  # of a coordinate
 FIRST_MODE = 252  # of a quaternion: 252 + which of w, x, y, z is the largest
 ENTRIES_A_ROW = 64  # of the picture of the palette
 MOST_ENTRIES = 65_536
+_HARMONIC_LEVELS = 64  # of the palette's numbers: as good as 256 beside the palette's own error, and a quarter smaller
+_MOST_LOG_AREA = 80.0  # of natural logarithms
+_SHOWN_QUANTILE = 0.99
+_LEAST_SHOWN = 1e-3  # of the mean: what is hardly seen from afar is seen from near
 _SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
 
 
@@ -85,15 +89,30 @@ _Part = tuple[dict[str, Any], dict[str, UInt8[np.ndarray, "h w c"]]]
 
 
 def _parts(gaussians: Gaussians) -> dict[str, _Part]:
+    shown = _shown(gaussians)
     parts = {
         "means": _means(gaussians.means),
-        "scales": _scales(gaussians.log_scales),
+        "scales": _scales(gaussians.log_scales, shown),
         "quats": _quats(gaussians.quats),
-        "sh0": _colours(gaussians.sh[:, 0], gaussians.opacity_logits),
+        "sh0": _colours(gaussians.sh[:, 0], gaussians.opacity_logits, shown),
     }
     if gaussians.sh_degree:
-        parts["shN"] = _harmonics(gaussians.sh[:, 1:], gaussians.sh_degree)
+        parts["shN"] = _harmonics(gaussians.sh[:, 1:], shown)
     return parts
+
+
+def _shown(gaussians: Gaussians) -> Float[Tensor, " n"]:
+    """How much of a picture shows each, in means: its opacity times its area, at most what all but a few have.
+
+    Errors count by that: a picture's error is the sum of theirs, each as large as its place in the picture.
+    """
+    if not len(gaussians):
+        return torch.zeros(0)
+    sides = gaussians.log_scales.sort(1).values[:, 1:].sum(1).clamp(-_MOST_LOG_AREA, _MOST_LOG_AREA)
+    areas = torch.sigmoid(gaussians.opacity_logits).double() * torch.exp(sides.double())
+    most = areas.sort().values[int(_SHOWN_QUANTILE * (len(areas) - 1))]  # the largest are hidden behind others
+    areas = areas.clamp_max(most)
+    return (areas / areas.mean().clamp_min(1e-300)).clamp_min(_LEAST_SHOWN).float()
 
 
 def _means(means: Float[Tensor, "n 3"]) -> _Part:
@@ -112,8 +131,8 @@ def _signed_log(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return np.asarray(np.sign(values) * np.log1p(np.abs(values)))
 
 
-def _scales(log_scales: Float[Tensor, "n 3"]) -> _Part:
-    codebook = fit_codebook(log_scales.numpy().ravel())
+def _scales(log_scales: Float[Tensor, "n 3"], shown: Float[Tensor, " n"]) -> _Part:
+    codebook = fit_codebook(log_scales.numpy().ravel(), shown.repeat_interleave(3).numpy())
     pictures = {"scales": _picture(nearest_codes(log_scales.numpy(), codebook))}
     return {"codebook": _numbers(codebook)}, pictures
 
@@ -131,25 +150,40 @@ def _quats(quats: Float[Tensor, "n 4"]) -> _Part:
     return {}, {"quats": _picture(pixels)}
 
 
-def _colours(dc: Float[Tensor, "n 3"], opacity_logits: Float[Tensor, " n"]) -> _Part:
-    codebook = fit_codebook(dc.numpy().ravel())
+def _colours(dc: Float[Tensor, "n 3"], opacity_logits: Float[Tensor, " n"], shown: Float[Tensor, " n"]) -> _Part:
+    codebook = fit_codebook(dc.numpy().ravel(), shown.repeat_interleave(3).numpy())
     opacities = torch.sigmoid(opacity_logits).mul(255.0).round().to(torch.uint8).numpy()
     pixels = np.concatenate((nearest_codes(dc.numpy(), codebook), opacities[:, None]), axis=1)
     return {"codebook": _numbers(codebook)}, {"sh0": _picture(pixels)}
 
 
-def _harmonics(sh: Float[Tensor, "n k 3"], bands: int) -> _Part:
+def _harmonics(sh: Float[Tensor, "n k 3"], shown: Float[Tensor, " n"]) -> _Part:
     """A palette of all coefficients of a Gaussian, and which entry each Gaussian has."""
     rows = sh.flatten(1)
-    palette = fit_palette(rows, palette_size(len(rows))) if len(rows) else torch.zeros(1, rows.shape[1])
-    codebook = fit_codebook(palette.numpy().ravel())
-    codes = np.unique(nearest_codes(palette.numpy(), codebook), axis=0)
+    palette = fit_palette(rows, palette_size(len(rows)), shown) if len(rows) else torch.zeros(1, rows.shape[1])
+    codebook = fit_codebook(palette.numpy().ravel(), size=_HARMONIC_LEVELS)
+    codes = nearest_codes(palette.numpy(), codebook)
     labels = nearest_entries(rows, torch.from_numpy(codebook[codes])).numpy()
+    codes, labels = _by_first_use(codes, labels)
     room = np.zeros((-(-len(codes) // ENTRIES_A_ROW) * ENTRIES_A_ROW, *sh.shape[1:]), np.uint8)
     room[: len(codes)] = codes.reshape(len(codes), *sh.shape[1:])
     split = np.stack((labels & 255, labels >> 8, np.zeros_like(labels)), axis=1).astype(np.uint8)
     pictures = {"shN_centroids": room.reshape(-1, ENTRIES_A_ROW * sh.shape[1], 3), "shN_labels": _picture(split)}
+    bands = math.isqrt(sh.shape[1] + 1) - 1
     return {"count": len(codes), "bands": bands, "codebook": _numbers(codebook)}, pictures
+
+
+def _by_first_use(
+    codes: UInt8[np.ndarray, "k d"], labels: Int64[np.ndarray, " n"]
+) -> tuple[UInt8[np.ndarray, "m d"], Int64[np.ndarray, " n"]]:
+    """Only what is used, in the order of its first use: the labels of neighbours are near one another."""
+    if not len(labels):
+        return codes, labels
+    used, first, places = np.unique(labels, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return codes[used[order]], rank[places]
 
 
 def palette_size(count: int) -> int:
