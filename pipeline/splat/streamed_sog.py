@@ -1,9 +1,9 @@
 """PlayCanvas' streamed SOG: `lod-meta.json`, and folders of SOG pictures that it says what to find in.
 
 The format is what splat-transform's writer makes and PlayCanvas' engine reads (splat-transform 2.7, playcanvas 2.23,
-both MIT): a tree of boxes whose leaves name, for each level of detail, a file and the run of its Gaussians that lies in the
-leaf; level 0 is the finest; a level that is missing in a leaf is shown by the next finer one. Boxes and pictures are in
-the frame of a 3DGS PLY, y down.
+both MIT): a tree of boxes whose leaves name, for each level of detail, a file and the run of its Gaussians that lies in
+the leaf. Level 0 is the finest; a level that is missing in a leaf is shown by the next finer one. Boxes and pictures
+are in the frame of a 3DGS PLY, y down.
 """
 
 from __future__ import annotations
