@@ -354,6 +354,42 @@ def test_without_places_only_one_frame_is_merged(tmp_path: Path):
     assert len(merged.gaussians) == 2 * len(true_model())
 
 
+# ------------------------------------------------------------------------------------------------------------- cleaning
+
+
+def test_cleaning_sees_by_cameras_that_went_with_the_splat():
+    scene = Scene(true_model(), SceneFacts("y down"))
+    scene.gaussians.opacity_logits[::10] = -8.0  # what nobody sees
+    to_up = Similarity(1.0, turn_of("z up", "y down").numpy(), np.zeros(3))
+    views = [moved(camera, to_up) for camera in cameras(4)]
+    kept = []
+    for steps in ((), (("rotate", "37"), ("move", "5,6,7"), ("scale", "3"))):
+        piece = Workpiece(Scene(scene.gaussians.clone(), scene.facts))
+        told = [step.apply(piece) for step in parse_steps([*steps, ("clean", True)], OUTPUT, False, views)]
+        assert told[-1]["photos"] == 4
+        assert told[-1]["removed"]["transparent"] == 15
+        kept.append((told[-1]["removed"], piece.scene().gaussians.opacity_logits))
+    assert kept[0][0] == kept[1][0] and torch.equal(kept[0][1], kept[1][1])
+
+
+def test_photos_of_one_run_do_not_judge_what_was_merged_into_it(tmp_path: Path):
+    plain_ply.write(tmp_path / "other.ply", Scene(true_model(), SceneFacts()))
+    piece = Workpiece(Scene(true_model(), SceneFacts()))
+    told = [
+        step.apply(piece)
+        for step in parse_steps([("merge", tmp_path / "other.ply"), ("clean", True)], OUTPUT, False, cameras(2))
+    ]
+    assert told[-1]["photos"] == 0 and "Clean first" in piece.notes[0]
+
+
+def test_photos_that_a_run_judges_itself_by_are_no_witnesses(run_folder: Path):
+    assert len(open_source(run_folder).trained_on()) == 9
+    (run_folder / "metrics.json").write_text(json.dumps({"per_view": [{"name": "flight 1/photo_0.png"}]}))
+    assert next(camera.name for camera in open_source(run_folder).trained_on()) == "flight 1/photo_1.png"
+    (run_folder / "metrics.json").write_text("[")
+    assert len(open_source(run_folder / "splat.ply").trained_on()) == 9
+
+
 # ------------------------------------------------------------------------------------------------------ sizes, records
 
 

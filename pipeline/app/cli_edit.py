@@ -95,6 +95,7 @@ def edit(
     scale: ScaleOption = None,
     scale_from: ScaleFromOption = None,
     about: AboutOption = None,
+    clean: CleanOption = False,
     merge: MergeOption = None,
     reduce: ReduceOption = None,
     local: LocalOption = False,
@@ -121,6 +122,7 @@ def edit(
             "scale": scale,
             "scale_from": scale_from,
             "about": about,
+            "clean": clean,
             "merge": merge,
             "reduce": reduce,
         }
@@ -163,8 +165,10 @@ def _edit(source: Path, out: Path, given: Sequence[tuple[str, Any]], how: tuple[
 
     local, pictures, threads = how
     output = Output(out, format_of_name(out))
-    steps = parse_steps(given, output, local)
-    task = Task(open_source(source), output, steps, pictures)
+    parse_steps(given, output, local)  # what makes no sense is told before anything is looked for
+    found = open_source(source)
+    steps = parse_steps(given, output, local, found.trained_on())
+    task = Task(found, output, steps, pictures)
     console = RunConsole()
     try:
         with same_bits(threads or available_cores()):

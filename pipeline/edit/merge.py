@@ -50,6 +50,7 @@ class Merge:
             )
         count = len(other.gaussians)
         piece.take(_joined(ours, other, moved))
+        piece.merged = True
         return {"step": "merge", "file": source.name[:80], "sha256": digest[:DIGEST_CHARACTERS], "added": count}
 
 

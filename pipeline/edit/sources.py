@@ -16,7 +16,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.scene import Scene
 
-SPLAT, CAMERAS, STAGES = "splat.ply", "cameras.json", "stages"
+SPLAT, CAMERAS, METRICS, STAGES = "splat.ply", "cameras.json", "metrics.json", "stages"
 LARGEST_CAMERAS = 64 << 20  # bytes: of some 100,000 photos
 LARGEST_PICTURE = 65_536  # pixels a side
 
@@ -54,6 +54,11 @@ class Source:
     def cameras(self) -> list[Camera]:
         """The run's cameras in the splat's frame, z up; none where there are none or their file is damaged."""
         return [] if self.run is None else read_cameras(self.run / CAMERAS)
+
+    def trained_on(self) -> list[Camera]:
+        """Those of its cameras whose photos were trained on."""
+        held_out = set() if self.run is None else _held_out(self.run / METRICS)
+        return [camera for camera in self.cameras() if camera.name not in held_out]
 
 
 def open_source(path: Path) -> Source:
@@ -96,6 +101,16 @@ def read_cameras(path: Path) -> list[Camera]:
         return [camera for entry in listed if (camera := _camera(entry)) is not None]
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return []
+
+
+def _held_out(path: Path) -> set[str]:
+    """Names of the photos that a run judged itself by; none where its figures are not there or damaged."""
+    try:
+        if path.stat().st_size > LARGEST_CAMERAS:
+            return set()
+        return {str(view["name"]) for view in json.loads(path.read_text(encoding="utf-8"))["per_view"]}
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return set()
 
 
 def _camera(entry: dict[str, Any]) -> Camera | None:

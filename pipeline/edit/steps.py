@@ -6,36 +6,42 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from splatpipe.pipeline.edit.clean import Clean
 from splatpipe.pipeline.edit.crops import CropBox, CropHeights, CropPolygon
 from splatpipe.pipeline.edit.merge import Merge
 from splatpipe.pipeline.edit.motions import Move, MoveTo, Pivot, Rotate, Scale, ScaleFrom
 from splatpipe.pipeline.edit.size import Output, Reduce
 from splatpipe.pipeline.edit.work import Step
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.geometry.camera import Camera
 
 MOST_STEPS = 100
 
 
-def parse_steps(given: Sequence[tuple[str, Any]], output: Output, local: bool) -> list[Step]:
+def parse_steps(
+    given: Sequence[tuple[str, Any]], output: Output, local: bool, cameras: Sequence[Camera] = ()
+) -> list[Step]:
     """Steps from the options that ask for them.
 
     Args:
         given: Names of options (`crop_box`) with what the user wrote, in their order.
         output: What is going to be written: `reduce` may ask for its bytes.
         local: Coordinates are metres from the splat's zero, not of its CRS.
+        cameras: Of the photos that it was trained on, in its frame as it is read, z up; none where nobody knows them.
 
     Raises:
         UsageError: if one makes no sense, or there are too many.
     """
     if len(given) > MOST_STEPS:
         raise UsageError(f"{len(given)} steps are too many.", hint=f"At most {MOST_STEPS}; edit what comes out again.")
-    pivot, steps = Pivot(None, local), []
+    pivot = Pivot(None, local)
+    steps: list[Step] = []
     for name, value in given:
         option = f"--{name.replace('_', '-')}"
         if name == "about":
             pivot = Pivot.parse(value, option, local)
             continue
-        steps.append(_PARSERS[name](value, option, pivot, output))
+        steps.append(Clean(cameras) if name == "clean" else _PARSERS[name](value, option, pivot, output))
     return steps
 
 

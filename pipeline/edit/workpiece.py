@@ -39,6 +39,8 @@ class Workpiece:
     def __init__(self, scene: Scene) -> None:
         self._gaussians, self.facts = scene.gaussians, scene.facts
         self._moved = Similarity.identity()  # in the frame: the splat's, turned to z up
+        self.travelled = Similarity.identity()  # from the frame as it was read to the present one
+        self.merged = False
         self.notes: list[str] = []
 
     def __len__(self) -> int:
@@ -92,6 +94,7 @@ class Workpiece:
     def move(self, similarity: Similarity) -> None:
         """Move all of it by a similarity of the frame."""
         self._moved = similarity.compose(self._moved)
+        self.travelled = similarity.compose(self.travelled)
 
     def take(self, gaussians: Gaussians) -> None:
         """Go on with other Gaussians, in the splat's own axes."""

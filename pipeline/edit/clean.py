@@ -1,0 +1,54 @@
+"""Cleaning as a step: with the photos of the run, where the splat is a run's and nothing was merged into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from splatpipe.pipeline.edit.cleaning import clean_scene
+from splatpipe.pipeline.edit.sightings import SEEN_MEGAPIXELS, Photos
+from splatpipe.pipeline.edit.workpiece import Workpiece
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.splat.scene import turn_of
+
+
+@dataclass(frozen=True)
+class Clean:
+    """What is no part of the scene is removed; see ``edit.cleaning``.
+
+    Attributes:
+        cameras: Of the photos that the splat was trained on, in its frame as it was read, z up; none where nobody
+            knows them.
+    """
+
+    cameras: Sequence[Camera] = ()
+
+    def apply(self, piece: Workpiece) -> dict[str, Any]:
+        """Clean; what is recorded of it.
+
+        Raises:
+            SplatpipeError: if nothing is left.
+        """
+        gaussians = piece.settled()
+        photos = None
+        if self.cameras and not piece.merged:
+            options = rasterizer.RenderOptions(sh_degree=gaussians.sh_degree, antialias=piece.facts.antialias)
+            photos = Photos([_seen_by(camera, piece) for camera in self.cameras], options)
+        elif self.cameras:
+            piece.notes.append("Photos of one run know nothing of a merged splat: it is cleaned without. Clean first.")
+        cleaned = clean_scene(gaussians, photos)
+        if not bool(cleaned.keep.any()):
+            raise SplatpipeError("Cleaning leaves nothing of the splat.", hint="Leave --clean out.")
+        piece.keep(cleaned.keep.numpy())
+        return {"step": "clean", "photos": 0 if photos is None else len(photos.cameras), "removed": cleaned.removed}
+
+
+def _seen_by(camera: Camera, piece: Workpiece) -> Camera:
+    """A small camera that went with the splat, in its own axes."""
+    pose = piece.travelled.camera_pose(camera.cam_from_world)
+    pose[:3, :3] = pose[:3, :3] @ turn_of("z up", piece.facts.axes).numpy()
+    return replace(reduced_camera(camera, SEEN_MEGAPIXELS), cam_from_world=pose)
