@@ -77,6 +77,9 @@ ReduceOption = Annotated[
 LocalOption = Annotated[
     bool, typer.Option("--local", help="Coordinates are metres from the splat's zero, not of its CRS.")
 ]
+FormatOption = Annotated[
+    str | None, typer.Option("--format", "-f", metavar="NAME", help="Where OUT's ending does not say it: spz2, model.")
+]
 PicturesOption = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw it before and after.")]
 
 
@@ -99,6 +102,7 @@ def edit(
     merge: MergeOption = None,
     reduce: ReduceOption = None,
     local: LocalOption = False,
+    format_name: FormatOption = None,
     pictures: PicturesOption = True,
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
@@ -127,7 +131,7 @@ def edit(
             "reduce": reduce,
         }
         given = steps_in_order(context.meta[ORDER], options)
-        done.told = told = _edit(source, out, given, (local, pictures, threads))
+        done.told = told = _edit(source, (out, format_name), given, (local, pictures, threads))
         _show(told)
 
 
@@ -152,7 +156,9 @@ def steps_in_order(order: Sequence[str], options: Mapping[str, Any]) -> list[tup
     return found
 
 
-def _edit(source: Path, out: Path, given: Sequence[tuple[str, Any]], how: tuple[bool, bool, int]) -> dict[str, Any]:
+def _edit(
+    source: Path, target: tuple[Path, str | None], given: Sequence[tuple[str, Any]], how: tuple[bool, bool, int]
+) -> dict[str, Any]:
     from splatpipe.pipeline.app.console import RunConsole
     from splatpipe.pipeline.edit.size import Output
     from splatpipe.pipeline.edit.sources import open_source
@@ -164,7 +170,7 @@ def _edit(source: Path, out: Path, given: Sequence[tuple[str, Any]], how: tuple[
     from splatpipe.pipeline.splat.formats.files import format_of_name
 
     local, pictures, threads = how
-    output = Output(out, format_of_name(out))
+    output = Output(target[0], format_of_name(*target))
     parse_steps(given, output, local)  # what makes no sense is told before anything is looked for
     found = open_source(source)
     steps = parse_steps(given, output, local, found.trained_on())
