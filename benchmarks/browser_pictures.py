@@ -1,0 +1,81 @@
+"""Splat files drawn by spark, in a browser without a window."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from captures import Picture
+from others import READERS, Others
+from playwright.sync_api import Page, sync_playwright
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.scene import Axes, turn_of
+
+PATIENCE_MS = 600_000.0  # of a busy machine
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+PAGE = '<!doctype html><meta charset="utf-8"><script src="draw.js"></script>'
+SPARK_TYPES = {"ply": "ply", "compressed-ply": "ply", "spz": "spz", "spz2": "spz", "sog": "pcsogszip", "glb": "glb"}
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""
+
+
+@contextmanager
+def drawing_page(others: Others, folder: Path) -> Iterator[Page]:
+    """A page that draws the files of a folder, into which its script is put.
+
+    Raises:
+        MachineError: if there is no browser, or the script cannot be bundled.
+    """
+    ended = others.run(READERS / "bundle.mjs", (folder / "draw.js").resolve())
+    if ended.code:
+        raise MachineError(f"esbuild: {ended.said[-300:]}")
+    (folder / "draw.html").write_text(PAGE, encoding="utf-8")
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        raise MachineError("There is no browser.", hint="apt install chromium")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        page = browser.new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        page.goto(f"http://127.0.0.1:{server.server_port}/draw.html")
+        yield page
+        browser.close()
+    server.shutdown()
+
+
+def draw(page: Page, address: str, kind: str, axes: Axes, camera: Camera, antialias: bool) -> tuple[int, Picture]:
+    """How many splats spark read of a file, and its picture on black, 0..1.
+
+    Args:
+        page: Of ``drawing_page``.
+        address: Of the file, below the page's folder.
+        kind: The format's name.
+        axes: The file's.
+        camera: In a world with z up, whose principal point is the picture's middle.
+        antialias: Whether opacities allow for the blur on screen.
+    """
+    cam_from_file = camera.cam_from_world.copy()
+    cam_from_file[:3, :3] = cam_from_file[:3, :3] @ turn_of("z up", axes).numpy()
+    asked = {"url": address, "type": SPARK_TYPES[kind], "width": camera.width, "height": camera.height}
+    asked |= {"focal": [camera.fx, camera.fy], "camFromFile": cam_from_file.ravel().tolist(), "antialias": antialias}
+    found = page.evaluate("asked => window.draw(asked)", asked)
+    data = np.frombuffer(base64.b64decode(found["png"].partition(",")[2]), np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert pixels is not None
+    return int(found["splats"]), pixels[:, :, ::-1].astype(np.float64) / 255.0
