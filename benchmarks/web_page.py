@@ -86,12 +86,12 @@ class Traffic:
 
     Attributes:
         hosts: Of its requests.
-        requests: How many.
+        requests: Their numbers.
         received: Bytes, as they came over the network.
     """
 
     hosts: set[str] = field(default_factory=set)
-    requests: int = 0
+    requests: set[str] = field(default_factory=set)
     received: float = 0.0
 
     def listen(self, session: CDPSession) -> None:
@@ -100,18 +100,19 @@ class Traffic:
         def asked(event: dict) -> None:
             url = event["request"]["url"]
             if url.startswith("http"):
-                self.requests += 1
+                self.requests.add(event["requestId"])
                 self.hosts.add(url.split("/")[2])
 
-        session.on("Network.requestWillBeSent", asked)
-        session.on("Network.dataReceived", lambda event: self._add(event["dataLength"]))  # the host compresses nothing
+        def received(event: dict) -> None:
+            if event["requestId"] in self.requests:  # not what comes from the page itself
+                self.received += event["dataLength"]  # the host compresses nothing
 
-    def _add(self, count: float) -> None:
-        self.received += count
+        session.on("Network.requestWillBeSent", asked)
+        session.on("Network.dataReceived", received)
 
     def told(self) -> str:
         """In a few words."""
-        return f"{self.received / 1e6:.1f} MB in {self.requests} requests to {len(self.hosts)} host"
+        return f"{self.received / 1e6:.1f} MB in {len(self.requests)} requests to {len(self.hosts)} host"
 
 
 class Visit:

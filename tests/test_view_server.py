@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from served import Answer, Served, linked_copy, serving
 
 SECRET = b"nobody may read this"
+WEB = {"index.html": b"<title>Web</title>", "viewer.js": b"0", "viewer.js.gz": b"1", "nodes/a1.spz": b"NGSP"}
 REFUSED = {400, 403, 404, 405, 411, 413, 414, 415, 416, 421, 431}
 
 
@@ -41,6 +42,12 @@ def home(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     sky.mkdir(parents=True)
     (sky / "secret.txt").write_bytes(b"its own")
     (out / "deep").symlink_to(home / "elsewhere")
+    # And the viewer for web hosts, as it lies in OUT.
+    for folder in (sky.parent, out):
+        for name, content in WEB.items():
+            (folder / "web" / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / "web" / name).write_bytes(content)
+    (out / "web/secret.txt").write_bytes(SECRET)
     return home
 
 
@@ -52,6 +59,22 @@ def served(home: Path) -> Iterator[Served]:
 
 def refused(answer: Answer) -> bool:
     return answer.status in REFUSED and SECRET not in answer.body and b"Traceback" not in answer.body
+
+
+def test_the_folder_for_web_hosts_is_served_under_its_own_policy_and_listed_once(served: Served) -> None:
+    kinds = {"index.html": "text/html; charset=utf-8", "viewer.js": "text/javascript; charset=utf-8"}
+    for name, content in WEB.items():
+        answer = served.ask(f"/web/{name}")
+        assert (answer.status, answer.body) == (200, content)
+        assert answer.headers["content-type"] == kinds.get(name, answer.headers["content-type"])
+        assert "script-src 'self' 'wasm-unsafe-eval' blob:;" in answer.headers["content-security-policy"]
+    assert "content-encoding" not in served.ask("/web/viewer.js.gz").headers
+    assert served.ask("/web/nodes/a1.spz", "Range: bytes=1-2").body == b"GS"
+    for path in ("/web/secret.txt", "/web/", "/web", "/web/nodes/../secret.txt"):
+        assert refused(served.ask(path))
+    page = served.ask("/").body.decode()
+    assert page.count("/web/index.html") >= 1
+    assert "nodes/a1.spz" not in page
 
 
 PATHS = [

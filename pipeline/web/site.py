@@ -34,6 +34,7 @@ POLICY = (
     " img-src 'self' data: blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
 )
 DIGITS = 16  # of a digest, in names: enough for no two files of a site ever to share one
+CORE = (0.02, 0.98)  # quantiles of the centres along each axis
 SPZ_AXES: Axes = "y up"
 
 
@@ -101,6 +102,7 @@ def _write_node(folder: Path, node: LevelNode, antialias: bool) -> dict[str, Any
         "count": len(node.gaussians),
         "error": node.error,
         "box": node.box.tolist(),
+        "core": _core(node.gaussians).tolist(),
         "origin": origin.tolist(),
     }
 
@@ -110,6 +112,16 @@ def _middle(gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
     means = gaussians.means.detach().numpy().astype(np.float64)
     middle: Float64[np.ndarray, " 3"] = (means.min(axis=0) + means.max(axis=0)) / 2.0
     return middle
+
+
+def _core(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
+    """Where nearly all centres are: by that the viewer finds what is near, and in the window.
+
+    A node's box is around whole Gaussians. A few large and far ones are in most nodes: all their boxes are about the eye.
+    """
+    means = gaussians.means.detach().numpy().astype(np.float64)
+    core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE, axis=0)
+    return core
 
 
 def _about(gaussians: Gaussians, origin: Float64[np.ndarray, " 3"]) -> Gaussians:

@@ -83,9 +83,7 @@ def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> 
     if VIEWER in names:
         ways.append((f"/{VIEWER}", "3D viewer", "Fly around, measure, read coordinates"))
     if SITE_PAGE in names:
-        ways.append(
-            (f"/{SITE_PAGE}", "3D viewer for the web", "The same for a web host: coarse at once, finer where one looks")
-        )
+        ways.append((f"/{SITE_PAGE}", "Viewer for the web", "For any web host: coarse at once, finer where one looks"))
     if REPORT in names:
         ways.append((f"/{REPORT}", "Report", "What was captured, what was done, how good it is"))
     if "flythrough.webm" in names:

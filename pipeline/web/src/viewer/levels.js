@@ -5,11 +5,12 @@ import { fetchPatiently } from "./files.js";
 import { LoadError } from "./error.js";
 
 const KEPT_FROM = 0.5; // of the pixels at which a node is refined: a refined one stays so down to here
-const MARGIN = 1.2; // of a box's radius: what is just outside the window is refined as well
+const MARGIN = 1.2; // of a core's size: what is just outside the window is refined as well
+const UNSEEN = 0.25; // of a Gaussian that is drawn is what one costs that is out of sight: it is sorted, no more
 
 /**
  * The tree's nodes, the root first.
- * @returns {Promise<{file: string, box: number[][], origin: number[], error: number, count: number, children: object[]}[]>}
+ * @returns {Promise<{file: string, core: number[][], origin: number[], error: number, count: number, children: object[]}[]>}
  */
 export async function readLevels(address) {
   if (location.protocol === "file:") {
@@ -46,16 +47,25 @@ class Eye {
     this.scale = Math.max(fx, fy) * ratio;
   }
 
-  pixels({ box: [least, most], error }) {
+  pixels({ core: [least, most], error }) {
     const distance = Math.hypot(...this.position.toArray().map((at, axis) => Math.max(least[axis] - at, at - most[axis], 0)));
     return (error * this.scale) / Math.max(distance, this.near);
   }
 
-  sees({ box: [least, most] }) {
-    const middle = new Vector3().addVectors(new Vector3(...least), new Vector3(...most)).multiplyScalar(0.5);
-    const radius = MARGIN * middle.distanceTo(new Vector3(...most));
+  /** Whether its box is before all sides of what is seen: what is farthest out of it is. */
+  sees({ core: [least, most] }) {
+    const middle = new Vector3(...least).add(new Vector3(...most)).multiplyScalar(0.5);
+    const half = new Vector3(...most).sub(middle).multiplyScalar(MARGIN);
     middle.sub(this.position);
-    return this.sides.every((side) => side.dot(middle) > -radius);
+    return this.sides.every((side) => {
+      const reach = Math.abs(side.x) * half.x + Math.abs(side.y) * half.y + Math.abs(side.z) * half.z;
+      return side.dot(middle) > -reach;
+    });
+  }
+
+  /** What drawing a node costs, in Gaussians that are seen. */
+  cost(node) {
+    return node.count * (this.sees(node) ? 1 : UNSEEN);
   }
 }
 
@@ -86,18 +96,18 @@ class Ranking {
  * @param {object} root
  * @param {import("./view.js").View} view
  * @param {{pixels: number, most: number, ratio: number, refined: Set<object>}} limits Errors up to which a node will do,
- *   in the screen's pixels; Gaussians that are drawn; the screen's pixels a CSS pixel; nodes whose descendants are shown.
+ *   in the screen's pixels; Gaussians that are seen; the screen's pixels a CSS pixel; nodes whose descendants are shown.
  * @returns {{inner: Set<object>, order: object[]}} Nodes that their children are to stand for, and all that have to be
  *   loaded for that, the most important first.
  */
 export function wantedLevels(root, view, { pixels, most, ratio, refined }) {
   const eye = new Eye(view, ratio);
   const [inner, order] = [new Set(), [root]];
-  let count = root.count;
+  let cost = eye.cost(root);
   const refine = (node, then) => {
-    const more = node.children.reduce((sum, child) => sum + child.count, -node.count);
-    if (count + more > most) return;
-    count += more;
+    const more = node.children.reduce((sum, child) => sum + eye.cost(child), -eye.cost(node));
+    if (cost + more > most) return;
+    cost += more;
     inner.add(node);
     for (const child of node.children) then(child);
   };

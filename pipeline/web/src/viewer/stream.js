@@ -7,10 +7,10 @@ import { readPart } from "./part.js";
 
 const PIXELS = 4; // of the screen: a smaller error is not refined; its Gaussians stand a quarter of a pixel from the truth
 const NARROW = "(max-width: 640px), (max-height: 520px), (pointer: coarse)";
-const MOST = { wide: 3_000_000, narrow: 600_000 }; // Gaussians drawn: what a computer, and what a phone does smoothly
+const MOST = { wide: 3_000_000, narrow: 800_000 }; // Gaussians seen: what a computer, and what a phone does smoothly
 const LITTLE_MEMORY_GB = 4; // of the machine: then as on a phone
-const KEPT = 2; // times as many Gaussians are kept at most, so that looking back asks for nothing
-const AT_ONCE = { wide: 4, narrow: 3 };
+const KEPT = 1.5; // times as many Gaussians are kept at most, if they are not shown: looking back asks for nothing
+const AT_ONCE = { wide: 4, narrow: 2 }; // files: each is decoded by a worker with memory of its own
 
 function size() {
   const small = matchMedia(NARROW).matches || (navigator.deviceMemory ?? Infinity) < LITTLE_MEMORY_GB;
@@ -51,18 +51,18 @@ export class LevelStream {
     this.time++;
     const ratio = this.stage.fullRatio;
     const { inner, order } = wantedLevels(this.root, view, { pixels: PIXELS, most: this.most, ratio, refined: this.refined });
-    for (const node of order) node.touched = this.time;
     const shown = this.cover(this.root, inner);
     this.refined = new Set();
     for (const node of shown) {
-      node.touched = this.time;
       for (let above = node.parent; above && !this.refined.has(above); above = above.parent) this.refined.add(above);
     }
     if (shown.length !== this.shown.length || shown.some((node, i) => node !== this.shown[i])) {
       this.shown = shown;
       this.stage.show(this.parts());
     }
-    this.queue.want(order.filter((node) => !node.part && !node.failed && !this.refined.has(node)).map((node) => node.file));
+    const useful = order.filter((node) => !this.refined.has(node)); // the others' descendants are shown
+    for (const node of [...shown, ...useful]) node.touched = this.time;
+    this.queue.want(useful.filter((node) => !node.part && !node.failed).map((node) => node.file));
     this.unload();
     this.settle();
   }
