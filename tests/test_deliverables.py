@@ -126,6 +126,7 @@ def test_tiles_stand_on_the_globe_and_the_site_is_whole(delivered: Path) -> None
     np.testing.assert_allclose(matrix, FRAME.origin.ecef_from_enu(), atol=1e-6)
     assert tileset["extensions"]["ESRI_crs"]["wkid"] == 32634
     assert (delivered / "tiles" / tileset["root"]["content"]["uri"]).is_file()
+    assert (delivered / "streamed-sog/lod-meta.json").is_file()
     assert (delivered.parent / "web/index.html").is_file() and (delivered.parent / "web/levels.json").is_file()
 
 

@@ -20,6 +20,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.levels import LevelNode, build_levels
 from splatpipe.pipeline.splat.scene import Scene
 from splatpipe.pipeline.splat.sh import C0
+from splatpipe.pipeline.splat.streamed_sog import write_streamed_sog
 from splatpipe.pipeline.surface.map_crs import open_map
 from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
 from splatpipe.pipeline.survey.frames import Frame
@@ -89,6 +90,8 @@ def write_deliverables(names: Sequence[str], run: RunSplat, out: Path, report: R
                 write_site(out / WEB, run.viewer, run.scene, run.levels)
             elif name == "tiles":
                 _write_tiles(run, folder / "tiles", report)
+            elif name == "streamed-sog":
+                write_streamed_sog(folder / name, run.scene, run.levels)
             else:
                 _write(name, run, folder)
         except SplatpipeError as error:

@@ -12,7 +12,15 @@ from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 
 EXPORT, WEB = "export", "web"
 """Folders of the formats below OUT."""
-FORMATS = (*(each.name for each in SPLAT_FORMATS if each.name != "ply"), "tiles", "web", "laz", "colmap", "transforms")
+FORMATS = (
+    *(each.name for each in SPLAT_FORMATS if each.name != "ply"),
+    "tiles",
+    "streamed-sog",
+    "web",
+    "laz",
+    "colmap",
+    "transforms",
+)
 """All that `export.formats` can name: a splat's, and those that take a run; `splat.ply` is always there."""
 
 
