@@ -52,7 +52,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunSplat:
 def delivered(run: RunSplat, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("delivered")
     sizes = write_deliverables(
-        ("tiles", "web", "model", "laz", "colmap", "transforms"), run, out, tiny_scene.Recorder()
+        ("tiles", "streamed-sog", "web", "model", "laz", "colmap", "transforms"), run, out, tiny_scene.Recorder()
     )
     assert all(size > 0 for size in sizes.values())
     return out / "export"

@@ -117,7 +117,7 @@ def _middle(gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
 def _core(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
     """Where nearly all centres are: by that the viewer finds what is near, and in the window.
 
-    A node's box is around whole Gaussians. A few large and far ones are in most nodes: all their boxes are about the eye.
+    A node's box is around whole Gaussians. A few large and far ones are in most nodes: their boxes are about the eye.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
     core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE, axis=0)
