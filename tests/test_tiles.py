@@ -84,6 +84,12 @@ def local_means(path: Path) -> np.ndarray:
     return np.stack([x, -z, y], axis=1)
 
 
+def apart(found: np.ndarray, expected: np.ndarray | torch.Tensor) -> float:
+    """Largest distance of one of either from the nearest of the others: files may hold them in any order."""
+    between = np.linalg.norm(found[:, None] - np.asarray(expected, np.float64)[None], axis=2)
+    return float(max(between.min(axis=0).max(), between.min(axis=1).max()))
+
+
 def test_the_tree_is_the_levels_and_lies_on_the_earth_at_its_root_alone(tmp_path: Path):
     scene, root = two_levels()
     matrix = np.arange(16.0).reshape(4, 4)
@@ -104,7 +110,7 @@ def test_the_tree_is_the_levels_and_lies_on_the_earth_at_its_root_alone(tmp_path
         box = corners(tile)
         assert (box[0] <= node.box[0]).all() and (box[1] >= node.box[1]).all()
         np.testing.assert_allclose(box, node.box, atol=0.002)
-        np.testing.assert_allclose(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means, atol=1e-4)
+        assert apart(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means) < 1e-4
 
 
 def test_attributes_are_those_that_cesium_takes(tmp_path: Path):
@@ -129,11 +135,11 @@ def test_a_site_of_three_kilometres_keeps_its_millimetres(tmp_path: Path):
     write_tiles(tmp_path, Scene(gaussians, FACTS), root, np.eye(4))
     worst = {0.0: 0.0, 1.0: 0.0}
     for node, tile in zip(root.nodes(), tiles(tileset(tmp_path)["root"]), strict=True):
-        off = np.abs(local_means(tmp_path / tile["content"]["uri"]) - node.gaussians.means.double().numpy()).max()
+        off = apart(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means)
         kind = 1.0 if node.children else 0.0
-        worst[kind] = max(worst[kind], float(off))
-    assert worst[1.0] < 0.25e-3  # of the coarsest: half a step of 1/4096 m, and float32 at 1.5 km
-    assert worst[0.0] < 0.2e-3
+        worst[kind] = max(worst[kind], off)
+    assert worst[1.0] < 0.6e-3  # of the coarsest: half a step of 1/2048 m along each axis, float32 at 1.5 km
+    assert worst[0.0] < 0.3e-3
 
 
 def test_points_lie_on_the_earth_where_pyproj_says(tmp_path: Path):
@@ -148,7 +154,7 @@ def test_points_lie_on_the_earth_where_pyproj_says(tmp_path: Path):
     there = f"+lat_0={PLACE.latitude} +lon_0={PLACE.longitude} +h_0={PLACE.height_m}"
     topocentric = pyproj.Transformer.from_pipeline(f"+proj=topocentric +ellps=WGS84 {there} +inv")
     expected = np.stack(topocentric.transform(*root.children[0].gaussians.means.double().numpy().T), axis=1)
-    assert np.abs(ecef - expected).max() < 1e-3
+    assert apart(ecef, expected) < 1e-3
 
 
 def test_programs_of_esri_are_told_the_crs_and_how_to_reach_it(tmp_path: Path):
@@ -211,7 +217,7 @@ def test_tiles_are_the_same_whatever_the_axes_of_the_scene(tmp_path: Path, axes)
     turned = scene.turned(axes)
     for name, each in (("a", scene), ("b", turned)):
         write_tiles(tmp_path / name, each, LevelNode(box_of(each.gaussians), 0.0, each.gaussians, ()), np.eye(4))
-    np.testing.assert_allclose(*(local_means(tmp_path / name / "tiles/0.glb") for name in "ab"), atol=1e-4)
+    assert apart(*(local_means(tmp_path / name / "tiles/0.glb") for name in "ab")) < 1e-3
     first, second = (tileset(tmp_path / name)["root"]["boundingVolume"]["box"] for name in "ab")
     np.testing.assert_allclose(first, second, atol=0.002)
 
