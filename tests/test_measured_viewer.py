@@ -111,6 +111,17 @@ def test_the_page_stays_and_the_store_takes_it_for_its_copy(out: Path) -> None:
     assert parts["export.viewer"].path.parent == newer.folder
 
 
+def test_the_page_for_web_hosts_shows_the_same(out: Path) -> None:
+    (out / "web").mkdir()
+    (out / "web/index.html").write_bytes(PLAIN)
+    assert renew_viewer(out) == ""
+    assert (out / "web/index.html").read_bytes() == (out / "viewer.html").read_bytes() != PLAIN
+    (out / "web/index.html").write_bytes(b"<title>of an earlier version</title>")
+    (out / "viewer.html").write_bytes(PLAIN)
+    assert "web/index.html is of an earlier version" in renew_viewer(out)
+    assert told(out)["sections"]
+
+
 def test_pages_that_differ_differ_in_size() -> None:
     one, other = (with_measurements(PLAIN, {"sections": [{"name": name}]}) for name in ("A", "B"))
     assert len(one) != len(other)

@@ -5,7 +5,7 @@ import { FileQueue } from "./files.js";
 import { wantedLevels } from "./levels.js";
 import { readPart } from "./part.js";
 
-const PIXELS = 4; // of the screen: a smaller error is not refined; its Gaussians stand a quarter of a pixel from the truth
+const PIXELS = 8; // of the screen: a smaller error is not refined; its Gaussians stand half a pixel from the truth
 const NARROW = "(max-width: 640px), (max-height: 520px), (pointer: coarse)";
 const MOST = { wide: 3_000_000, narrow: 800_000 }; // Gaussians seen: what a computer, and what a phone does smoothly
 const LITTLE_MEMORY_GB = 4; // of the machine: then as on a phone
