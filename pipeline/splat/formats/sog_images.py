@@ -160,10 +160,12 @@ def _colours(dc: Float[Tensor, "n 3"], opacity_logits: Float[Tensor, " n"], show
 def _harmonics(sh: Float[Tensor, "n k 3"], shown: Float[Tensor, " n"]) -> _Part:
     """A palette of all coefficients of a Gaussian, and which entry each Gaussian has."""
     rows = sh.flatten(1)
-    palette = fit_palette(rows, palette_size(len(rows)), shown) if len(rows) else torch.zeros(1, rows.shape[1])
+    palette, fitted = torch.zeros(1, rows.shape[1]), torch.zeros(0, dtype=torch.int64)
+    if len(rows):
+        palette, fitted = fit_palette(rows, palette_size(len(rows)), shown)
     codebook = fit_codebook(palette.numpy().ravel(), size=_HARMONIC_LEVELS)
     codes = nearest_codes(palette.numpy(), codebook)
-    labels = nearest_entries(rows, torch.from_numpy(codebook[codes])).numpy()
+    labels = nearest_entries(rows, torch.from_numpy(codebook[codes]), fitted).numpy()
     codes, labels = _by_first_use(codes, labels)
     room = np.zeros((-(-len(codes) // ENTRIES_A_ROW) * ENTRIES_A_ROW, *sh.shape[1:]), np.uint8)
     room[: len(codes)] = codes.reshape(len(codes), *sh.shape[1:])
