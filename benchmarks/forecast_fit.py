@@ -18,7 +18,7 @@ from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import NEIGHBOURS, CaptureSize, Units, Work
 
 KINDS = ("cpu_seconds", "peak_memory_bytes", "disk_bytes")
-BY_GAUSSIANS = ("train", "evaluate", "export")
+BY_GAUSSIANS = ("train", "clean", "evaluate", "export")
 """Stages whose memory grows with Gaussians, of which runs at `preview` have too few to tell how: what one takes is
 counted in training (`train/limits.py`), and was seen on seneca's 325,000 in the stages after it."""
 

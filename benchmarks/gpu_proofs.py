@@ -73,7 +73,7 @@ def train_capture(capture: str, on: str, out: Path, *, start: Path | None = None
     if start is not None:
         given = replace(given, parts={**given.parts, "initialize.splat": start})
     trained = loop.run(TrainConfig.model_validate(options), given, out, SilentReporter())
-    parts = {**given.parts, "train.model": out / "model.ply", "train.rendering": out / "rendering.json"}
+    parts = {**given.parts, "clean.model": out / "model.ply", "train.rendering": out / "rendering.json"}
     parts["train.sky"] = out / "sky.npz"
     found = evaluate.run(EvaluateConfig(), Inputs(parts, out, machine=given.machine), out, SilentReporter())
     return dict(trained), dict(found)

@@ -20,7 +20,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import Model, as_trained, render_pixels
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.stages.line import EXPORT, LINE, TRAIN
+from splatpipe.stages.line import CLEAN, EXPORT, LINE, TRAIN
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +69,10 @@ def open_run(out: Path) -> OpenedRun:
     """
     folder = open_run_folder(out, LINE)
     photos_dir, _ = folder.settings()
-    parts = folder.lineage(EXPORT, TRAIN)
+    parts = folder.lineage(EXPORT, CLEAN, TRAIN)
     if "train.model" not in parts:
         raise UsageError(f"{out} has no trained splat.", hint="Run to the end of training.")
-    gaussians = read_splat(parts["train.model"].path)
+    gaussians = read_splat(parts.get("clean.model", parts["train.model"]).path)
     options, megapixels = as_trained(parts["train.rendering"].path, gaussians)
     views = load_views(parts["undistort.dataset"].path)
     held_out = load_split(parts["split.views"].path).held_out

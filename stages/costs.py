@@ -65,6 +65,7 @@ REFERENCE = Costs(
             "split": StageCosts(0.0001, 259e6, 0.0, 18.3),
             "initialize": StageCosts(0.292, 538e6, 0.0, 206.0),
             "train": StageCosts(0.0896, 340e6, 1.0, 249.0),
+            "clean": StageCosts(1.5, 620e6, 560.0, 249.0),
             "evaluate": StageCosts(0.303, 1215e6, 500.0, 0.844e6),
             "export": StageCosts(2.07e-05, 620e6, 560.0, 375.0),
             "flythrough": StageCosts(0.3, 486e6, 0.0, 0.13e6),

@@ -45,7 +45,7 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     views = load_views(inputs["undistort.dataset"])
     held_out = load_split(inputs["split.views"]).held_out
     chosen = [view for view in views if view.camera.name in set(held_out)]
-    gaussians = read_splat(inputs["train.model"])
+    gaussians = read_splat(inputs["clean.model"])
     options, _ = as_trained(inputs["train.rendering"], gaussians)
     device = choose_device(inputs.machine.device)
     gaussians, sky = placed((gaussians, read_panorama(inputs["train.sky"])), device)

@@ -62,7 +62,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     cameras = [view.camera for view in load_views(dataset)]
 
     report.progress(0, 4, "moving the model into its frame", "files")
-    model = read_splat(inputs["train.model"])
+    model = read_splat(inputs["clean.model"])
     facts = facts_of(frame, load_rendering(inputs["train.rendering"]).antialias)
     area = read_world_area(inputs.parts.get("georef.boundary"))
     sky = read_panorama(inputs["train.sky"]) if config.sky else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from splatpipe.pipeline.edit.options import CleanConfig
 from splatpipe.pipeline.engine.stage import NamedFile, Shards, Stage
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
@@ -176,12 +177,20 @@ TRAIN = Stage(
         resumable=True,
     ),
 )
+CLEAN = Stage(
+    "clean",
+    version=1,
+    config=CleanConfig,
+    reads=("train.model", "train.rendering", "train.sky", "undistort.dataset", "split.views"),
+    parts={"model": "model.ply", "told": "cleaned.json"},
+    entry="splatpipe.stages.clean:run",
+)
 EVALUATE = Stage(
     "evaluate",
     version=10,
     config=EvaluateConfig,
     reads=(
-        "train.model",
+        "clean.model",
         "train.rendering",
         "train.sky",
         "undistort.dataset",
@@ -199,7 +208,7 @@ EXPORT = Stage(
     version=7,
     config=ExportConfig,
     reads=(
-        "train.model",
+        "clean.model",
         "train.rendering",
         "train.sky",
         "georef.frame",
@@ -228,7 +237,7 @@ FLYTHROUGH = Stage(
     "flythrough",
     version=4,
     config=FlythroughConfig,
-    reads=("train.model", "train.rendering", "train.sky", "undistort.dataset"),
+    reads=("clean.model", "train.rendering", "train.sky", "undistort.dataset"),
     parts={"film": "film"},
     entry="splatpipe.stages.flythrough:run",
     borrows=("train.time_budget_s",),
@@ -249,7 +258,7 @@ SPLAT_DEPTHS = Stage(
     version=1,
     config=SplatDepthsConfig,
     reads=(
-        "train.model",
+        "clean.model",
         "train.rendering",
         "train.sky",
         "train.exposures",
@@ -335,6 +344,7 @@ LINE = (
     INITIALIZE,
     BLOCKS,
     TRAIN,
+    CLEAN,
     EVALUATE,
     EXPORT,
     FLYTHROUGH,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
+from splatpipe.pipeline.edit.options import CleanConfig
 from splatpipe.pipeline.engine.stage import StageConfig
 from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
@@ -50,6 +51,7 @@ class LineConfig(StageConfig):
     initialize: InitializeConfig = InitializeConfig()
     blocks: BlocksConfig = BlocksConfig()
     train: TrainConfig = TrainConfig()
+    clean: CleanConfig = CleanConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     export: ExportConfig = ExportConfig()
     flythrough: FlythroughConfig = FlythroughConfig()

@@ -68,9 +68,9 @@ def _model(inputs: Inputs, out: Path, report: Reporter) -> tuple[Gaussians, Rend
     """
     if is_in_blocks(inputs["blocks.plan"]):
         report.note("trained in blocks, whose Gaussians no training holds at once: depths are the splat's as it is")
-        return read_splat(inputs["train.model"]), render_depth
+        return read_splat(inputs["clean.model"]), render_depth
     trained = TrainedParts(
-        inputs["train.model"],
+        inputs["clean.model"],
         inputs["train.rendering"],
         inputs["train.sky"],
         inputs["train.exposures"],

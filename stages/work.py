@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.film.options import MOST_FILM_MEGAPIXELS
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
@@ -63,6 +64,7 @@ PARALLEL = {
     "initialize": 0.85,
     "blocks": 0.93,
     "train": 0.93,
+    "clean": 0.75,
     "evaluate": 0.75,
     "export": 0.2,
     "flythrough": 0.7,
@@ -324,6 +326,7 @@ class Work:
         keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
         judged = photos * min(self.kept_at, JUDGED_MEGAPIXELS)
         depths = photos * min(self.kept_at, self.config.depths.max_megapixels)
+        looked_through = photos * min(self.kept_at, SEEN_MEGAPIXELS)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
         done = self.done
@@ -350,6 +353,7 @@ class Work:
             "initialize": Units(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
             "blocks": Units(done * self.coarse_training, coarse_state, 0.0),
             "train": Units(done * self.training, state, gaussians),
+            "clean": Units(looked_through, gaussians, gaussians),
             "evaluate": Units(judged, gaussians, judged),
             "export": Units(gaussians, gaussians, gaussians),
             "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),

@@ -202,7 +202,7 @@ def test_evaluate_leaves_it_in_its_metrics(parts: dict[str, Path], tmp_path: Pat
     plan = make_plan(TrainConfig(antialias=False), load_views(dataset), tiny_scene.split_of(load_views(dataset), 4), 1)
     (tmp_path / "rendering.json").write_text(plan.rendering().to_json())
     write_panorama(tmp_path / "sky.npz", None)
-    files = {"train.model": "model.ply", "train.rendering": "rendering.json", "train.sky": "sky.npz"}
+    files = {"clean.model": "model.ply", "train.rendering": "rendering.json", "train.sky": "sky.npz"}
     inputs = Inputs(
         {name: tmp_path / file for name, file in files.items()}
         | parts

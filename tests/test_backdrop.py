@@ -77,7 +77,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     (folder / "boundary.json").write_text(
         json.dumps(part | {"degrees": [[[[20.9, 52.2], [20.91, 52.2], [20.9, 52.21]]]]})
     )
-    names = {"train.model": "model.ply", "train.rendering": "rendering.json", "train.sky": "sky.npz"}
+    names = {"clean.model": "model.ply", "train.rendering": "rendering.json", "train.sky": "sky.npz"}
     names |= {"georef.frame": "frame.json", "georef.boundary": "boundary.json", "evaluate.metrics": "metrics.json"}
     parts = {part: folder / name for part, name in names.items()}
     parts |= {"undistort.dataset": dataset, "georef.model": dataset / "sparse/0"} | tiny_scene.split_part(dataset, 4)

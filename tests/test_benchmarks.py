@@ -143,7 +143,7 @@ def test_time_to_quality_trains_and_measures_what_the_line_does(dataset: Path, t
     (row,) = found["rows"]
 
     parts = {"undistort.dataset": dataset, "initialize.splat": tmp_path / "init.ply"}
-    parts |= {"train.model": tmp_path / "model.ply", "train.rendering": tmp_path / "rendering.json"}
+    parts |= {"clean.model": tmp_path / "model.ply", "train.rendering": tmp_path / "rendering.json"}
     parts["train.sky"] = tmp_path / "sky.npz"
     parts |= tiny_scene.split_part(dataset, names=held_out)
     inputs = Inputs(parts, tmp_path, machine=Machine("cpu", 1))

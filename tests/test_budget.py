@@ -370,7 +370,7 @@ def test_photos_are_trained_on_at_the_planned_size_and_measured_at_the_datasets(
     trained(scene, out, plan, monkeypatch)
     widths = {point["width"] for point in json.loads((out / "history.json").read_text())["curve"]}
     assert len(widths) == 1 and widths.pop() < tiny_scene.WIDTH
-    parts = {"train.model": out / "model.ply", "train.rendering": out / "rendering.json", "train.sky": out / "sky.npz"}
+    parts = {"clean.model": out / "model.ply", "train.rendering": out / "rendering.json", "train.sky": out / "sky.npz"}
     parts |= {"undistort.dataset": scene / "dataset"} | tiny_scene.split_part(scene / "dataset", 4)
     evaluate.run(EvaluateConfig(), Inputs(parts, scene), out, tiny_scene.Recorder())
     for view in json.loads((out / "metrics.json").read_text())["per_view"]:

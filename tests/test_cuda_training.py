@@ -341,7 +341,7 @@ def test_a_memory_limit_is_the_trainings_alone(scene: Path, tmp_path: Path, monk
 
 def test_held_out_photos_are_measured_the_same(scene: Path, whole: Path, tmp_path: Path) -> None:
     parts = dict(make_inputs(scene).parts)
-    parts |= {"train.model": whole / "model.ply", "train.rendering": whole / "rendering.json"}
+    parts |= {"clean.model": whole / "model.ply", "train.rendering": whole / "rendering.json"}
     parts |= {"train.sky": whole / "sky.npz"}
     found = []
     for device in (cpu(), ON_CUDA):

@@ -95,7 +95,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     )
     (folder / "rendering.json").write_text(plan.rendering().to_json())
     parts = {
-        "train.model": folder / "model.ply",
+        "clean.model": folder / "model.ply",
         "train.rendering": folder / "rendering.json",
         "train.sky": folder / "sky.npz",
         "undistort.dataset": dataset,
@@ -135,14 +135,14 @@ def test_splat_looks_the_same_from_the_exported_cameras(inputs: Inputs, exported
         pose[:3, 3] = -pose[:3, :3] @ np.array(entry["position"])
         shape = (entry["width"], entry["height"], entry["fx"], entry["fy"])
         moved = Camera(entry["img_name"], *shape, camera.cx, camera.cy, pose)
-        before = render(inputs["train.model"], camera, 0.01)
+        before = render(inputs["clean.model"], camera, 0.01)
         after = render(exported / "splat.ply", moved, 0.01 * SCALE)
         assert before.std() > 0.1
         assert metrics.psnr(after, before) >= 50.0
 
 
 def test_positions_and_sizes_are_in_the_world_frame(inputs: Inputs, exported: Path) -> None:
-    before = read_splat(inputs["train.model"])
+    before = read_splat(inputs["clean.model"])
     vertex = PlyData.read(str(exported / "splat.ply"))["vertex"]
     means = np.stack([vertex[axis] for axis in "xyz"], axis=1)
     np.testing.assert_allclose(means, SCALE * before.means.numpy() @ ROTATION.T + TRANSLATION, atol=1e-4)
@@ -185,7 +185,7 @@ def test_the_crs_and_its_operation_are_told(inputs: Inputs, tmp_path: Path) -> N
 
 
 def test_broken_gaussians_stay_out_of_the_file(inputs: Inputs, tmp_path: Path) -> None:
-    model = read_splat(inputs["train.model"])
+    model = read_splat(inputs["clean.model"])
     model.quats[0] = 0.0
     model.log_scales[1, 0] = float("nan")
     moved = in_world(model, load_frame(inputs["georef.frame"]))

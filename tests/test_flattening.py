@@ -132,13 +132,14 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     (folder / "exposures.json").write_text(exposures_json(Exposure(names)))
     (folder / "blocks.json").write_text('{"shards": 0}')
     found = {"undistort.dataset": dataset, "blocks.plan": folder / "blocks.json"}
-    files = {"model": "model.ply", "rendering": "rendering.json", "sky": "sky.npz", "exposures": "exposures.json"}
+    found["clean.model"] = folder / "model.ply"
+    files = {"rendering": "rendering.json", "sky": "sky.npz", "exposures": "exposures.json"}
     found |= {f"train.{name}": folder / file for name, file in files.items()}
     return found | tiny_scene.split_part(dataset, 4)
 
 
 def trained(parts: dict[str, Path]) -> TrainedParts:
-    names = ("train.model", "train.rendering", "train.sky", "train.exposures", "undistort.dataset", "split.views")
+    names = ("clean.model", "train.rendering", "train.sky", "train.exposures", "undistort.dataset", "split.views")
     return TrainedParts(*(parts[name] for name in names))
 
 
@@ -162,7 +163,7 @@ def test_copy_is_flatter_and_the_same_for_any_threads_and_after_a_kill(
     once.mkdir()
     twice.mkdir()
     model = flatten(trained(parts), Machine("cpu", 1), once, tiny_scene.Recorder())
-    before = read_splat(parts["train.model"])
+    before = read_splat(parts["clean.model"])
     assert len(model) == len(before)
     # A tenth of the shipped length takes off a tenth.
     assert spread_of(model, parts["undistort.dataset"]) < 0.95 * spread_of(before, parts["undistort.dataset"])

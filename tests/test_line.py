@@ -171,13 +171,21 @@ def test_a_second_run_does_nothing(photos: Path, copy_of_run: Path) -> None:
 
 def test_changed_option_reruns_only_downstream(photos: Path, copy_of_run: Path) -> None:
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK, "train.iterations=40"))
-    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough"]
+    assert ran(told) == ["blocks", "train", "clean", "evaluate", "export", "flythrough"]
 
 
 def test_a_budget_is_planned_shown_and_reused(photos: Path, copy_of_run: Path) -> None:
     budgets = ("--time-budget", "8s", "--max-memory", "4G")
     told = splatpipe("run", photos, copy_of_run, *sets(*QUICK), *budgets)
-    assert ran(told) == ["blocks", "train", "evaluate", "export", "flythrough", *SURFACES]  # which it turns off
+    assert ran(told) == [
+        "blocks",
+        "train",
+        "clean",
+        "evaluate",
+        "export",
+        "flythrough",
+        *SURFACES,
+    ]  # which it turns off
     events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text().splitlines()]
     notes = [event["data"]["message"] for event in events if event["kind"] == "note"]
     assert any(note.startswith("plan: ") and "8 s budget, within 4.0 GB" in note for note in notes), notes

@@ -235,8 +235,8 @@ def tiny_parts(folder: Path, dataset: Path) -> dict[str, Path]:
         .to_json()
     )
     write_panorama(folder / "sky.npz", None)
-    found = {"model": folder / "model.ply", "rendering": folder / "rendering.json", "sky": folder / "sky.npz"}
-    return {f"train.{name}": path for name, path in found.items()} | {"undistort.dataset": dataset}
+    found = {"clean.model": folder / "model.ply", "undistort.dataset": dataset}
+    return found | {"train.rendering": folder / "rendering.json", "train.sky": folder / "sky.npz"}
 
 
 def tiny_film(folder: Path, views: list[Camera] | None = None, budget_s: float = 0.0, **options: object) -> tuple:

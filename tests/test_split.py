@@ -56,7 +56,6 @@ def test_no_stage_borrows_what_the_split_decides() -> None:
     """All who ask read its part, after it."""
     order = [stage.name for stage in LINE]
     readers = [stage.name for stage in LINE if "split.views" in stage.reads]
-    assert readers == ["initialize", "blocks", "train", "evaluate", "splat_depths"] and order.index(
-        "split"
-    ) < order.index("initialize")
+    assert readers == ["initialize", "blocks", "train", "clean", "evaluate", "splat_depths"]
+    assert order.index("split") < order.index("initialize")
     assert not [name for stage in LINE for name in stage.borrows if name.startswith(("split.", "evaluate."))]

@@ -76,7 +76,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def make_inputs(scene: Path, out: Path, threads: int = 1) -> Inputs:
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
     parts |= tiny_scene.split_part(scene / "dataset", 3)
-    parts |= {"train.model": out / "model.ply", "train.rendering": out / "rendering.json", "train.sky": out / "sky.npz"}
+    parts |= {"clean.model": out / "model.ply", "train.rendering": out / "rendering.json", "train.sky": out / "sky.npz"}
     return Inputs(parts, scene, machine=Machine("cpu", threads))
 
 

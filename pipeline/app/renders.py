@@ -39,7 +39,7 @@ from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.view_measures import flat_stems
 from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.stages.line import EXPORT, FLYTHROUGH, LINE, TRAIN
+from splatpipe.stages.line import CLEAN, EXPORT, FLYTHROUGH, LINE, TRAIN
 
 ORBIT_STILLS = 12
 FOLDER = "renders"  # below OUT
@@ -269,7 +269,9 @@ def _parts(out: Path) -> dict[str, Path]:
     Raises:
         UsageError: if training is not done.
     """
-    found = {name: part.path for name, part in open_run_folder(out, LINE).lineage(EXPORT, TRAIN).items()}
+    found = {name: part.path for name, part in open_run_folder(out, LINE).lineage(EXPORT, CLEAN, TRAIN).items()}
+    if "train.model" in found:
+        found.setdefault("clean.model", found["train.model"])  # not cleaned yet, or by a splatpipe that did not
     missing = [name for name in READ if name not in found]
     if missing and "train.model" in found:
         raise UsageError(

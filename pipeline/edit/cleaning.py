@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from splatpipe.pipeline.edit.isolation import Shapes, Touch, far_groups, held
@@ -41,6 +42,8 @@ WORTH = (-0.015, -0.005, -0.003)
 make what is behind them look bad, and those left are judged anew."""
 FEW_PHOTOS = 2.0  # that see what hangs loosely: one photo makes up anything before its own picture
 OVERSIZED = 0.2  # times the distance to the nearest camera, that a floating Gaussian's standard deviation is large
+HAZE = 0.3  # opacity below which a very large Gaussian is no thing, where there are no photos to say so
+EXTENT = (0.05, 0.95)  # quantiles of the centres, between which a scene extends
 BORDER = 0.8  # share of what is seen of one at the borders of pictures: hardly covered
 FEW = 100  # that hang together and are no scene
 LOOKS = 1 + len(WORTH)  # passes over the photos, with pictures
@@ -79,6 +82,16 @@ def clean_scene(gaussians: Gaussians, photos: Photos | None = None, told: Told |
     return Cleaned(torch.from_numpy(keep), removed)
 
 
+def told_in_a_line(cleaned: Cleaned) -> str:
+    """What was removed and why, for people; that nothing was, where it is so."""
+    count, total = sum(cleaned.removed.values()), len(cleaned.keep)
+    if not count:
+        return "Nothing had to be removed."
+    ordered = sorted(cleaned.removed.items(), key=lambda entry: -entry[1])  # sorted keeps the order of equals
+    why = ", ".join(f"{number:,} {reason}" for reason, number in ordered if number)
+    return f"Removed {count:,} of {total:,} Gaussians: {why}."
+
+
 def _untold(_done: int, _total: int) -> None:
     """Where nobody listens."""
 
@@ -89,6 +102,7 @@ def _found(gaussians: Gaussians, photos: Photos | None, told: Told) -> Iterator[
     yield "transparent", opacity < TRANSPARENT
     shapes, solid = Shapes.of(gaussians), opacity >= SOLID
     if photos is None or not photos.cameras:
+        yield "oversized", _haze(shapes, opacity)
         yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
         return
     steps = len(photos.cameras) * (1 if photos.picture is None else LOOKS)
@@ -97,17 +111,19 @@ def _found(gaussians: Gaussians, photos: Photos | None, told: Told) -> Iterator[
     floats = seen & (found.floating > FLOATING)
     ground = seen & ~floats & solid
     loose = floats & ~held(shapes, LOOSE, ground, floats & solid)
-    yield "oversized", floats & _oversized(shapes, photos)
+    large = floats & _oversized(shapes, photos)
     yield "seen by too few photos", loose & (found.photos < FEW_PHOTOS)
     unseen = found.weight < UNSEEN_PIXELS
     yield "seen by none", unseen & ~held(shapes, LOOSE, seen & solid, unseen & solid)
     yield "beyond the photos", _at_edges(found, shapes, seen & solid)
     if photos.picture is None:
-        yield "floating", loose & solid
+        yield "floating", loose & solid & ~large  # which may be all that shows what is far behind
         return
-    suspected = floats & solid & ~held(shapes, SUSPECTED, ground, floats & solid)
+    suspected = large | (floats & solid & ~held(shapes, SUSPECTED, ground, floats & solid))
     looked = len(photos.cameras)
-    yield "floating", _unwanted(gaussians, suspected, photos, found, lambda done: told(looked + done, steps))
+    unwanted = _unwanted(gaussians, suspected, photos, found, lambda done: told(looked + done, steps))
+    yield "oversized", unwanted & large
+    yield "floating", unwanted
     told(steps, steps)
 
 
@@ -117,6 +133,12 @@ def _oversized(shapes: Shapes, photos: Photos) -> Flags:
     for camera in photos.cameras:
         np.minimum(nearest, np.linalg.norm(shapes.centres - camera.centre(), axis=1), out=nearest)
     return np.asarray(shapes.largest > OVERSIZED * nearest)
+
+
+def _haze(shapes: Shapes, opacity: Float32[np.ndarray, " n"]) -> Flags:
+    """Which Gaussians are very large for the scene and hardly there; large solid ones may be its sky."""
+    low, high = np.quantile(shapes.centres, EXTENT, axis=0) if len(shapes.centres) else (np.zeros(3), np.zeros(3))
+    return np.asarray((shapes.largest > OVERSIZED * float(np.linalg.norm(high - low))) & (opacity < HAZE))
 
 
 def _at_edges(found: Sightings, shapes: Shapes, solid: Flags) -> Flags:
@@ -130,13 +152,22 @@ def _unwanted(
 ) -> Flags:
     """Which of the suspected make renders less like the photos."""
     gone = np.zeros(len(gaussians), np.bool_)
+    worth = np.zeros(len(gaussians), np.float32)
+    is_known = False
     for number, limit in enumerate(WORTH):
         left = np.flatnonzero(~gone)
         asked = suspected[left] & ~gone[left]
         if not asked.any():
             break
-        of_left = gaussians.select(torch.from_numpy(left).to(gaussians.means.device)) if gone.any() else gaussians
-        looks = number * len(photos.cameras)
-        worth = worth_in_photos(of_left, asked, photos, lambda done, looks=looks: told(looks + done))  # type: ignore[misc]
-        gone[left[asked & (worth < limit * found.weight[left])]] = True
+        if not is_known:
+            of_left = gaussians.select(torch.from_numpy(left).to(gaussians.means.device)) if gone.any() else gaussians
+            looks = number * len(photos.cameras)
+            worth[left] = worth_in_photos(of_left, asked, photos, partial(_after, told, looks))
+        bad = left[asked & (worth[left] < limit * found.weight[left])]
+        gone[bad] = True
+        is_known = not len(bad)  # nothing that those left are seen through has gone
     return gone
+
+
+def _after(told: Callable[[int], None], before: int, done: int) -> None:
+    told(before + done)

@@ -25,8 +25,6 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama
 from splatpipe.pipeline.splat.sh import C0
 
-SEEN_MEGAPIXELS = 0.3
-"""Of the pictures that tell: a floater that hides something is larger than their pixels."""
 LEAST_SEEN = 1e-3  # of a pixel: less is rounding
 BORDER_SHARE = 0.08  # of a picture's shorter side, that is its border: what only borders show was hardly covered
 BEFORE_SHARE = 0.005  # of the depth, that a Gaussian is before what is behind islands: depths are as good as that
@@ -38,7 +36,7 @@ class Photos:
     """The photos that a splat was trained on.
 
     Attributes:
-        cameras: Small (``SEEN_MEGAPIXELS``), whole pictures.
+        cameras: Small (``options.SEEN_MEGAPIXELS``), whole pictures.
         options: As the splat is rendered.
         picture: A photo, (h, w, 3) RGB, and its mask, of its camera's size; None where only cameras are known.
         sky: What is behind the splat.

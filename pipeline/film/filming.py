@@ -67,17 +67,17 @@ def _even(length: float) -> int:
 
 
 def open_scene(parts: Mapping[str, Path], threads: int, device: Device) -> TrainedScene:
-    """Read what training left.
+    """Read what training and cleaning left.
 
     Args:
-        parts: `train.model`, `train.rendering`, `train.sky` and `undistort.dataset`.
+        parts: `clean.model`, `train.rendering`, `train.sky` and `undistort.dataset`.
         threads: That read photos, where these have to tell which way is up.
         device: What it is rendered on.
 
     Raises:
         StageError: if one is broken.
     """
-    gaussians = read_splat(parts["train.model"])
+    gaussians = read_splat(parts["clean.model"])
     options, megapixels = as_trained(parts["train.rendering"], gaussians)
     sky = read_panorama(parts["train.sky"])
     views = load_views(parts["undistort.dataset"])

@@ -224,10 +224,18 @@ def _link(name: str, file: str, folder: Path) -> str:
     return f"{name}/{file}" if (folder / file).is_file() else ""
 
 
+_SUMMARIES = (
+    ("sparse", ("registered",)),
+    ("train", ("gaussians",)),
+    ("clean", ("gaussians",)),  # what of them is delivered
+    ("evaluate", ("psnr", "ssim")),
+)
+
+
 def _figures(holdings: Holdings) -> dict[str, float | int]:
     """What people ask for first."""
     found: dict[str, float | int] = {}
-    for stage, names in (("sparse", ("registered",)), ("train", ("gaussians",)), ("evaluate", ("psnr", "ssim"))):
+    for stage, names in _SUMMARIES:
         summary = holdings.summary(stage)
         found |= {name: summary[name] for name in names if isinstance(summary.get(name), int | float)}
     with suppress(OSError, ValueError, KeyError, TypeError):

@@ -18,7 +18,7 @@ from splatpipe.pipeline.app.batch.shards import counts_shards
 from splatpipe.pipeline.engine.stage import JSON, Stage, stage_name
 
 SNAKEFILE = "Snakefile"
-GPU_STAGES = ("blocks", "train", "evaluate", "flythrough")
+GPU_STAGES = ("blocks", "train", "clean", "evaluate", "flythrough")
 
 _HEAD = """\
 # Written by splatpipe batch for one call; the next call writes its own.

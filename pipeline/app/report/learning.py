@@ -42,6 +42,7 @@ def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
         ("Blocks", _blocks(holdings)),
         ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
         ("Gaussians", f"{count(gaussians)}, {count(holdings.summary('initialize').get('gaussians'))} at the beginning"),
+        ("Cleaned", removed_in_words(holdings.summary("clean"))),
         (
             "Size of the photos",
             f"{number(summary.get('train_megapixels'), 2)} megapixels",
@@ -64,6 +65,19 @@ def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
     if drawn:
         chapter["charts"] = _curve_charts(curves, None if planned is None else float(planned))
     return chapter
+
+
+def removed_in_words(summary: Mapping[str, Any]) -> str:
+    """How many Gaussians were removed from what was trained, and why; nothing where nobody looked.
+
+    Args:
+        summary: Of the stage `clean`.
+    """
+    reasons = summary.get("reasons")
+    if reasons is None:
+        return ""
+    why = ", ".join(f"{count(number)} {reason}" for reason, number in reasons.items() if number)
+    return f"{count(sum(reasons.values()))} removed: {why}" if why else "none removed"
 
 
 def views_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:

@@ -132,7 +132,7 @@ def _cards(holdings: Holdings) -> list[tuple[str, str, str]]:
         at = f", at {size} megapixels" if (size := judged_size(evaluate)) else ""
         cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text + at + inside))
     if train:
-        cards.append(("Gaussians", count(train.get("gaussians")), ""))
+        cards.append(("Gaussians", count(holdings.summary("clean").get("gaussians", train.get("gaussians"))), ""))
     seconds = [float(artifact.manifest["seconds"]) for artifact in holdings.artifacts.values()]
     if seconds:
         cards.append(("Computed in", duration(sum(seconds)), "all stages, by the clock"))

@@ -78,7 +78,7 @@ def newest(opened: Contents) -> Source | None:
     if "train.model" in opened.parts:
         if "train.rendering" not in opened.parts:  # of an earlier splatpipe: how it was rendered is not known
             return None
-        part = opened.parts["train.model"]
+        part = opened.parts.get("clean.model", opened.parts["train.model"])
         rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
         return Source(part.path, "model", part.digest[:16], rendering, sky)
     folder = opened.working.get("train")

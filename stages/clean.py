@@ -1,0 +1,89 @@
+"""clean: the trained splat without floaters, haze, and what no photo shows; what is measured and delivered."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from splatpipe.pipeline.edit.cleaning import Cleaned, clean_scene, told_in_a_line
+from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS, CleanConfig
+from splatpipe.pipeline.edit.sightings import Photos
+from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.dataset import load_split, load_views
+from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.raster.device import choose_device
+from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.render.rendering import as_trained
+from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.panorama import read_panorama
+from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat_parts
+
+
+def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `model.ply`, the trained model's own bytes where nothing is removed, and `cleaned.json`.
+
+    Raises:
+        SplatpipeError: if a file is missing or broken.
+        MachineError: if the device asked for is not there.
+    """
+    trained, model = inputs["train.model"], out / "model.ply"
+    if not config.enabled:
+        report.progress(1, 1, "nothing is removed", "steps")
+        shutil.copyfile(trained, model)
+        write_json(out / "cleaned.json", {"removed": {}})
+        return {"removed": 0}
+    gaussians = read_splat(trained)
+    device = choose_device(inputs.machine.device)
+    with same_bits(inputs.machine.threads):
+        cleaned = _cleaned(gaussians.to(device.tensors), inputs, report)
+    removed = sum(cleaned.removed.values())
+    if removed:
+        kept = (piece.select(keep) for piece, keep in _pieces(gaussians, cleaned.keep))
+        count, comments = len(gaussians) - removed, read_splat_header(trained).comments
+        write_splat_parts(model, kept, count, gaussians.sh_degree, comments)
+        report.note(told_in_a_line(cleaned))
+    else:
+        shutil.copyfile(trained, model)
+    write_json(out / "cleaned.json", {"gaussians": len(gaussians), "removed": cleaned.removed})
+    return {
+        "gaussians": len(gaussians) - removed,
+        "removed": removed,
+        "reasons": cleaned.removed,
+        "device": device.name,
+    }
+
+
+def _cleaned(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> Cleaned:
+    """By the photos that it was trained on: those held out are to measure it, and say nothing here."""
+    held_out = set(load_split(inputs["split.views"]).held_out)
+    views = [view for view in load_views(inputs["undistort.dataset"]) if view.camera.name not in held_out]
+    options, _ = as_trained(inputs["train.rendering"], gaussians)
+    sky = read_panorama(inputs["train.sky"])
+
+    def picture(index: int) -> tuple[Pixels, Mask | None]:
+        _, photo, mask = reduced_view(views[index], SEEN_MEGAPIXELS)
+        return photo, mask
+
+    photos = Photos(
+        [reduced_camera(view.camera, SEEN_MEGAPIXELS) for view in views],
+        options,
+        picture,
+        None if sky is None else sky.to(gaussians.means.device),
+    )
+
+    def told(done: int, total: int) -> None:
+        report.progress(done, total, "looking for floaters", "photos")
+
+    return clean_scene(gaussians, photos, told)
+
+
+def _pieces(gaussians: Gaussians, keep: Bool[Tensor, " n"]) -> Iterator[tuple[Gaussians, Bool[Tensor, " m"]]]:
+    start = 0
+    for piece in gaussians.pieces():
+        yield piece, keep[start : start + len(piece)]
+        start += len(piece)
