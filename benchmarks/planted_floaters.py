@@ -20,7 +20,8 @@ from opened_run import OpenedRun, open_run
 from tables import Row, print_table
 
 from splatpipe.pipeline.edit.cleaning import clean_scene
-from splatpipe.pipeline.edit.sightings import SEEN_MEGAPIXELS, Photos
+from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
+from splatpipe.pipeline.edit.sightings import Photos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.render.rendering import Model, render_pixels

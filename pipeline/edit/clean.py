@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from splatpipe.pipeline.edit.cleaning import clean_scene
-from splatpipe.pipeline.edit.sightings import SEEN_MEGAPIXELS, Photos
+from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
+from splatpipe.pipeline.edit.sightings import Photos
 from splatpipe.pipeline.edit.workpiece import Workpiece
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
