@@ -55,6 +55,8 @@ SPLAT_FORMATS = (
     SplatFormat("ply", "splat.ply", "plain_ply", exact=True),
     SplatFormat("viewer-ply", "splat.viewer.ply", "plain_ply", "write_for_viewers", reads=False),
     SplatFormat("compressed-ply", "splat.compressed.ply", "compressed_ply"),
+    SplatFormat("spz", "splat.spz", "spz"),
+    SplatFormat("spz2", "splat.spz2.spz", "spz", "write_version_2", reads=False),
     SplatFormat("model", "model", "model_folder", exact=True),
     SplatFormat("sog", "splat.sog", "sog"),
     SplatFormat("glb", "splat.glb", "glb"),
