@@ -142,7 +142,7 @@ def test_harmonics_are_finer_where_more_is_seen_of_them() -> None:
 
 def test_positions_are_as_fine_as_the_gaussians_are_small() -> None:
     made = some_gaussians(400)
-    for log_scale, bits in ((0.0, 11), (-6.0, 13), (-30.0, 16)):  # at most 16: 100 units fill 24 bits
+    for log_scale, bits in ((0.0, 12), (-6.0, 13), (-30.0, 16)):  # at most 16: 100 units fill 24 bits
         made.log_scales[:] = log_scale
         head, found = read(spz_bytes(made, antialias=False))
         assert head["bits"] == bits

@@ -31,7 +31,7 @@ SPZ_FROM_Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 RECORD_FIELD = b"sp"
 """Names the record in gzip's extra field (RFC 1952, 2.3.1.1), which readers of SPZ pass over."""
 POSITION_STEPS = 2**23 - 1
-LEAST_FRACTIONAL_BITS, MOST_FRACTIONAL_BITS = 11, 20  # half a millimetre where a unit is a metre
+LEAST_FRACTIONAL_BITS, MOST_FRACTIONAL_BITS = 12, 20  # the reference's: a quarter of a millimetre in metres
 FINEST_QUANTILE, STEPS_PER_SIZE = 0.05, 16.0  # nearly all Gaussians are as many steps large: finer ones are noise
 RANGE_PER_SCENE = 16.0  # of the distances of nearly all Gaussians: what is beyond is brought in
 SCENE_QUANTILE = 0.99
