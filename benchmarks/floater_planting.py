@@ -22,6 +22,7 @@ NEAREST = 0.06  # of the depth: what is nearer to a camera is haze
 SIGMAS = 2.0  # that a floater's extent keeps from the surface
 SEEN_ALPHA = 8.0 / 255.0  # at its centre: what is fainter no photo shows
 DEPTH_MARGIN = 0.03  # of a depth: so near to the surface, a Gaussian is of it
+TOUCHING = 0.01  # of a depth: what is so near to it in two views is no floater
 CAMERAS = 24  # whose depths are rendered, spread over the capture
 FAR = 2.0  # times a picture's median depth: what is farther is not what it was taken for
 SURE_VIEWS = 2  # that see a Gaussian at its surface, for it to be of the building
@@ -92,8 +93,9 @@ def plant(
 
     Each lies on a ray of a random pixel of a random camera before the surface there, as far along it as is uniform in
     the volume that the pixel sees (near a surface: 1.5 to 5 % of the depth before it; haze: 6 to 15 % from the camera),
-    and keeps clear of the surface by twice its size. It is a copy of a Gaussian of a surface, in a size of its kind,
-    and as opaque as real ones. What none shows that sees it is planted again elsewhere.
+    and keeps clear of the surface by twice its size; and no two cameras see a surface just there. It is a copy of a
+    Gaussian of a surface, in a size of its kind, and as opaque as real ones. What none shows that sees it is planted
+    again elsewhere.
     """
     building = on_surfaces(model, sights)
     donors = _donors(model, building)
@@ -102,6 +104,7 @@ def plant(
         left = round(SHARES[kind] * per_kind)
         while left > 0:
             part = _attempt(model, donors, sights[generator.integers(len(sights))], kind, options, generator)
+            part = part.select(torch.from_numpy(~_at_surfaces(part, sights, TOUCHING)))
             part = part.first(min(left, len(part)))
             left -= len(part)
             parts.append(part)
@@ -111,11 +114,15 @@ def plant(
 
 def on_surfaces(model: Gaussians, sights: Sequence[Sight]) -> Bool[np.ndarray, " n"]:
     """Which Gaussians lie where at least two cameras see a surface."""
-    means, agreeing = model.means.double().numpy(), np.zeros(len(model), int)
-    for sight in sights:
-        agreeing += np.abs(sight.gaps(means)) < DEPTH_MARGIN  # NaN is not near
     opaque = torch.sigmoid(model.opacity_logits).numpy() > SEEN_ALPHA
-    return np.asarray((agreeing >= min(SURE_VIEWS, len(sights))) & opaque)
+    return np.asarray(_at_surfaces(model, sights, DEPTH_MARGIN) & opaque)
+
+
+def _at_surfaces(gaussians: Gaussians, sights: Sequence[Sight], margin: float) -> Bool[np.ndarray, " n"]:
+    means, agreeing = gaussians.means.double().numpy(), np.zeros(len(gaussians), int)
+    for sight in sights:
+        agreeing += np.abs(sight.gaps(means)) < margin  # NaN is not near
+    return np.asarray(agreeing >= min(SURE_VIEWS, len(sights)))
 
 
 def _donors(model: Gaussians, building: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " d"]:

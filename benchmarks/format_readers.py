@@ -84,15 +84,17 @@ def check_splat_transform(bench: Bench) -> Iterator[Row]:
 
 
 def check_streamed_sog(bench: Bench) -> Iterator[Row]:
-    """Streamed SOG: every part of the first level by itself, which is SOG; all of them together are the splat."""
-    kind = format_named("streamed-sog")
-    path = bench.file(kind)
-    facts = json.loads(path.read_text(encoding="utf-8"))
-    names = [name for name in facts["filenames"] if name.startswith("0_")]
-    count = sum(len(bench.others.read(path.parent / name).gaussians) for name in names)
+    """Streamed SOG of `splatpipe export`: each file of the first level is a SOG, and together they are the splat."""
+    path = bench.out / "export/streamed-sog/lod-meta.json"
+    if not path.is_file():
+        yield line("splat-transform", "streamed-sog", "is there", "splatpipe export OUT --format streamed-sog", False)
+        return
+    names = json.loads(path.read_text(encoding="utf-8"))["filenames"]
+    finest = [name for name in names if name.startswith("0_")]
+    count = sum(len(bench.others.read(path.parent / name).gaussians) for name in finest)
     whole = len(bench.capture.scene.gaussians)
-    figure = f"{count:,} of {whole:,} in {len(names)} of {len(facts['filenames'])} files"
-    yield line("splat-transform", kind.name, "its finest level is the splat", figure, count == whole)
+    figure = f"{count:,} of {whole:,} in {len(finest)} of {len(names)} files"
+    yield line("splat-transform", "streamed-sog", "its finest level is the splat", figure, count == whole)
 
 
 def check_validator(bench: Bench) -> Iterator[Row]:

@@ -244,7 +244,8 @@ def _fill(gaussians: Gaussians, start: int, rows: list[np.ndarray]) -> None:
     """Decode the chunks, vertices and harmonics of some Gaussians into those from ``start`` on."""
     chunks, vertices = rows[0], rows[1]
     part = slice(start, start + len(vertices))
-    ranges = {name: chunks[name].astype(np.float64) for name in _RANGES if name in (chunks.dtype.names or ())}
+    with np.errstate(invalid="ignore"):  # a signalling NaN in a cast: reported in the end
+        ranges = {name: chunks[name].astype(np.float64) for name in _RANGES if name in (chunks.dtype.names or ())}
     chunk_of = np.arange(len(vertices)) // CHUNK
 
     def between(words: np.ndarray, bits: tuple[int, ...], names: tuple[str, ...]) -> Float64[np.ndarray, "n c"]:
