@@ -12,6 +12,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable
+from itertools import chain
 
 import numpy as np
 import torch
@@ -39,15 +40,13 @@ COLOUR_SCALE = 0.15
 LEAST_LOG_SCALE, LOG_SCALE_STEPS = -10.0, 16.0
 ROTATION_STEPS = 511
 SH_STEPS = 128.0
-SH_STEP = 11.0
-"""Of a Gaussian of middling weight, in SH_STEPS: as large as the reference writer's files, 2 dB better on the demo."""
+SH_STEP = 10.0
+"""Of a Gaussian of middling weight, in SH_STEPS: files as large as the reference writer's, 2 dB better on the demo."""
 LEAST_SH_DOUBLINGS, MOST_SH_DOUBLINGS = 1, 6
 SH_COUNTS = 8  # coefficients apart that Gaussians of one group have
 LEAST_WEIGHED_OPACITY = 1.0 / 255.0
 GZIP_LEVEL = 6
 ARRAYS = 6  # after the header
-MATCHED = (1, 5)
-"""Of them: what the order brings together repeats itself. In the others a search for repetitions finds nothing."""
 
 
 def spz_bytes(
@@ -99,26 +98,24 @@ def spz_bytes(
         done += len(piece)
     whole = [np.concatenate(kept) for kept in coded if kept]
     order = _order(whole[1], whole[5], doublings) if whole else np.zeros(0, np.int64)
-    return _gzip(header, (array[order].tobytes() for array in whole), record)
+    return _gzip(chain([header], (array[order].tobytes() for array in whole)), record)
 
 
-def _gzip(header: bytes, arrays: Iterable[bytes], record: str) -> bytes:
-    """A gzip file of a header and arrays, each of them compressed as suits it (RFC 1951, 1952)."""
+def _gzip(parts: Iterable[bytes], record: str) -> bytes:
+    """A gzip file (RFC 1952).
+
+    Of repetitions only those of one byte are looked for: in the harmonics' runs of nothing that finds more than any
+    level of deflate does, in an eighth of its time, and elsewhere there are none.
+    """
     extra = b"" if not record else RECORD_FIELD + struct.pack("<H", len(record)) + record.encode("ascii")
     made = [b"\x1f\x8b\x08", bytes([4 if extra else 0]), b"\0\0\0\0\0\xff"]  # no time stamp, no system
     made += [struct.pack("<H", len(extra)), extra] if extra else []
-    check, size = zlib.crc32(header), len(header)
-    made += _deflated(header, zlib.Z_DEFAULT_STRATEGY)
-    for i, data in enumerate(arrays):
-        made += _deflated(data, zlib.Z_DEFAULT_STRATEGY if i in MATCHED else zlib.Z_HUFFMAN_ONLY)
-        check, size = zlib.crc32(data, check), size + len(data)
-    return b"".join([*made, b"\3\0", struct.pack("<II", check, size & 0xFFFFFFFF)])  # 3, 0: a last block of nothing
-
-
-def _deflated(data: bytes, strategy: int) -> list[bytes]:
-    """A part of a deflate stream that needs none before it."""
-    deflate = zlib.compressobj(GZIP_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, strategy)
-    return [deflate.compress(data), deflate.flush(zlib.Z_SYNC_FLUSH)]
+    deflate = zlib.compressobj(GZIP_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, zlib.Z_RLE)
+    check, size = 0, 0
+    for part in parts:
+        made.append(deflate.compress(part))
+        check, size = zlib.crc32(part, check), size + len(part)
+    return b"".join([*made, deflate.flush(), struct.pack("<II", check, size & 0xFFFFFFFF)])
 
 
 def _fine_bits(log_scales: Float[torch.Tensor, "n 3"]) -> int:

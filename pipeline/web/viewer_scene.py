@@ -29,6 +29,7 @@ from splatpipe.pipeline.web.measured_page import PAGE
 from splatpipe.pipeline.web.viewer import ViewerCamera, ViewerScene, ViewerSky, viewer_page
 
 SPLAT = "splat.spz"
+SH_STEP = 8.0  # finer than files: the page is looked at, and 41.6 dB for 40.2 cost 6 % of its splat
 THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows; of more photos than the next, less
 MOST_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
@@ -124,7 +125,7 @@ def viewer_splat(gaussians: Gaussians, antialias: bool) -> bytes:
         gaussians: In the world frame (z up), finite.
         antialias: Whether their opacities allow for the blur on screen.
     """
-    return spz_bytes(gaussians, antialias, turn=torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64))
+    return spz_bytes(gaussians, antialias, SH_STEP, torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64))
 
 
 def upright(camera: Camera) -> tuple[Camera, int]:
