@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.moments import moments_of
@@ -18,11 +18,13 @@ MOST_PER_NODE = 60_000
 CHILDREN = 4
 """Of a node, at most: a surface twice as coarse has a quarter as many Gaussians."""
 BOX_SIGMAS = 3.0
-ERROR_PER_SPREAD = 16.0
-"""World units of a node's error for each of the spread of its merged Gaussians."""
-_SPREAD_QUANTILE = 0.9  # by mass: the coarsest tenth may lie beyond
+ERROR_PER_SPREAD = 32.0
+"""World units of a node's error for each of the spread of its merged Gaussians: at an error of 16 pixels the spread is
+half a pixel, and models of unlike captures are within 32 dB there, or nearly (`benchmarks/levels.py`)."""
+_SPREAD_QUANTILE = 0.9  # the coarsest tenth may lie beyond
 _ERROR_STEP = 1.01  # that a node's error is at least above its children's
 _FAR_SIDES = 2.0  # what lies so many sides of the middle 80 % beyond them is far: sky, floaters
+_LARGE_SIDES = 0.05  # a Gaussian with such a standard deviation is large: it would be most of a leaf's box
 _MIDDLE_PERCENT = (10.0, 90.0)  # even a fifth of all Gaussians in a sky around leaves these to the scene
 _EXTENT_PERCENT = (5.0, 95.0)
 
@@ -54,7 +56,7 @@ class LevelNode:
 def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> LevelNode:
     """Divide Gaussians in space into leaves, and merge those of a node's children until they fit one node.
 
-    What lies far outside, as a sky does, has its own branch: the others' boxes stay small.
+    What lies far outside, as a sky does, and what is enormous have a branch of their own: the others' boxes stay small.
 
     Args:
         gaussians: On the CPU, in any frame; at least one.
@@ -69,13 +71,11 @@ def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> Le
     if not len(gaussians) or most_per_node < 1:
         raise ValueError(f"levels of {len(gaussians)} Gaussians, at most {most_per_node} in a node")
     means = gaussians.means.detach().to(torch.float64).numpy()
-    everything = np.arange(len(means))
-    far = _far(means)
-    if len(far) <= most_per_node // 2 or len(far) == len(means):  # too few to be worth a branch
-        return _branch(gaussians, means, everything, most_per_node).node
-    near = np.setdiff1d(everything, far, assume_unique=True)
-    parts = [_branch(gaussians, means, part, most_per_node) for part in (near, far)]
-    return _joined(parts, most_per_node).node
+    outside = _outside(gaussians, means)
+    parts = [np.flatnonzero(~outside), np.flatnonzero(outside)]
+    if len(means) <= most_per_node or not all(len(part) for part in parts):
+        return _branch(gaussians, means, np.arange(len(means)), most_per_node).node
+    return _joined([_branch(gaussians, means, part, most_per_node) for part in parts], most_per_node).node
 
 
 def select_nodes(
@@ -132,12 +132,13 @@ def _joined(branches: Sequence[_Branch], most: int) -> _Branch:
 
 
 def _spread(reduced: Reduction) -> float:
-    """Upper quantile, by mass, of how far Gaussians stand from what they stand for."""
-    masses = moments_of(reduced.gaussians).masses()
+    """Upper quantile, by the numbers that they stand for, of how far Gaussians stand from those.
+
+    Not by mass: a model's few enormous Gaussians, far from every camera, would outweigh all that is looked at.
+    """
     order = np.argsort(reduced.spreads, kind="stable")
-    below = np.cumsum(masses[order])
-    at = np.searchsorted(below, _SPREAD_QUANTILE * below[-1])
-    return float(reduced.spreads[order][min(at, len(order) - 1)])
+    below = np.cumsum(reduced.counts[order])
+    return float(reduced.spreads[order][np.searchsorted(below, _SPREAD_QUANTILE * below[-1])])
 
 
 def _cells(
@@ -154,10 +155,13 @@ def _cells(
     return _cells(means, order[:at], first) + _cells(means, order[at:], count - first)
 
 
-def _far(means: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " m"]:
+def _outside(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which lie far outside the middle of all, or are so large that a box around them says nothing of the others."""
     low, high = np.percentile(means, _MIDDLE_PERCENT, axis=0)
-    margin = _FAR_SIDES * float((high - low).max())
-    return np.flatnonzero(((means < low - margin) | (means > high + margin)).any(1))
+    side = float((high - low).max())
+    far = ((means < low - _FAR_SIDES * side) | (means > high + _FAR_SIDES * side)).any(1)
+    large = gaussians.log_scales.detach().amax(1).to(torch.float64).exp().numpy() > _LARGE_SIDES * side
+    return np.asarray(far | large)
 
 
 def _box(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:

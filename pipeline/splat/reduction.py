@@ -25,6 +25,9 @@ ROUND_SHARE = 0.3
 BALANCE = 2.0
 """Power of the number that a merged Gaussian stands for by which its cost grows: at 1 it is that of all of them, at 0
 some swallow all that is around them."""
+LARGE_POWER = 0.25
+"""Power of the area, beside the median's, by which merging a large Gaussian costs more: a scene's few enormous ones
+fill whole pictures, and the many that are large only because they are far away are to merge nearly as others do."""
 PIECE = 200_000
 """Gaussians looked at together: bounds the memory."""
 _ROWS_AT_ONCE = 1 << 15
@@ -168,6 +171,8 @@ def _piece_pairs(
     edges = _neighbours(moments.means)
     colours = piece.sh.to(torch.float32).reshape(len(piece), -1).numpy()
     costs = merge_costs(moments, colours, edges, least_variance) * counts[edges].sum(1) ** BALANCE
+    largest = moments.areas[edges].max(1) * (_FLAT**2 / least_variance)
+    costs *= np.maximum(largest, 1.0) ** LARGE_POWER
     chosen = match_cheapest(edges, costs, len(piece))
     return edges[chosen], costs[chosen]
 
