@@ -42,6 +42,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     write_panorama(folder / "sky.npz", None)
     parts = {"model": folder / "model.ply", "rendering": folder / "rendering.json", "sky": folder / "sky.npz"}
     parts = {f"train.{name}": path for name, path in parts.items()} | {"undistort.dataset": dataset}
+    parts["clean.model"] = parts.pop("train.model")
     parts |= tiny_scene.split_part(dataset, 4)
     return Inputs(parts, folder)
 
