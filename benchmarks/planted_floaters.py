@@ -25,6 +25,7 @@ from splatpipe.pipeline.edit.sightings import Photos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.render.rendering import Model, render_pixels
+from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.metrics import psnr, psnr_cc
 
 ASKED_FOUND, MOST_LOST, MOST_WORSE_DB = 0.95, 0.005, 0.05
