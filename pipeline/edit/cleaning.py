@@ -1,9 +1,9 @@
 """What of a splat is no part of the scene: floaters, haze, and what no photo vouches for.
 
-Where the photos are known, a Gaussian is suspected of floating if it lies before all that is around it in most of what
-is seen of it (``depth_islands``), and does not hang together with the scene (``isolation``). Where their pictures are
-known, too, they decide: what makes renders less like them goes, and nothing else. Without photos, what goes are the few
-that hang together apart from all others.
+Where the photos are known, a Gaussian is suspected of floating if it lies before all that is around it where it is seen
+(``depth_islands``). Where their pictures are known, too, what they are worth with it and without decides, together with
+how far it hangs before the scene and by what (``floaters``); else whether it hangs together with the scene at all
+(``isolation``). Without photos, what goes are the few that hang together apart from all others.
 
 All limits keep real things rather than find every floater: leaves, wires, and what only one photo shows.
 """
@@ -12,16 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from splatpipe.pipeline.edit.isolation import Shapes, Touch, far_groups, held
+from splatpipe.pipeline.edit.floaters import LOOKS, LOOSE, Suspects, likely_floaters
+from splatpipe.pipeline.edit.isolation import Shapes, far_groups, held
 from splatpipe.pipeline.edit.sightings import Photos, Sightings, look_through
-from splatpipe.pipeline.edit.worth import worth_in_photos
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 Flags = Bool[np.ndarray, " n"]
@@ -29,24 +28,18 @@ Told = Callable[[int, int], None]
 
 TRANSPARENT = 0.01
 """Opacity that nobody sees, two and a half steps of an 8-bit picture, and that no overlap of a few makes visible."""
+FAINT = 0.03  # opacity that is nothing where no photo shows it: seven steps of an 8-bit picture at its very centre
 SOLID = 0.1  # opacity that things are made of: haze holds nothing
 SEEN_PIXELS = 1.0  # of all photos' pictures, that say anything of a Gaussian
 UNSEEN_PIXELS = 0.1
 FLOATING = 0.5  # share of what is seen of one that is before all around it
-SUSPECTED = Touch(sigmas=2.0, size_ratio=1.0, needed=3)
-"""What does not hang together like this is suspected, where pictures decide: most of it is real, and they keep it."""
-LOOSE = Touch(sigmas=2.0, size_ratio=4.0)
-"""What does not hang together even like this floats, where nothing else decides."""
-WORTH = (-0.015, -0.005, -0.003)
-"""Of a pixel's squared error (0..3), that it is smaller without a Gaussian, by mean weight. The worst go first: they
-make what is behind them look bad, and those left are judged anew."""
+SUSPECTED = 0.3  # the same, where pictures decide: most of it is real, and they keep it
 FEW_PHOTOS = 2.0  # that see what hangs loosely: one photo makes up anything before its own picture
 OVERSIZED = 0.2  # times the distance to the nearest camera, that a floating Gaussian's standard deviation is large
 HAZE = 0.3  # opacity below which a very large Gaussian is no thing, where there are no photos to say so
 EXTENT = (0.05, 0.95)  # quantiles of the centres, between which a scene extends
 BORDER = 0.8  # share of what is seen of one at the borders of pictures: hardly covered
 FEW = 100  # that hang together and are no scene
-LOOKS = 1 + len(WORTH)  # passes over the photos, with pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +98,8 @@ def _found(gaussians: Gaussians, photos: Photos | None, told: Told) -> Iterator[
         yield "oversized", _haze(shapes, opacity)
         yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
         return
-    steps = len(photos.cameras) * (1 if photos.picture is None else LOOKS)
+    looks = len(photos.cameras)
+    steps = looks * (1 if photos.picture is None else 1 + LOOKS)
     found = look_through(gaussians, photos, lambda done: told(done, steps))
     seen = found.weight >= SEEN_PIXELS
     floats = seen & (found.floating > FLOATING)
@@ -114,16 +108,16 @@ def _found(gaussians: Gaussians, photos: Photos | None, told: Told) -> Iterator[
     large = floats & _oversized(shapes, photos)
     yield "seen by too few photos", loose & (found.photos < FEW_PHOTOS)
     unseen = found.weight < UNSEEN_PIXELS
-    yield "seen by none", unseen & ~held(shapes, LOOSE, seen & solid, unseen & solid)
+    yield "seen by none", unseen & ((opacity < FAINT) | ~held(shapes, LOOSE, seen & solid, unseen))
     yield "beyond the photos", _at_edges(found, shapes, seen & solid)
     if photos.picture is None:
         yield "floating", loose & solid & ~large  # which may be all that shows what is far behind
         return
-    suspected = large | (floats & solid & ~held(shapes, SUSPECTED, ground, floats & solid))
-    looked = len(photos.cameras)
-    unwanted = _unwanted(gaussians, suspected, photos, found, lambda done: told(looked + done, steps))
-    yield "oversized", unwanted & large
-    yield "floating", unwanted
+    suspected = seen & (found.floating > SUSPECTED)
+    suspects = Suspects(gaussians, shapes, suspected, seen & ~suspected & solid, found)
+    floaters = likely_floaters(suspects, photos, lambda done: told(looks + done, steps))
+    yield "oversized", floaters & large
+    yield "floating", floaters
     told(steps, steps)
 
 
@@ -145,29 +139,3 @@ def _at_edges(found: Sightings, shapes: Shapes, solid: Flags) -> Flags:
     """Which Gaussians only the borders of a photo or two show, and what is better covered does not hold."""
     rough = solid & (found.border > BORDER) & (found.photos < FEW_PHOTOS)
     return np.asarray(rough & ~held(shapes, LOOSE, solid & ~rough, rough))
-
-
-def _unwanted(
-    gaussians: Gaussians, suspected: Flags, photos: Photos, found: Sightings, told: Callable[[int], None]
-) -> Flags:
-    """Which of the suspected make renders less like the photos."""
-    gone = np.zeros(len(gaussians), np.bool_)
-    worth = np.zeros(len(gaussians), np.float32)
-    is_known = False
-    for number, limit in enumerate(WORTH):
-        left = np.flatnonzero(~gone)
-        asked = suspected[left] & ~gone[left]
-        if not asked.any():
-            break
-        if not is_known:
-            of_left = gaussians.select(torch.from_numpy(left).to(gaussians.means.device)) if gone.any() else gaussians
-            looks = number * len(photos.cameras)
-            worth[left] = worth_in_photos(of_left, asked, photos, partial(_after, told, looks))
-        bad = left[asked & (worth[left] < limit * found.weight[left])]
-        gone[bad] = True
-        is_known = not len(bad)  # nothing that those left are seen through has gone
-    return gone
-
-
-def _after(told: Callable[[int], None], before: int, done: int) -> None:
-    told(before + done)

@@ -58,6 +58,7 @@ class Sightings:
         angle_deg: Of the rays from it to those photos about their mean, root mean square by weight; 0 where unseen.
         border: Share of its weight that lies at the pictures' borders.
         floating: Share of the area in which it is seen where it lies before all that is around it.
+        gap: How far before that it lies, share of the depth there: mean by weight, -1..1.
     """
 
     weight: Float32[np.ndarray, " n"]
@@ -65,13 +66,15 @@ class Sightings:
     angle_deg: Float32[np.ndarray, " n"]
     border: Float32[np.ndarray, " n"]
     floating: Float32[np.ndarray, " n"]
+    gap: Float32[np.ndarray, " n"]
 
 
 class _Sums:
     """Sums over the photos, of which ``Sightings`` are made."""
 
     def __init__(self, n: int) -> None:
-        self.weight, self.square, self.border, self.area, self.before = (np.zeros(n, np.float32) for _ in range(5))
+        self.weight, self.square, self.border = (np.zeros(n, np.float32) for _ in range(3))
+        self.area, self.before, self.gap = (np.zeros(n, np.float32) for _ in range(3))
         self.towards = np.zeros((n, 3), np.float32)
 
     def sightings(self) -> Sightings:
@@ -82,7 +85,8 @@ class _Sums:
         angle = np.rad2deg(np.sqrt(2.0 * (1.0 - together), dtype=np.float32))
         angle[self.weight == 0.0] = 0.0
         photos = part(self.weight * self.weight, self.square)
-        return Sightings(self.weight, photos, angle, part(self.border, self.weight), part(self.before, self.area))
+        border, before, gap = part(self.border, self.weight), part(self.before, self.area), part(self.gap, self.weight)
+        return Sightings(self.weight, photos, angle, border, before, gap)
 
 
 def look_through(gaussians: Gaussians, photos: Photos, told: Callable[[int], None]) -> Sightings:
@@ -144,7 +148,8 @@ def _add(
     rays = (camera.centre() - centres).astype(np.float32)
     depths = camera.depths(centres.astype(np.float64)).astype(np.float32)
     spread = np.linalg.norm(np.einsum("mij,i->mj", axes, camera.cam_from_world[2, :3].astype(np.float32)), axis=1)
-    is_before = behind / weight - depths > np.maximum(BEFORE_SHARE * depths, BEFORE_SIGMAS * spread)
+    behind = behind / weight
+    is_before = behind - depths > np.maximum(BEFORE_SHARE * depths, BEFORE_SIGMAS * spread)
     area = weight * depths * depths / np.float32(camera.fx * camera.fy)
     sums.weight[rows] += weight
     sums.square[rows] += weight * weight
@@ -152,3 +157,4 @@ def _add(
     sums.towards[rows] += rays * (weight / np.maximum(np.linalg.norm(rays, axis=1), 1e-30))[:, None]
     sums.area[rows] += area
     sums.before[rows] += area * is_before
+    sums.gap[rows] += weight * np.clip(1.0 - depths / behind, -1.0, 1.0)

@@ -1,19 +1,23 @@
-"""What suspected Gaussians are worth to the photos: whether these are more like renders with them, or without.
+"""What suspected Gaussians are worth to the photos: by how much these are more like renders with them than without.
 
-Two renders of a photo's view, with all Gaussians and without the suspected ones, differ from the photo; how much better
-the one with them is, is a picture, and its mean by a Gaussian's weights (``sightings.weights_of``) is that one's part.
+Many are suspected at once, and what hides a surface shares its pixels with what lies behind it. So the difference
+between the squared errors with and without them all is divided as A. E. Aumann and L. S. Shapley do ("Values of
+Non-Atomic Games", 1974): each is paid the derivative by its own opacity along the way from none of them to all. Of one
+Gaussian alone a pixel's colour is linear in its opacity, the squared error quadratic, and the derivative at the middle
+is the difference itself; so all suspected ones are rendered at half of their opacity, and one backward pass pays them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
+from torch import Tensor
 
-from splatpipe.pipeline.edit.sightings import Photos, grey_of, weights_of
+from splatpipe.pipeline.edit.sightings import Photos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
@@ -22,59 +26,75 @@ from splatpipe.pipeline.splat.panorama import laid_over
 
 Picture = Float32[np.ndarray, "h w 3"]
 FITTED_PIXELS = 4  # every so manieth pixel along both sides is enough for a colour map
+HALFWAY = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Worth:
+    """Sums over the photos of squared errors (of pixels of 0..1, three channels).
+
+    Attributes:
+        better: How much smaller they are with a Gaussian, in the photos where they are.
+        worse: How much larger, in the others.
+    """
+
+    better: Float32[np.ndarray, " n"]
+    worse: Float32[np.ndarray, " n"]
 
 
 def worth_in_photos(
     gaussians: Gaussians, asked: Bool[np.ndarray, " n"], photos: Photos, told: Callable[[int], None]
-) -> Float32[np.ndarray, " n"]:
-    """How much smaller the squared errors of the photos' pixels are with the Gaussians than without, in sum.
+) -> Worth:
+    """By how much photos are more like renders with each Gaussian, and by how much others are less.
 
     Exposure differs between photos and is forgiven: a colour map is fitted to each, as ``metrics.psnr_cc`` does.
 
     Args:
         gaussians: Where they are rendered, all of them; finite.
-        asked: Those whose worth is wanted; they are left out together.
+        asked: Those whose worth is wanted.
         photos: With pictures.
         told: Called with the number of photos that were looked through.
 
     Returns:
-        Positive where photos are better with one; 0 of those that nobody asked for, and of the unseen.
+        0 of those that nobody asked for, and of the unseen.
     """
     assert photos.picture is not None
-    kept = gaussians.select(torch.from_numpy(~asked).to(gaussians.means.device))
-    grey, worth = grey_of(gaussians), np.zeros(len(gaussians), np.float32)
-    plain = replace(photos.options, depth=False, magnitudes=False)
+    options = replace(photos.options, depth=False, magnitudes=False)
+    wanted = torch.from_numpy(asked).to(gaussians.means.device)
+    opacity = torch.sigmoid(gaussians.opacity_logits.detach())
+    shown = torch.where(wanted, HALFWAY * opacity, opacity)
+    logits = torch.logit(shown).requires_grad_()
+    halfway = replace(gaussians.detach(), opacity_logits=logits)
+    per_logit = torch.where(wanted, opacity / (shown * (1.0 - shown)), torch.zeros(()).to(opacity)).numpy(force=True)
+    better, worse = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), np.float32)
     for index, camera in enumerate(photos.cameras):
-        photo, mask = photos.picture(index)
-        with_them, without = (_rendered(model, camera, photos, plain) for model in (gaussians, kept))
-        better = _better(with_them, without, photo, mask)
-        picture = np.repeat(better[:, :, None], 3, axis=2)
-        rendered = rasterizer.render(grey, camera, replace(plain, sh_degree=0))
-        worth += weights_of(rendered, grey, picture)[:, 0]
+        colour = _rendered(halfway, camera, photos, options)
+        downhill = _error_slope(colour, *photos.picture(index))
+        (slope,) = torch.autograd.grad(colour, logits, downhill)
+        paid = slope.numpy(force=True) * per_logit
+        better -= np.minimum(paid, 0.0)
+        worse += np.maximum(paid, 0.0)
         told(index + 1)
-    worth[~asked] = 0.0
-    return worth
+    return Worth(better, worse)
 
 
-def _rendered(model: Gaussians, camera: Camera, photos: Photos, options: rasterizer.RenderOptions) -> Picture:
-    with torch.no_grad():
-        rendered = rasterizer.render(model, camera, options)
-        colour = rendered.colour
-        if photos.sky is not None:
-            behind = photos.sky.behind(camera, options.background)
-            colour = laid_over(colour, rendered.alpha, options.background, behind)
-    return np.asarray(colour.clamp(0.0, 1.0).numpy(force=True))
+def _rendered(model: Gaussians, camera: Camera, photos: Photos, options: rasterizer.RenderOptions) -> Tensor:
+    rendered = rasterizer.render(model, camera, options)
+    if photos.sky is None:
+        return rendered.colour
+    behind = photos.sky.behind(camera, options.background)
+    return laid_over(rendered.colour, rendered.alpha, options.background, behind)
 
 
-def _better(with_them: Picture, without: Picture, photo: Pixels, mask: Mask | None) -> Float32[np.ndarray, "h w"]:
-    """By how much a pixel's squared error is smaller with them."""
+def _error_slope(colour: Tensor, photo: Pixels, mask: Mask | None) -> Tensor:
+    """Derivative of a render's squared error by its pixels; none where the photo does not count."""
+    picture = np.asarray(colour.detach().clamp(0.0, 1.0).numpy(force=True))
     target = photo.astype(np.float32) / np.float32(255.0)
-    colours = _colour_map(without, target, mask)
-    errors = [((_mapped(picture, colours) - target) ** 2).sum(axis=2) for picture in (without, with_them)]
-    better = np.asarray(errors[0] - errors[1], np.float32)
+    colours = _colour_map(picture, target, mask)
+    error = (picture @ colours[:3] + colours[3]).clip(0.0, 1.0) - target
     if mask is not None:
-        better[~mask] = 0.0
-    return better
+        error[~mask] = 0.0
+    return torch.from_numpy((2.0 * error @ colours[:3].T).astype(np.float32)).to(colour)
 
 
 def _colour_map(picture: Picture, target: Picture, mask: Mask | None) -> Float64[np.ndarray, "4 3"]:
@@ -84,7 +104,3 @@ def _colour_map(picture: Picture, target: Picture, mask: Mask | None) -> Float64
     source = picture[some, some][counts].astype(np.float64)
     ones = np.ones((len(source), 1))
     return np.asarray(np.linalg.lstsq(np.hstack([source, ones]), target[some, some][counts], rcond=None)[0])
-
-
-def _mapped(picture: Picture, colours: Float64[np.ndarray, "4 3"]) -> Picture:
-    return np.asarray((picture @ colours[:3] + colours[3]).clip(0.0, 1.0), np.float32)
