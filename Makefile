@@ -3,6 +3,7 @@
 # make test                    sets up, then passes every test
 # make develop                 installs links to the sources, so that what is edited is what runs; make test goes back
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
+# make options-page            writes the tables of docs/options.md from the code
 # make test-image              builds the container image for real and runs the demo in it (Linux, root, buildah, runc)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
@@ -40,7 +41,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-.PHONY: run test test-image test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -104,6 +105,10 @@ imports: .venv/.developed
 # Which sources each stage's version stands for; see docs/working.md.
 versions: $(EITHER) .venv/.dev
 	@$(WITH_HEADERS) $(BIN)/python tests/versions $(if $(SINCE),--since $(SINCE))
+
+# The options' tables in docs/options.md, from their types, defaults and help.
+options-page: $(EITHER)
+	@$(BIN)/python tests/options_page.py
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

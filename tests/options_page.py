@@ -1,0 +1,99 @@
+"""``make options-page``: writes the tables of ``docs/options.md`` from the options' own types, defaults and help."""
+
+from __future__ import annotations
+
+import sys
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic.fields import FieldInfo
+
+from splatpipe.pipeline.engine.config import load_preset, lookup, option_help, preset_names, resolve
+from splatpipe.stages.options import LineConfig
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
+MARK = "<!-- Below this line: make options-page -->"
+KINDS = {bool: "`true`, `false`", str: "text", int: "whole number", float: "number"}
+
+
+def written() -> str:
+    """The whole page: what was written by hand above the mark, and the tables below it."""
+    by_hand, mark, _ = PAGE.read_text(encoding="utf-8").partition(MARK)
+    if not mark:
+        raise ValueError(f"{PAGE} has no line {MARK}")
+    return f"{by_hand}{MARK}\n\n{tables()}"
+
+
+def tables() -> str:
+    """A section for each stage with a row for each of its options, in Markdown."""
+    presets = {name: resolve(LineConfig, [load_preset(name)]) for name in preset_names()}
+    texts = dict(option_help(LineConfig))
+    sections = []
+    for section, info in LineConfig.model_fields.items():
+        fields: dict[str, FieldInfo] = info.annotation.model_fields  # type: ignore[union-attr]
+        lines = [f"## {section}", ""]
+        if fields:
+            lines += ["| option | takes | default | presets | what it does |", "|---|---|---|---|---|"]
+        else:
+            lines.append("No options.")
+        for option, field in fields.items():
+            name = f"{section}.{option}"
+            default = field.get_default(call_default_factory=True)
+            others = [(preset, lookup(config, name)) for preset, config in presets.items()]
+            differing = "; ".join(f"{preset} {shown(value)}" for preset, value in others if value != default)
+            cells = (f"`{name}`", kind(field), shown(default), differing, texts[name])
+            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        sections.append("\n".join(lines))
+    return "\n\n".join(sections) + "\n"
+
+
+def kind(field: FieldInfo) -> str:
+    """What an option takes, in words."""
+    return " or ".join(_kinds(field.annotation, field.metadata))
+
+
+def shown(value: Any) -> str:
+    """A value as it stands after ``--set``."""
+    if value == "":
+        return "empty"
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def _kinds(annotation: Any, limits: Sequence[Any]) -> Iterator[str]:
+    """What a type takes, in words; limits are annotated-types' ``Ge``, ``Gt``, ``Le``, ``Lt``."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        inner, *inner_limits = typing.get_args(annotation)
+        yield from _kinds(inner, [*limits, *inner_limits])
+    elif origin in (typing.Union, types.UnionType):
+        for each in typing.get_args(annotation):
+            yield from _kinds(each, limits)
+    elif origin is Literal:
+        yield ", ".join(f"`{choice}`" for choice in typing.get_args(annotation))
+    else:
+        flat = [part for limit in limits for part in getattr(limit, "metadata", [limit])]
+        yield ", ".join([KINDS[annotation], *_limits(flat)])
+
+
+def _limits(limits: Sequence[Any]) -> Iterator[str]:
+    for attribute, words in (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below")):
+        for limit in limits:
+            if (bound := getattr(limit, attribute, None)) is not None:
+                yield f"{words} {int(bound) if bound == int(bound) else bound:,}"
+
+
+def main() -> int:
+    """Write the page; the exit code."""
+    before, now = PAGE.read_text(encoding="utf-8"), written()
+    PAGE.write_text(now, encoding="utf-8")
+    sys.stdout.write(f"{PAGE.name}: {'as it was' if now == before else 'written'}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
