@@ -197,7 +197,8 @@ def test_the_quick_commands_of_the_pages_run(tmp_path: Path) -> None:
 
     splatpipe("run", str(capture_path()), "OUT", "--until", "control")
     write_splat(tmp_path / "splat.ply", some_gaussians())
-    calls = {tuple(call) for page in PAGES for call in command_lines(page, "splatpipe") if call[0] in QUICK}
-    assert {call[0] for call in calls} == set(QUICK)
-    for call in sorted(calls):
+    calls = [call for page in PAGES for call in command_lines(page, "splatpipe") if call[0] in QUICK]
+    fullest = {call[0]: call for call in sorted(calls, key=len)}
+    assert set(fullest) == set(QUICK)
+    for call in fullest.values():
         splatpipe(*call)
