@@ -24,16 +24,19 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from splatpipe.pipeline.app.report.verdict import Verdict
+from splatpipe.pipeline.app.sentences import sentence
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.line import Standing
-from splatpipe.pipeline.engine.stage import JSON, Summary, stage_name
+from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
 PLAIN_WIDTH = 120  # columns of a table in a log file
 LEAST_OFFSET_M = 0.01  # of a flight's positions, to be told
 POINTS_SHOWN = 40  # more are in metrics.json alone
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
+MARKS = {"good": ("✓", "green"), "doubt": ("!", "yellow"), "bad": ("✗", "red")}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
 # What a file's name could tell a terminal, or write as colours into a file; tab and line feed stay.
 CONTROLS = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "\ufffd")
@@ -133,11 +136,11 @@ class RunConsole:
     def _stage_finished(self, stage: str, data: Mapping[str, JSON]) -> None:
         self.close()
         self._shards.end(stage, float(data["seconds"]))
-        self._line("✓", "green", stage, f"{_duration(data['seconds'])}  {_brief(data['summary'])}")
+        self._line("✓", "green", stage, f"{_duration(data['seconds'])}  {sentence(stage, data['summary'])}")
 
     def _stage_reused(self, stage: str, data: Mapping[str, JSON]) -> None:
         self._shards.end(stage, float(data["seconds"]))
-        self._line("=", "blue", stage, f"reused  {_brief(data['summary'])}")
+        self._line("=", "blue", stage, f"reused  {sentence(stage, data['summary'])}")
 
     def _stage_failed(self, stage: str, data: Mapping[str, JSON]) -> None:
         self.close()
@@ -224,27 +227,34 @@ def show_standings(standings: Iterable[Standing]) -> None:
         for row in (standing, *standing.shards):
             artifact = row.artifact
             took = _duration(float(artifact.manifest["seconds"])) if artifact else ""
-            what = _brief(artifact.summary) if artifact else row.reason
+            what = sentence(row.stage.name, artifact.summary) if artifact else row.reason
             name = row.stage.name if row is standing else f"  {row.stage.name}"
             table.add_row(name, f"[{COLOURS[row.state]}]{row.state}[/]", took, Text(what), end_section=False)
     Console(highlight=False).print(table)
 
 
-def show_outputs(
-    out: Path, seconds: float | None, metrics: Mapping[str, JSON], files: Iterable[Path], news: Sequence[str] = ()
-) -> None:
-    """What a run left and how good it is, for people.
+def show_verdict(verdict: Verdict) -> None:
+    """What is good about a run and what is doubtful: the report's first lines."""
+    console = Console(file=sys.stderr, highlight=False)
+    mark, colour = MARKS[verdict.level]
+    console.print(f"\n[bold {colour}]{mark} {escape(verdict.headline)}.[/]  {escape(verdict.text)}", soft_wrap=True)
+    for finding in verdict.findings:
+        mark, colour = MARKS[finding.level]
+        console.print(f"  [{colour}]{mark}[/] [bold]{escape(finding.title)}[/]  {escape(finding.text)}", soft_wrap=True)
+
+
+def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], news: Sequence[str] = ()) -> None:
+    """What a run left, for people.
 
     Args:
         out: OUT.
         seconds: How long it took; None where all was there already.
-        metrics: Figures of its result.
         files: Its files.
         news: What was measured besides, a line each.
     """
     console = Console(file=sys.stderr, highlight=False)
     done = "Everything was there already: nothing to do." if seconds is None else f"Done in {_duration(seconds)}."
-    console.print(f"\n[bold]{done}[/]  {escape(_brief(metrics))}", soft_wrap=True)
+    console.print(f"\n[bold]{done}[/]", soft_wrap=True)
     sizes: dict[Path, int] = {}
     for path in files:  # what lies in a folder is told of as that
         shown = out / path.relative_to(out).parts[0]
@@ -361,19 +371,6 @@ def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
 def say(text: str) -> None:
     """One line to the user on stderr."""
     Console(file=sys.stderr, highlight=False).print(escape(text), soft_wrap=True)
-
-
-def _brief(summary: Summary) -> str:
-    """The scalars of a summary in one line."""
-    shown = []
-    for name, value in summary.items():
-        if isinstance(value, bool | int | str):
-            shown.append(
-                f"{name.replace('_', ' ')} {value:,}" if type(value) is int else f"{name.replace('_', ' ')} {value}"
-            )
-        elif isinstance(value, float):
-            shown.append(f"{name.replace('_', ' ')} {value:.4g}")
-    return ", ".join(shown)
 
 
 def _duration(seconds: float) -> str:

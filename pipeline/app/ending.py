@@ -17,6 +17,7 @@ from splatpipe.pipeline.app.notice import TIME_LIMIT_S, State, check_command, no
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, exit_code
 
 if TYPE_CHECKING:
+    from splatpipe.pipeline.app.report.verdict import Verdict
     from splatpipe.pipeline.engine.runner import Outcome
 
 PART_VARIABLE = "SPLATPIPE_PART"  # set where more stages follow at once, by other commands: a good end needs no report
@@ -94,11 +95,13 @@ class Ending:
             say(f"{trouble.message} {trouble.hint}".strip())
 
     def _show(self, outcome: Outcome, seconds: float) -> None:
-        from splatpipe.pipeline.app.console import show_accuracy, show_bad_cameras, show_outputs
+        from splatpipe.pipeline.app.console import show_accuracy, show_bad_cameras, show_outputs, show_verdict
 
+        if (verdict := _verdict(self._out)) is not None:
+            show_verdict(verdict)
         show_accuracy(*_accuracy(outcome))
         took = seconds if outcome.ran or self.news else None
-        show_outputs(self._out, took, _headline(outcome), self._files(outcome), self.news)
+        show_outputs(self._out, took, self._files(outcome), self.news)
         if "sparse" in outcome.artifacts:
             show_bad_cameras(outcome.artifacts["sparse"].summary.get("verdict") or {})
 
@@ -155,13 +158,15 @@ def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return report, points
 
 
-def _headline(outcome: Outcome) -> dict[str, Any]:
-    """The figures that people ask for first."""
-    merged: dict[str, Any] = {}
-    for artifact in outcome.artifacts.values():
-        merged.update(artifact.summary)
-    wanted = ("photos", "registered", "points3d", "gaussians", "psnr", "ssim")
-    return {name: merged[name] for name in wanted if merged.get(name) is not None}
+def _verdict(out: Path) -> Verdict | None:
+    """The report's, where the run's record can be read: what is wrong with it does not spoil the run's end."""
+    from splatpipe.pipeline.app.report.holdings import open_holdings
+    from splatpipe.pipeline.app.report.verdict import judge
+
+    try:
+        return judge(open_holdings(out))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, SplatpipeError):
+        return None
 
 
 def print_json(value: dict[str, Any]) -> None:

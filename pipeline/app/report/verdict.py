@@ -58,8 +58,7 @@ def judge(holdings: Holdings) -> Verdict:
     ended, text = _ended(holdings)
     told = sum(len(stage.told.warnings) for stage in holdings.story.stages.values())
     if told:
-        stand = "it stands" if told == 1 else "they stand"
-        findings.append(Finding("doubt", "Warnings", f"The run gave {plural(told, 'warning')}; {stand} below."))
+        findings.append(Finding("doubt", "Warnings", f"The run gave {plural(told, 'warning')}."))
     wrong = next((it for it in findings if it.title == CAMERAS and it.level == "bad"), None)
     if ended is not None and (ended.level == "bad" or wrong is None):
         return Verdict(ended.level, ended.title, ended.text, findings)

@@ -1,0 +1,64 @@
+"""Each stage's line on the terminal: a sentence with units, silent on what is as it should be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from splatpipe.pipeline.app.console import show_verdict
+from splatpipe.pipeline.app.report.verdict import Finding, Verdict
+from splatpipe.pipeline.app.sentences import SENTENCES, sentence
+from splatpipe.stages.line import LINE
+
+PLACED = {"photos": 40, "registered": 40, "mean_reprojection_error_px": 0.3225, "points3d": 23143}
+SEEN = {"photos": 40, "cameras": 1, "positions": 40, "masks": 0, "left_out": 0, "sigma_horizontal_m": 0.02}
+SURVEYED = {"rmse_horizontal_m": 0.006701, "rmse_up_m": 0.009899, "count": 6}
+GEOREF = {"kind": "enu", "note": "From 12 control points.", "positions_left_out": 0, "points_left_out": 1}
+SAID = [
+    ("ingest", SEEN, "40 photos of 1 camera, all with positions good to 0.02 m"),
+    (
+        "ingest",
+        SEEN | {"cameras": 2, "positions": 38, "sigma_horizontal_m": 3.0, "sigma_vertical_m": 5.0, "left_out": 1},
+        "40 photos of 2 cameras, 38 with positions good to 3 m (5 m in height), 1 file left out",
+    ),
+    ("sparse", PLACED, "all 40 photos placed, reprojection error 0.32 px, 23,143 tie points"),
+    ("sparse", PLACED | {"registered": 37}, "37 of 40 photos placed, reprojection error 0.32 px, 23,143 tie points"),
+    (
+        "georef",
+        GEOREF | {"tables": {"check": SURVEYED, "control": None}, "model_bent": False},
+        "From 12 control points; 6 check points off by 6.7 mm across and 9.9 mm in height (RMSE); 1 point left out",
+    ),
+    (
+        "train",
+        {"gaussians": 103138, "iterations": 2500, "planned_iterations": 2500},
+        "103,138 Gaussians after 2,500 iterations",
+    ),
+    ("clean", {"gaussians": 900, "removed": 100}, "100 of 1,000 Gaussians removed (10.0 %)"),
+    ("clean", {"removed": 0}, "nothing removed"),
+    ("evaluate", {"test_views": 5, "psnr": 29.006, "ssim": 0.8797}, "5 held-out photos: PSNR 29.0 dB, SSIM 0.88"),
+    ("flythrough", {"frames": 0}, "no film"),
+    ("dsm", {"cells": 0}, "no surface model"),
+]
+
+
+@pytest.mark.parametrize(("stage", "summary", "said"), SAID)
+def test_a_summary_is_said_in_a_sentence(stage: str, summary: dict[str, Any], said: str) -> None:
+    assert sentence(stage, summary) == said
+
+
+def test_every_stage_has_one_and_none_fails_on_what_it_does_not_know() -> None:
+    assert {stage.name for stage in LINE} == set(SENTENCES)
+    for stage in LINE:
+        assert sentence(stage.name, {}) in ("", "none needed")
+        assert sentence(stage.name, dict.fromkeys(["photos", "note", "frames", "points", "positions"], "x")) is not None
+
+
+def test_the_verdict_comes_first_with_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
+    doubt = Finding("doubt", "Floaters", "Something hangs in the air [bold]before[/] 5 photos")
+    show_verdict(Verdict("doubt", "Finished; 1 point to look at", "The run ended.", [doubt]))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1:] == [
+        "! Finished; 1 point to look at.  The run ended.",
+        "  ! Floaters  Something hangs in the air [bold]before[/] 5 photos",
+    ]
