@@ -36,6 +36,7 @@ LARGEST_FRONT = 200.0  # megapixels
 FOLLOW = VARIANTS.with_name("time_to_quality.py")
 CURVE = "curve.json"
 TOLD = ("psnr", "psnr_cc", "best_psnr")  # of a run that ended, on the way
+AS_TRAINED = ("clean.enabled=false",)  # what is compared is training; a variant that cleans says so
 FRONT = ("ingest", "features", "matches", "sparse", "georef", "undistort")
 
 
@@ -174,7 +175,7 @@ def cases_of(
     for seed in range(arguments.seeds):
         for capture, dataset in datasets.items():
             for variant in variants:
-                sets = (*base_sets(arguments), *variant.sets)
+                sets = (*AS_TRAINED, *base_sets(arguments), *variant.sets)
                 config = config_of(sets, seed).model_dump(mode="json")
                 facts = {"capture": digests[capture], "config": config, "seed": seed, "threads": arguments.threads}
                 key = digest(build | facts)

@@ -72,7 +72,8 @@ def open_run(out: Path) -> OpenedRun:
     parts = folder.lineage(EXPORT, CLEAN, TRAIN)
     if "train.model" not in parts:
         raise UsageError(f"{out} has no trained splat.", hint="Run to the end of training.")
-    gaussians = read_splat(parts.get("clean.model", parts["train.model"]).path)
+    parts.setdefault("clean.model", parts["train.model"])  # runs of before there was cleaning, or up to training alone
+    gaussians = read_splat(parts["clean.model"].path)
     options, megapixels = as_trained(parts["train.rendering"].path, gaussians)
     views = load_views(parts["undistort.dataset"].path)
     held_out = load_split(parts["split.views"].path).held_out

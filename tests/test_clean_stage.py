@@ -97,6 +97,11 @@ def test_where_nothing_is_removed_the_bytes_are_those_of_training(enabled: bool,
     assert (out / "model.ply").read_bytes() == inputs["train.model"].read_bytes()
 
 
+def test_turned_off_it_reads_the_trained_model_all_the_same() -> None:
+    """A line of its own is run so by `test_ablation.py`."""
+    assert not CleanConfig(enabled=False).is_off
+
+
 def test_a_damaged_model_is_told(dataset: Path, tmp_path: Path) -> None:
     inputs = inputs_of(tmp_path, dataset, tiny_scene.true_model())
     inputs["train.model"].write_bytes(inputs["train.model"].read_bytes()[:5000])

@@ -13,3 +13,8 @@ class CleanConfig(StageConfig):
 
     enabled: bool = True
     """Remove floaters, haze and what no photo shows before the splat is measured and delivered."""
+
+    @property
+    def is_off(self) -> bool:
+        """Never: where nothing is removed, the splat as it was trained is its answer, and what follows reads that."""
+        return False
