@@ -3,9 +3,10 @@
     python benchmarks/levels.py OUT [--splat-transform 'node …/bin/cli.mjs']
 
 Prints decibels against pictures of the full model, from the photos' places, of reductions to some shares, and those of
-splat-transform's `--decimate`; decibels of nodes from where their error is 16 pixels; on a way from afar to the photos,
-how much more the picture changes from frame to frame than the full model's, and whether it is ever less opaque; with
-`--large`, seconds and peak memory of reducing and of levels for that many Gaussians, in a process of its own.
+splat-transform's `--decimate`; decibels of nodes from where their error is 16 pixels, as drawn, and of the means of 4
+by 4 finer pixels, without what the rasterizer makes of Gaussians far smaller than a pixel; on a way from afar to the
+photos, how much more the picture changes from frame to frame than the full model's, and whether it is ever less opaque;
+with `--large`, seconds and peak memory of reducing and of levels for that many Gaussians, in a process of its own.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import LevelNode, box_distance, build_levels, select_nodes
+from splatpipe.pipeline.splat.levels import MOST_PER_NODE, LevelNode, box_distance, build_levels, select_nodes
 from splatpipe.pipeline.splat.reduction import reduce_to
 from splatpipe.pipeline.splat.scene import Scene
 
@@ -38,6 +39,7 @@ SHARES = (50, 25, 10, 5)  # percent
 ERROR_PX = 16.0
 GREY = (0.5, 0.5, 0.5)
 SIDE, FOCAL = 384, 800.0  # of pictures of nodes, pixels
+FINER = 4  # times as many pixels along each side: the scene as it is, nearly
 LEAST_COVERED = 60  # pixels: of less a picture says nothing
 FRAMES = 48
 FARTHEST = 60.0  # times the photos' distance: where the way begins
@@ -48,7 +50,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="OUT of a finished run")
     parser.add_argument("--splat-transform", default="", help="command that runs it")
-    parser.add_argument("--most-per-node", type=int, default=6000, help="small, so that a small model has levels")
+    sizes = f"{MOST_PER_NODE},15000,6000"
+    parser.add_argument("--most-per-node", default=sizes, help="small ones, so that a small model has levels")
     parser.add_argument("--every", type=int, default=8, help="of the photos, one in so many is looked from")
     parser.add_argument("--large", type=int, default=0, help="Gaussians to measure time and memory with")
     options = parser.parse_args()
@@ -58,11 +61,16 @@ def main() -> None:
         return
     cameras = photo_cameras(options.out)
     equal_counts(scene, cameras[:: options.every], options.out / "splat.ply", shlex.split(options.splat_transform))
-    root = build_levels(scene.gaussians, options.most_per_node)
-    held = sum(len(node.gaussians) for node in root.nodes())
-    print(f"levels: {sum(1 for _ in root.nodes())} nodes, {held / len(scene.gaussians):.2f} times the model")
-    node_errors(scene, root, cameras)
-    way_through(scene, root, cameras)
+    for most in map(int, options.most_per_node.split(",")):
+        start = time.perf_counter()
+        root = build_levels(scene.gaussians, most)
+        seconds = time.perf_counter() - start
+        held = sum(len(node.gaussians) for node in root.nodes()) / len(scene.gaussians)
+        count = sum(1 for _ in root.nodes())
+        print(f"levels of {most:,}: {count} nodes, {held:.2f} times the model, in {seconds:.0f} s", flush=True)
+        if root.children:
+            node_errors(scene, root, cameras)
+            way_through(scene, root, cameras)
 
 
 def photo_cameras(out: Path) -> list[Camera]:
@@ -137,9 +145,15 @@ def full_of(node: LevelNode) -> Gaussians:
     return Gaussians.concat([each.gaussians for each in node.nodes() if not each.children])
 
 
+def finer(gaussians: Gaussians, camera: Camera, antialias: bool) -> Tensor:
+    """A picture's colours, each pixel the mean of those of a finer one."""
+    colour = drawn(gaussians, camera.scaled(FINER * camera.width, FINER * camera.height), antialias).colour
+    return colour.reshape(camera.height, FINER, camera.width, FINER, 3).mean(dim=(1, 3))
+
+
 def node_errors(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> None:
     """Print the least decibels of what nodes cover, from where their error is 16 pixels, in photos' directions."""
-    least = []
+    found, antialias = [], scene.facts.antialias
     for node in (each for each in root.nodes() if each.children):
         full = full_of(node)
         middle = full.means.median(dim=0).values.double().numpy()
@@ -148,13 +162,19 @@ def node_errors(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> Non
             towards /= np.linalg.norm(towards)
             place = place_at(node, middle, towards, node.error * FOCAL / ERROR_PX)
             view = look(place, middle, FOCAL, SIDE, SIDE)
-            one, other = drawn(full, view, scene.facts.antialias), drawn(node.gaussians, view, scene.facts.antialias)
-            covered = one.alpha > 0.5
+            picture, ours = (drawn(gaussians, view, antialias) for gaussians in (full, node.gaussians))
+            covered = picture.alpha > 0.5
             if int(covered.sum()) >= LEAST_COVERED:
-                least.append(decibels(one.colour[covered], other.colour[covered]))
-    low, middle_dB = min(least), float(np.median(least))
+                as_drawn = decibels(picture.colour[covered], ours.colour[covered])
+                finely = decibels(
+                    finer(full, view, antialias)[covered], finer(node.gaussians, view, antialias)[covered]
+                )
+                found.append((as_drawn, finely))
+    least, middle_dB = np.min(found, axis=0), np.median(found, axis=0)
     print(
-        f"where a node's error is {ERROR_PX:.0f} px: least {low:.1f} dB, median {middle_dB:.1f}, of {len(least)} views"
+        f"  where a node's error is {ERROR_PX:.0f} px: least {least[0]:.1f} dB, median {middle_dB[0]:.1f}, "
+        f"of {len(found)} views; of finer pixels {least[1]:.1f}, {middle_dB[1]:.1f}",
+        flush=True,
     )
 
 
@@ -178,8 +198,9 @@ def way_through(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> Non
             worst_jump = max(worst_jump, float((other.colour - before[1]).abs().mean()) / full_change)
         before = (one.colour, other.colour)
     print(
-        f"way of {FRAMES} frames, {min(chosen_counts):,} to {max(chosen_counts):,} Gaussians: least {worst_dB:.1f} dB, "
-        f"largest change of a frame {worst_jump:.2f} times the full model's, most pixels less opaque {holes}"
+        f"  way of {FRAMES} frames, {min(chosen_counts):,} to {max(chosen_counts):,} Gaussians: least {worst_dB:.1f} "
+        f"dB, largest change of a frame {worst_jump:.2f} times the full model's, most pixels less opaque {holes}",
+        flush=True,
     )
 
 

@@ -202,6 +202,21 @@ def test_from_afar_and_out_of_sight_nothing_finer_is_asked_for(site: Path, open_
         assert len(page.evaluate("() => splatpipe.shown().files")) == 1
 
 
+def test_no_more_gaussians_are_shown_than_allowed_wherever_one_has_looked(site: Path, open_page: Callable) -> None:
+    with hosted(site / "web") as host:
+        page = open_page(f"{host.address}/index.html", WIDTH, HEIGHT).page
+        page.evaluate("() => splatpipe.ready.then(() => splatpipe.complete())")
+        assert page.evaluate("() => splatpipe.shown().gaussians") == COUNT
+        page.evaluate("() => splatpipe.limit(400)")
+        asked = 0
+        for name in page.evaluate("() => splatpipe.facts.cameras.map(({ name }) => name)"):
+            page.evaluate("name => splatpipe.goToCamera(name)", name)
+            page.evaluate("() => splatpipe.complete()")
+            assert MOST_PER_NODE < page.evaluate("() => splatpipe.shown().gaussians") <= 600
+            asked, before = sum(host.asked.values()), asked
+        assert asked > before or asked > len(nodes_of(site))  # what was let go of is asked for again
+
+
 def test_a_file_that_is_lost_is_told_once_and_leaves_no_hole(site: Path, open_page: Callable) -> None:
     leaf = next(node for node in nodes_of(site) if not node["children"])
     with hosted(site / "web") as host:

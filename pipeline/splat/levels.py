@@ -18,9 +18,14 @@ MOST_PER_NODE = 60_000
 CHILDREN = 4
 """Of a node, at most: a surface twice as coarse has a quarter as many Gaussians."""
 BOX_SIGMAS = 3.0
-ERROR_PER_SPREAD = 32.0
+ERROR_PER_SPREAD = 36.0
 """World units of a node's error for each of the spread of its merged Gaussians: at an error of 16 pixels the spread is
-half a pixel, and models of unlike captures are within 32 dB there, or nearly (`benchmarks/levels.py`)."""
+less than half a pixel, and models of unlike captures are within 32 dB there (`benchmarks/levels.py`). With more, a
+node's picture is nearer still to what the full model is, but not to what is drawn of it: much of a pixel's many
+Gaussians is fainter than an 8-bit step then, and left out."""
+LARGE_POWER = 0.5
+"""In place of ``reduction.LARGE_POWER``: all of a node is seen from about one distance, and what is large is large in
+the picture."""
 _SPREAD_QUANTILE = 0.9  # the coarsest tenth may lie beyond
 _ERROR_STEP = 1.01  # that a node's error is at least above its children's
 _FAR_SIDES = 2.0  # what lies so many sides of the middle 80 % beyond them is far: sky, floaters
@@ -124,7 +129,7 @@ def _branch(
 def _joined(branches: Sequence[_Branch], most: int) -> _Branch:
     """The node over some: what they hold, merged until it fits."""
     children = tuple(branch.node for branch in branches)
-    reduced = reduce_further(Reduction.joined([branch.held for branch in branches]), most)
+    reduced = reduce_further(Reduction.joined([branch.held for branch in branches]), most, LARGE_POWER)
     boxes = np.stack([child.box for child in children])
     box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
     error = max(_ERROR_STEP * max(child.error for child in children), ERROR_PER_SPREAD * _spread(reduced))

@@ -16,7 +16,7 @@ _LOG_SCALE_MOST = 40.0  # the square of the square of e^40 is a float64 still, a
 _OPACITY_LEAST, _OPACITY_MOST = 1e-7, 1.0 - 1e-6  # of a merged Gaussian: their logits are float32s, and finite
 _AREA_POWER = 1.6075
 """Exponent of Knud Thomsen's formula for an ellipsoid's surface (2004), within 1.061 %."""
-GROWTH = 0.3
+GROWTH = 0.45
 """Power of the excess over opaque by which a merged Gaussian's area grows. At 0 surfaces whose Gaussians overlap become
 thin, at 1 their edges spread."""
 _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

@@ -18,14 +18,11 @@ from splatpipe.pipeline.splat.merge_costs import merge_costs
 from splatpipe.pipeline.splat.moments import merge_pairs, moments_of, shares
 from splatpipe.pipeline.splat.morton import morton_keys
 
-NEIGHBOURS = 8
-"""Of each Gaussian that it may merge with."""
+NEIGHBOURS = 16
+"""Of each Gaussian that it may merge with: with 8, levels from where they are shown are 0.5 dB worse."""
 ROUND_SHARE = 0.3
 """Of the Gaussians, at most so many vanish in a round: the less, the nearer to always taking the very cheapest."""
-BALANCE = 2.0
-"""Power of the number that a merged Gaussian stands for by which its cost grows: at 1 it is that of all of them, at 0
-some swallow all that is around them."""
-LARGE_POWER = 0.25
+LARGE_POWER = 0.1
 """Power of the area, beside the median's, by which merging a large Gaussian costs more: a scene's few enormous ones
 fill whole pictures, and the many that are large only because they are far away are to merge nearly as others do."""
 PIECE = 200_000
@@ -83,12 +80,13 @@ def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
     return reduce_further(Reduction.none_yet(gaussians), count).gaussians
 
 
-def reduce_further(start: Reduction, count: int) -> Reduction:
+def reduce_further(start: Reduction, count: int, large_power: float = LARGE_POWER) -> Reduction:
     """``reduce_to`` of what stands for others already.
 
     Args:
         start: What is there.
         count: How many are to be left, at least 1.
+        large_power: See ``LARGE_POWER``.
 
     Raises:
         ValueError: if the count is less than 1.
@@ -103,7 +101,7 @@ def reduce_further(start: Reduction, count: int) -> Reduction:
     turn = 0
     while len(alive) > count:
         quota = min(len(alive) - count, max(1, math.ceil(ROUND_SHARE * len(alive))))
-        pairs = _cheapest_pairs(work, alive, quota, turn, least_variance)
+        pairs = _cheapest_pairs(work, alive, quota, turn, least_variance, large_power)
         _merge_into_first(work, pairs)
         gone = np.zeros(len(work.counts), dtype=bool)
         gone[pairs[:, 1]] = True
@@ -137,13 +135,18 @@ def _drawn(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
 
 
 def _cheapest_pairs(
-    work: Reduction, alive: Int64[np.ndarray, " n"], quota: int, turn: int, least_variance: float
+    work: Reduction,
+    alive: Int64[np.ndarray, " n"],
+    quota: int,
+    turn: int,
+    least_variance: float,
+    large_power: float,
 ) -> Int64[np.ndarray, "m 2"]:
     """Pairs without conflict, the cheapest of all pieces; at least one."""
     found, costs = [], []
     for piece in _pieces(work.gaussians, alive, turn):
         part = work.gaussians.select(torch.from_numpy(piece))
-        pairs, paid = _piece_pairs(part, work.counts[piece], least_variance)
+        pairs, paid = _piece_pairs(part, work.counts[piece], least_variance, large_power)
         found.append(piece[pairs])
         costs.append(paid)
     order = np.argsort(np.concatenate(costs), kind="stable")[:quota]
@@ -164,15 +167,15 @@ def _pieces(work: Gaussians, alive: Int64[np.ndarray, " n"], turn: int) -> Itera
 
 
 def _piece_pairs(
-    piece: Gaussians, counts: Int64[np.ndarray, " n"], least_variance: float
+    piece: Gaussians, counts: Int64[np.ndarray, " n"], least_variance: float, large_power: float
 ) -> tuple[Int64[np.ndarray, "m 2"], Float64[np.ndarray, " m"]]:
     """A matching of neighbours, and what each pair costs all that it stands for."""
     moments = moments_of(piece)
     edges = _neighbours(moments.means)
     colours = piece.sh.to(torch.float32).reshape(len(piece), -1).numpy()
-    costs = merge_costs(moments, colours, edges, least_variance) * counts[edges].sum(1) ** BALANCE
+    costs = merge_costs(moments, colours, edges, least_variance) * counts[edges].sum(1)
     largest = moments.areas[edges].max(1) * (_FLAT**2 / least_variance)
-    costs *= np.maximum(largest, 1.0) ** LARGE_POWER
+    costs *= np.maximum(largest, 1.0) ** large_power
     chosen = match_cheapest(edges, costs, len(piece))
     return edges[chosen], costs[chosen]
 

@@ -15,6 +15,7 @@
 //   showPoints(on), showCameras(on), showInterface(on)
 //   picture()             a promise: the present view as a PNG data URL
 //   shown()               {gaussians, files}: what is drawn; files of the levels of detail, where it is in such
+//   limit(count)          on a site: so many Gaussians at most are seen in full; the page has its own limit by the device
 //   facts                 what the page was made with
 
 import { Box3, Vector3 } from "three";
@@ -362,8 +363,7 @@ class Viewer {
         const to = this.pose();
         to.position = vector(position);
         if (target) to.face(vector(target).sub(to.position).normalize(), this.view.axes().right);
-        if (target) to.roll = 0;
-        else Object.assign(to, { yaw, pitch, roll });
+        Object.assign(to, target ? { roll: 0 } : { yaw, pitch, roll });
         this.view.travel(to, true);
       },
       goToCamera: (name, atOnce = true) => this.goTo(this.photos.find((photo) => photo.name === name), atOnce),
@@ -384,6 +384,7 @@ class Viewer {
         const gaussians = this.parts().reduce((sum, part) => sum + part.count, 0);
         return { gaussians, files: this.levels?.shown.map((node) => node.file) ?? [] };
       },
+      limit: (count) => this.levels?.limit(count),
       picture: async () => (await this.picture()).toDataURL("image/png"),
     };
   }

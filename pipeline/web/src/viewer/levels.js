@@ -95,19 +95,22 @@ class Ranking {
  *
  * @param {object} root
  * @param {import("./view.js").View} view
- * @param {{pixels: number, most: number, ratio: number, refined: Set<object>}} limits Errors up to which a node will do,
- *   in the screen's pixels; Gaussians that are seen; the screen's pixels a CSS pixel; nodes whose descendants are shown.
+ * @param {{pixels: number, most: number, held: number, ratio: number, refined: Set<object>}} limits Errors up to which a
+ *   node will do, in the screen's pixels; Gaussians that are seen, and all that are shown, at most; the screen's pixels a
+ *   CSS pixel; nodes whose descendants are shown.
  * @returns {{inner: Set<object>, order: object[]}} Nodes that their children are to stand for, and all that have to be
  *   loaded for that, the most important first.
  */
-export function wantedLevels(root, view, { pixels, most, ratio, refined }) {
+export function wantedLevels(root, view, { pixels, most, held, ratio, refined }) {
   const eye = new Eye(view, ratio);
   const [inner, order] = [new Set(), [root]];
-  let cost = eye.cost(root);
+  let [cost, count] = [eye.cost(root), root.count];
   const refine = (node, then) => {
-    const more = node.children.reduce((sum, child) => sum + eye.cost(child), -eye.cost(node));
-    if (cost + more > most) return;
-    cost += more;
+    const costlier = node.children.reduce((sum, child) => sum + eye.cost(child), -eye.cost(node));
+    const more = node.children.reduce((sum, child) => sum + child.count, -node.count);
+    if (cost + costlier > most || count + more > held) return;
+    cost += costlier;
+    count += more;
     inner.add(node);
     for (const child of node.children) then(child);
   };

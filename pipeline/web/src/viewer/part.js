@@ -22,9 +22,10 @@ export class SplatPart {
   /** Once the GPU has the harmonics, nobody else needs them: two thirds of a splat's bytes. */
   forget() {
     const { extra } = this.splats;
+    this.splats.ensureShTextures(); // spark makes them when it first draws
     for (const [name, its] of Object.entries(SH_TEXTURES)) {
       const texture = extra[its]?.value;
-      if (!texture) continue;
+      if (!texture) continue; // a lower degree has none
       texture.onUpdate = () => {
         texture.image.data = null;
         extra[name] = true; // that it is there, spark asks still

@@ -8,8 +8,8 @@ import { readPart } from "./part.js";
 const PIXELS = 8; // of the screen: a smaller error is not refined; its Gaussians stand half a pixel from the truth
 const NARROW = "(max-width: 640px), (max-height: 520px), (pointer: coarse)";
 const MOST = { wide: 3_000_000, narrow: 800_000 }; // Gaussians seen: what a computer, and what a phone does smoothly
+const HELD = 1.5; // times as many are in memory at most, those out of sight as well: each takes 200 bytes
 const LITTLE_MEMORY_GB = 4; // of the machine: then as on a phone
-const KEPT = 1.5; // times as many Gaussians are kept at most, if they are not shown: looking back asks for nothing
 const AT_ONCE = { wide: 4, narrow: 2 }; // files: each is decoded by a worker with memory of its own
 
 function size() {
@@ -29,7 +29,7 @@ export class LevelStream {
     this.byFile = new Map(nodes.map((node) => [node.file, node]));
     this.stage = stage;
     this.failed = failed;
-    this.most = MOST[size()];
+    this.limit(MOST[size()]);
     this.refined = new Set();
     this.shown = [];
     this.loaded = 0; // Gaussians
@@ -37,6 +37,13 @@ export class LevelStream {
     this.waiting = [];
     this.queue = new FileQueue(AT_ONCE[size()], (...file) => this.take(...file), (...file) => this.miss(...file));
     addEventListener("online", () => this.retry());
+  }
+
+  /** How many Gaussians are seen at most, and with them how many are in memory. */
+  limit(most) {
+    this.most = most;
+    this.held = HELD * most;
+    this.stage.invalidate();
   }
 
   /** Load and show the root: the whole model, coarse. */
@@ -50,7 +57,8 @@ export class LevelStream {
   update(view) {
     this.time++;
     const ratio = this.stage.fullRatio;
-    const { inner, order } = wantedLevels(this.root, view, { pixels: PIXELS, most: this.most, ratio, refined: this.refined });
+    const { most, held, refined } = this;
+    const { inner, order } = wantedLevels(this.root, view, { pixels: PIXELS, most, held, ratio, refined });
     const shown = this.cover(this.root, inner);
     this.refined = new Set();
     for (const node of shown) {
@@ -61,6 +69,7 @@ export class LevelStream {
       this.stage.show(this.parts());
     }
     const useful = order.filter((node) => !this.refined.has(node)); // the others' descendants are shown
+    if (shown.reduce((sum, node) => sum + node.count, 0) > held) useful.push(...this.lost(this.root, inner));
     for (const node of [...shown, ...useful]) node.touched = this.time;
     this.queue.want(useful.filter((node) => !node.part && !node.failed).map((node) => node.file));
     this.unload();
@@ -77,6 +86,12 @@ export class LevelStream {
       parts.push(...part);
     }
     return parts.length ? parts : null;
+  }
+
+  /** Nodes that were let go of while their descendants were shown, which are finer than wanted. */
+  lost(node, inner) {
+    if (!inner.has(node)) return node.part ? [] : [node];
+    return node.children.flatMap((child) => this.lost(child, inner));
   }
 
   async take(file, bytes, signal) {
@@ -103,10 +118,10 @@ export class LevelStream {
 
   /** Let go of what has not been wanted for longest. */
   unload() {
-    if (this.loaded <= KEPT * this.most) return;
+    if (this.loaded <= this.held) return;
     const idle = this.nodes.filter((node) => node.part && node.touched !== this.time && node !== this.root);
     for (const node of idle.sort((a, b) => a.touched - b.touched)) {
-      if (this.loaded <= KEPT * this.most) return;
+      if (this.loaded <= this.held) return;
       this.loaded -= node.part.count;
       node.part.dispose();
       node.part = null;
