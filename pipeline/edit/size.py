@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.splat.formats import SplatFormat
 from splatpipe.pipeline.splat.formats.files import write_scene
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.reduction import reduce_to
+from splatpipe.pipeline.splat.reduction import Reduction, reduce_further, reduce_to
 from splatpipe.pipeline.splat.scene import Scene
 
 MOST = 10**10  # Gaussians: more than any machine holds
@@ -83,7 +83,7 @@ class Reduce:
         """
         if self.count:
             if len(piece) > self.count:
-                piece.take(reduce_to(piece.settled(), self.count))
+                piece.take(reduce_further(Reduction.none_yet(piece.settled()), self.count).gaussians)
             return {"step": "reduce", "to": self.count}
         piece.take(self._fitting(piece.scene()))
         return {"step": "reduce", "bytes": self.size_bytes, "format": self.output.kind.name}
@@ -94,27 +94,28 @@ class Reduce:
         sample = whole.select(torch.arange(0, len(whole), max(1, -(-len(whole) // SAMPLE))))
         each = self._bytes(replace(scene, gaussians=sample)) / max(1, len(sample))
         count, too_many = min(len(whole), max(1, int(self.size_bytes / each))), len(whole) + 1
-        best: Gaussians | None = None
+        best = 0  # the most that are known to fit: they are merged anew rather than kept beside the next
         for _ in range(ROUNDS):
-            tried = whole if count >= len(whole) else reduce_to(whole, count)
+            tried = reduce_to(whole, count)
             size = self._bytes(replace(scene, gaussians=tried))
             if size <= self.size_bytes:
-                best = tried
+                best = count
                 if count >= len(whole) or size >= FULL * self.size_bytes:
-                    break
+                    return tried
             else:
                 too_many = count
+            del tried
             wanted = math.floor(MARGIN * count * self.size_bytes / size)
             wanted = max(1, min(wanted, too_many - 1, len(whole)))
-            if best is not None and wanted <= len(best):
+            if best and wanted <= best:
                 break
             count = wanted
-        if best is None:
+        if not best:
             raise SplatpipeError(
                 f"{self.size_bytes / 1e6:g} MB are too few for a {self.output.kind.name} of this splat.",
                 hint="Ask for more, or for a format that packs more tightly.",
             )
-        return best
+        return reduce_to(whole, best)
 
     def _bytes(self, scene: Scene) -> int:
         """What it takes when it is written, beside where it is going to be: that has the room."""

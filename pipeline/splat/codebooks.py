@@ -33,11 +33,16 @@ def fit_codebook(
         return np.zeros(CODEBOOK_SIZE, np.float32)
     order = np.argsort(values, kind="stable")
     ordered = values[order].astype(np.float64)
-    changes = np.flatnonzero(np.diff(ordered)) + 1
-    if len(changes) < size:
-        return _filled(ordered[np.concatenate(([0], changes))])
-    mass = np.concatenate(([0.0], np.cumsum(np.ones(len(ordered)) if weights is None else weights[order], dtype=float)))
-    moment = np.concatenate(([0.0], np.cumsum(np.diff(mass) * ordered)))
+    is_new = np.concatenate(([True], ordered[1:] != ordered[:-1]))
+    if np.count_nonzero(is_new) <= size:
+        return _filled(ordered[is_new])
+    mass, moment = np.zeros((2, len(ordered) + 1))
+    np.cumsum(np.ones(len(ordered)) if weights is None else weights[order], out=mass[1:])
+    del order, is_new  # of the harmonics of five million Gaussians each array here is a tenth of all that they are
+    moments = np.diff(mass)
+    moments *= ordered
+    np.cumsum(moments, out=moment[1:])
+    del moments
     found = _start(ordered, mass, size)
     for _ in range(_ITERATIONS):
         bounds = _bounds(ordered, found)

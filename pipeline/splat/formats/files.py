@@ -10,9 +10,9 @@ from pathlib import Path
 from splatpipe.pipeline.engine.durable import sync_folder, sync_tree
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
-from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.scene import Scene
 
+_ROWS_AT_ONCE = 1 << 16
 _MOST_HEADER_BYTES = 65_536  # of a PLY, in which it says whether it is compressed
 _MAGIC = ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK", "sog"), (b"glTF", "glb"))
 _HINT = "Give a splat as PLY, compressed PLY, SPZ, SOG or GLB, or the folder of a 3DGS model."
@@ -125,13 +125,10 @@ def _sync_file(path: Path) -> None:
 
 
 def in_unit_quats(scene: Scene) -> Scene:
-    """The same splat with quaternions of unit length; one of no length is no rotation."""
-    pieces = (_normalised(piece) for piece in scene.gaussians.pieces())
-    return replace(scene, gaussians=Gaussians.gathered(pieces, scene.gaussians))
-
-
-def _normalised(piece: Gaussians) -> Gaussians:
-    length = piece.quats.double().norm(dim=1, keepdim=True)
-    unit = (piece.quats.double() / length.clamp(min=1e-30)).to(piece.quats.dtype)
-    unit[length[:, 0] == 0.0] = unit.new_tensor([1.0, 0.0, 0.0, 0.0])
-    return replace(piece, quats=unit)
+    """The same splat, its other parameters shared, with quaternions of unit length; one of no length is no rotation."""
+    quats = scene.gaussians.quats.detach().clone()
+    for rows in quats.split(_ROWS_AT_ONCE):
+        length = rows.double().norm(dim=1, keepdim=True)
+        rows.copy_(rows.double() / length.clamp(min=1e-30))
+        rows[length[:, 0] == 0.0] = rows.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return replace(scene, gaussians=replace(scene.gaussians, quats=quats))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats.bounded import open_file
 from splatpipe.pipeline.splat.formats.sog_decoder import SogDecoder
 from splatpipe.pipeline.splat.formats.sog_images import META, RECORD, SogImages, encode_sog
-from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record
+from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record, turn_of
 
 __all__ = ["AXES", "SogImages", "encode_sog", "read", "write"]
 
@@ -46,8 +47,9 @@ def write(path: Path, scene: Scene) -> None:
         ValueError: if a value is not finite.
         OSError: if the file cannot be written.
     """
-    scene = scene.turned(AXES)
-    files = encode_sog(scene.gaussians, scene.facts.antialias, scene.facts.record()).files()
+    facts = replace(scene.facts, axes=AXES)
+    turn = None if scene.facts.axes == AXES else turn_of(AXES, scene.facts.axes)
+    files = encode_sog(scene.gaussians, facts.antialias, facts.record(), turn=turn).files()
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in files.items():
             archive.writestr(zipfile.ZipInfo(name, _FIRST_DAY), data)

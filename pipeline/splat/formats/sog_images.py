@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64, UInt8, UInt16
+from jaxtyping import Float, Float32, Float64, Int64, UInt8, UInt16
 from torch import Tensor
 
 from splatpipe.pipeline.splat.codebooks import fit_codebook, nearest_codes
 from splatpipe.pipeline.splat.formats.lossless_pictures import webp_of_pixels
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.morton import morton_keys
+from splatpipe.pipeline.splat.neighbourhoods import reordered
 from splatpipe.pipeline.splat.palettes import fit_palette, nearest_entries
+from splatpipe.pipeline.splat.sh import multiply_rows
 
 VERSION = 2
 META = "meta.json"
@@ -30,6 +32,7 @@ _HARMONIC_LEVELS = 64  # of the palette's numbers: as good as 256 beside the pal
 _MOST_LOG_AREA = 80.0  # of natural logarithms
 _SHOWN_QUANTILE = 0.99
 _LEAST_SHOWN = 1e-3  # of the mean: what is hardly seen from afar is seen from near
+_ROWS_AT_ONCE = 1 << 16
 _SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
 
 
@@ -51,7 +54,13 @@ class SogImages:
         return {META: text.encode("ascii"), **self.images}
 
 
-def encode_sog(gaussians: Gaussians, antialias: bool = False, record: str = "", in_order: bool = False) -> SogImages:
+def encode_sog(
+    gaussians: Gaussians,
+    antialias: bool = False,
+    record: str = "",
+    in_order: bool = False,
+    turn: Float64[Tensor, "3 3"] | None = None,
+) -> SogImages:
     """Code Gaussians; the same bytes for the same Gaussians, whatever the number of threads.
 
     Args:
@@ -61,6 +70,7 @@ def encode_sog(gaussians: Gaussians, antialias: bool = False, record: str = "", 
         record: ``SceneFacts.record()`` of a whole file; none in the pieces of a streamed one.
         in_order: Keep the Gaussians' order, as where an index of levels counts them; along a Morton curve otherwise,
             which takes less room.
+        turn: Rotation to the file's frame, where they are in another.
 
     Returns:
         meta.json and the pictures.
@@ -71,9 +81,9 @@ def encode_sog(gaussians: Gaussians, antialias: bool = False, record: str = "", 
     gaussians = gaussians.detach().to("cpu", torch.float32)
     if not bool(gaussians.finite().all()):
         raise ValueError("a SOG file holds finite numbers only")
-    if not in_order and len(gaussians):
-        lowest, highest = gaussians.means.amin(0), gaussians.means.amax(0)
-        gaussians = gaussians.select(torch.argsort(morton_keys(gaussians.means, lowest, highest - lowest), stable=True))
+    if len(gaussians) and not (in_order and turn is None):
+        order = torch.arange(len(gaussians)) if in_order else _along_a_curve(gaussians.means, turn)
+        gaussians = Gaussians.gathered(reordered(gaussians, order, _ROWS_AT_ONCE, turn), gaussians)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "splatpipe"}, "count": len(gaussians)}
     meta["antialias"] = antialias
     if record:
@@ -83,6 +93,12 @@ def encode_sog(gaussians: Gaussians, antialias: bool = False, record: str = "", 
         meta[name] = {**facts, "files": [f"{picture}.webp" for picture in pictures]}
         images |= {f"{picture}.webp": webp_of_pixels(pixels) for picture, pixels in pictures.items()}
     return SogImages(meta, images)
+
+
+def _along_a_curve(means: Float[Tensor, "n 3"], turn: Float64[Tensor, "3 3"] | None) -> Int64[Tensor, " n"]:
+    turned = means if turn is None else multiply_rows(turn, means.double()).to(means.dtype)
+    lowest, highest = turned.amin(0), turned.amax(0)
+    return torch.argsort(morton_keys(turned, lowest, highest - lowest), stable=True)
 
 
 _Part = tuple[dict[str, Any], dict[str, UInt8[np.ndarray, "h w c"]]]
