@@ -107,6 +107,19 @@ def test_the_same_levels_give_the_same_bytes(written: Path, wall: Scene, root: L
     assert all((written / name).read_bytes() == (tmp_path / name).read_bytes() for name in names)
 
 
+def test_levels_of_an_earlier_one_are_taken_away_and_other_files_stay(
+    wall: Scene, root: LevelNode, tmp_path: Path
+) -> None:
+    write_streamed_sog(tmp_path, wall, root)
+    (tmp_path / "3_1").mkdir()
+    (tmp_path / "3_1/own.txt").write_text("mine")
+    before = {path.name for path in tmp_path.iterdir()}
+    few = Scene(wall.gaussians.first(20), FACTS)
+    write_streamed_sog(tmp_path, few, build_levels(few.gaussians))
+    assert len(before) > 3
+    assert {path.name for path in tmp_path.iterdir()} == {"3_1", "0_0", LOD_META}
+
+
 def test_a_model_of_one_node_has_one_level(wall: Scene, tmp_path: Path) -> None:
     few = Scene(wall.gaussians.first(20), FACTS)
     write_streamed_sog(tmp_path, few, build_levels(few.gaussians))

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.levels import LevelNode, build_levels
 from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts, facts_of_record
@@ -112,6 +113,42 @@ def test_the_tree_is_the_levels_and_lies_on_the_earth_at_its_root_alone(tmp_path
         assert (box[0] <= node.box[0]).all() and (box[1] >= node.box[1]).all()
         np.testing.assert_allclose(box, node.box, atol=0.002)
         assert apart(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means) < MOST_OFF_M
+
+
+def test_our_own_reader_finds_each_nodes_gaussians_within_the_files_steps(tmp_path: Path):
+    scene, root = two_levels()
+    for node in root.nodes():
+        node.gaussians.sh.mul_(0.5)  # SPZ holds harmonics within ±1
+    write_tiles(tmp_path, scene, root, np.eye(4))
+    for node, tile in zip(root.nodes(), tiles(tileset(tmp_path)["root"]), strict=True):
+        read = read_scene(tmp_path / tile["content"]["uri"])
+        assert read.facts.axes == "y up"
+        made = Scene(node.gaussians, FACTS).turned("y up").gaussians
+        between = torch.cdist(read.gaussians.means.double(), made.means.double())
+        order = between.argmin(dim=0)  # a file's order is its own
+        assert sorted(order.tolist()) == list(range(len(made)))
+        found = read.gaussians.select(order)
+        assert float(between.min(dim=0).values.max()) < MOST_OFF_M
+        assert float((found.log_scales - made.log_scales).abs().max()) < 0.5 / 16 + 1e-5
+        assert float((found.opacity_logits.sigmoid() - made.opacity_logits.sigmoid()).abs().max()) < 0.5 / 255 + 1e-5
+        assert float((found.sh[:, 0] - made.sh[:, 0]).abs().max()) < 0.5 / 255 / 0.15 + 1e-5
+        signed = torch.nn.functional.normalize(made.quats, dim=1) * torch.where(made.quats[:, :1] < 0.0, -1.0, 1.0)
+        within = 0.5 / 127.5 * (1.0 + 3.0**0.5)  # and where three bytes are longer than 1, they are made shorter
+        assert float((found.quats[:, 1:] - signed[:, 1:]).abs().max()) < within + 1e-5
+        whole = (found.sh[:, 1:] * 128.0).round().to(torch.int64).flatten(1).numpy()
+        step = np.gcd.reduce(whole, axis=1) / 128.0  # a Gaussian's harmonics are multiples of one step
+        off = (found.sh[:, 1:] - made.sh[:, 1:]).abs().flatten(1).amax(dim=1).numpy()
+        assert (off <= step / 2.0 + 1e-5)[step > 0.0].all() and (off < 0.25 + 1e-5).all()
+
+
+def test_tiles_of_an_earlier_tileset_are_taken_away_and_other_files_stay(tmp_path: Path):
+    scene, root = two_levels()
+    write_tiles(tmp_path, scene, root, np.eye(4))
+    (tmp_path / "tiles/own.glb").write_bytes(b"mine")
+    (tmp_path / "notes.txt").write_text("mine")
+    write_tiles(tmp_path, scene, LevelNode(root.box, 0.0, scene.gaussians, ()), np.eye(4))
+    files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file())
+    assert files == ["notes.txt", "tiles/0.glb", "tiles/own.glb", "tileset.json"]
 
 
 def test_attributes_are_those_that_cesium_takes(tmp_path: Path):

@@ -9,7 +9,9 @@ are in the frame of a 3DGS PLY, y down.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+import shutil
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ VERSION = 1
 FULL_FILE = 100_000
 """Gaussians after which a level's next leaf begins another file: what is fetched at once stays some megabytes."""
 _DIGITS = 7  # of a number in the tree: a float32's
+_LEVEL = re.compile(r"[0-9]+_[0-9]+", re.ASCII)  # level and number, as folders are called
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,7 @@ def write_streamed_sog(folder: Path, scene: Scene, root: LevelNode) -> None:
     """Write `lod-meta.json` and its SOG folders; the same bytes for the same levels.
 
     Args:
-        folder: Made if it is not there; files of an earlier one are replaced, others stay.
+        folder: Made if it is not there; files of an earlier one are replaced or taken away, others stay.
         scene: What the levels are of: its facts go into `lod-meta.json` under ``splatpipe``.
         root: Of its levels, in its frame, with finite parameters.
 
@@ -116,6 +119,14 @@ def write_streamed_sog(folder: Path, scene: Scene, root: LevelNode) -> None:
     }
     text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
     (folder / LOD_META).write_text(text, encoding="ascii")
+    _drop_earlier(folder, {name.partition("/")[0] for name in files.names})
+
+
+def _drop_earlier(folder: Path, named: Set[str]) -> None:
+    """Take away the folders of levels that no index names any more."""
+    for path in sorted(folder.iterdir()):
+        if _LEVEL.fullmatch(path.name) and path.name not in named and (path / META).is_file():
+            shutil.rmtree(path)
 
 
 def _height(node: LevelNode) -> int:

@@ -10,7 +10,8 @@ attribute for each term of the harmonics but the constant one, which is COLOR_0,
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ GLTF_CONTENT = "3DTILES_content_gltf"
 ESRI_CRS = "ESRI_crs"
 _STEP_M = 0.001  # that boxes are rounded outwards to
 _LEAST_HALF_M = 0.001  # of a box's side: one of nothing has no inverse
+_TILE = re.compile(r"[0-9]+\.glb", re.ASCII)  # as they are called
 _EXTENSIONS = [EXTENSION, SPZ_EXTENSION]
 
 
@@ -66,7 +68,7 @@ def write_tiles(
     kilometres across.
 
     Args:
-        folder: Made if it is not there; tiles of an earlier one are replaced, its other files stay.
+        folder: Made if it is not there; tiles of an earlier one are replaced or taken away, its other files stay.
         scene: What the levels are of; its facts go into the tileset.
         root: Of its levels, in its frame.
         ecef_from_local: Places the scene, turned to z up, on the earth (EPSG:4978), metres; rigid.
@@ -91,6 +93,14 @@ def write_tiles(
     tileset = _tileset(tile, root, scene.facts, esri_crs)
     text = json.dumps(tileset, separators=(",", ":"), allow_nan=False)
     (folder / TILESET).write_text(text, encoding="ascii")
+    _drop_earlier(folder, set(names.values()))
+
+
+def _drop_earlier(folder: Path, named: Set[str]) -> None:
+    """Take away tiles that no tileset names any more."""
+    for path in sorted((folder / TILES).iterdir()):
+        if _TILE.fullmatch(path.name) and f"{TILES}/{path.name}" not in named:
+            path.unlink()
 
 
 def refuse_nowhere(facts: SceneFacts) -> None:

@@ -127,7 +127,8 @@ def _sync_file(path: Path) -> None:
 def in_unit_quats(scene: Scene) -> Scene:
     """The same splat, its other parameters shared, with quaternions of unit length; one of no length is no rotation."""
     quats = scene.gaussians.quats.detach().clone()
-    for rows in quats.split(_ROWS_AT_ONCE):
+    for start in range(0, len(quats), _ROWS_AT_ONCE):
+        rows = quats[start : start + _ROWS_AT_ONCE]
         length = rows.double().norm(dim=1, keepdim=True)
         rows.copy_(rows.double() / length.clamp(min=1e-30))
         rows[length[:, 0] == 0.0] = rows.new_tensor([1.0, 0.0, 0.0, 0.0])
