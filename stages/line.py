@@ -179,7 +179,7 @@ TRAIN = Stage(
 )
 CLEAN = Stage(
     "clean",
-    version=1,
+    version=2,
     config=CleanConfig,
     reads=("train.model", "train.rendering", "train.sky", "undistort.dataset", "split.views"),
     parts={"model": "model.ply", "told": "cleaned.json"},
@@ -205,7 +205,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=7,
+    version=8,
     config=ExportConfig,
     reads=(
         "clean.model",
