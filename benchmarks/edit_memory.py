@@ -1,9 +1,11 @@
 """What an edit of a large splat takes of memory: its peak above that of the bare program, over the splat's size.
 
-    python benchmarks/edit_memory.py FOLDER [--gaussians 5000000] [--steps "--rotate 37 --crop-box …"]
+    python benchmarks/edit_memory.py FOLDER [--gaussians 5000000] [--edits crop merge …]
+    python benchmarks/edit_memory.py FOLDER --steps "--rotate 37 --crop-box …" [--out out.sog]
 
-A synthetic splat of SH degree 3 is written into FOLDER once. Each edit runs in a process of its own; the baseline is
-the same edit of a splat of a thousand Gaussians.
+A synthetic splat of SH degree 3 is written into FOLDER once, and once more in the formats that edits write ("to spz")
+before others read them ("from spz"). Each edit runs in a process of its own; the baseline is the same edit of a splat
+of a thousand Gaussians.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import shlex
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -25,12 +28,39 @@ from splatpipe.pipeline.splat.scene import Place, SceneFacts
 BYTES = 236  # of a Gaussian of degree 3 in memory
 PART = 500_000
 FACTS = SceneFacts("z up", False, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
+CAMERA_HEIGHT_M, CAMERA_PX = 30.0, (1200, 900)  # of the photos of the run that is cleaned
+CAMERA_PLACES_M = (-25.0, 0.0, 25.0)  # along both axes
+
+
+@dataclass(frozen=True)
+class MeasuredEdit:
+    """An edit that is measured.
+
+    Attributes:
+        steps: As on the command line.
+        out: What is written, in the folder.
+        source: What is edited, there.
+    """
+
+    steps: str
+    out: str = "out.ply"
+    source: str = "{size}.ply"
+
+
+_CROP = "--local --crop-box -40,-40,40,40"
+_READ_BACK = ("spz", "sog", "glb", "compressed.ply")
 EDITS = {
-    "crop": "--local --crop-box -40,-40,40,40",
-    "polygon": "--crop-polygon {folder}/site.geojson",
-    "motion": "--rotate 37 --move 1,2,3",
-    "merge": "--merge {folder}/half.ply",
-    "pictures": "--move 0,0,1 --pictures",
+    "crop": MeasuredEdit(_CROP),
+    "polygon": MeasuredEdit("--crop-polygon {folder}/site.geojson"),
+    "motion": MeasuredEdit("--rotate 37 --move 1,2,3"),
+    "merge": MeasuredEdit("--merge {folder}/half.ply"),
+    "reduce": MeasuredEdit("--reduce {most}"),
+    "bytes": MeasuredEdit("--reduce {megabytes}MB", "out.spz"),
+    "clean": MeasuredEdit("--clean"),
+    "photos": MeasuredEdit("--clean", source="run-{size}.ply"),
+    "pictures": MeasuredEdit("--move 0,0,1 --pictures"),
+    **{f"to {ending}": MeasuredEdit("--rotate 37", f"{{size}}.{ending}") for ending in _READ_BACK},
+    **{f"from {ending}": MeasuredEdit(_CROP, source=f"{{size}}.{ending}") for ending in _READ_BACK},
 }
 
 
@@ -55,6 +85,19 @@ def write(path: Path, count: int) -> None:
     write_splat_parts(path, parts, count, 3, [f"splatpipe {FACTS.record()}"])
 
 
+def write_run(folder: Path, splat: Path) -> None:
+    """What cleaning takes for a run: the splat, and cameras that look down on it."""
+    (folder / "stages").mkdir(parents=True, exist_ok=True)
+    if not (folder / "splat.ply").exists():
+        (folder / "splat.ply").hardlink_to(splat)
+    down = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+    focal = CAMERA_PX[0] / 2.0
+    seen = {"width": CAMERA_PX[0], "height": CAMERA_PX[1], "fx": focal, "fy": focal, "rotation": down}
+    places = [(x, y, CAMERA_HEIGHT_M) for x in CAMERA_PLACES_M for y in CAMERA_PLACES_M]
+    cameras = [{**seen, "id": i, "img_name": f"{i}.jpg", "position": place} for i, place in enumerate(places)]
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+
+
 def measured(command: list[str]) -> tuple[int, float]:
     """Peak of its resident memory in bytes, and seconds."""
     code = f"import resource, subprocess, sys; done = subprocess.run({command!r}, capture_output=True, text=True); "
@@ -73,6 +116,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=5_000_000)
     parser.add_argument("--edits", nargs="*", default=list(EDITS))
     parser.add_argument("--steps", help="Another edit than those of the list.")
+    parser.add_argument("--out", default="out.ply", help="What that writes.")
     arguments = parser.parse_args()
     folder: Path = arguments.folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,19 +125,27 @@ def main() -> None:
     sizes = {"few": 1000, "many": arguments.gaussians}
     for name, count in sizes.items():
         write(folder / f"{name}.ply", count)
-    asked = {"asked": arguments.steps} if arguments.steps else {name: EDITS[name] for name in arguments.edits}
-    for name, steps in asked.items():
+    write_run(folder / "run-many.ply", folder / "many.ply")
+    if not (folder / "run-few.ply").exists():  # no run: to photos, a thousand scattered Gaussians are floaters
+        (folder / "run-few.ply").hardlink_to(folder / "few.ply")
+    asked = {name: EDITS[name] for name in arguments.edits}
+    if arguments.steps:
+        asked = {"asked": MeasuredEdit(arguments.steps, arguments.out)}
+    for name, edit in asked.items():
         peaks = {}
         for size, count in sizes.items():
             half = folder / "half.ply"
             half.unlink(missing_ok=True)
             write(half, count // 2)
-            command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "edit", str(folder / f"{size}.ply")]
-            command += [str(folder / "out.ply"), "--threads", "1", "--no-pictures"]
-            peaks[size] = measured([*command, *shlex.split(steps.format(folder=folder))])
+            few_enough = {"most": count * 3 // 5, "megabytes": max(1, count * 20 // 1_000_000)}
+            command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "edit"]
+            command += [str(folder / each.format(size=size)) for each in (edit.source, edit.out)]
+            command += ["--threads", "1", "--no-pictures", *shlex.split(edit.steps.format(folder=folder, **few_enough))]
+            peaks[size] = measured(command)
         above = peaks["many"][0] - peaks["few"][0]
         share = above / (BYTES * sizes["many"])
-        print(f"{name:9} {above / 1e6:8.0f} MB above, {share:.2f} × the splat, {peaks['many'][1]:.1f} s")
+        told = f"{above / 1e6:8.0f} MB above, {share:.2f} × the splat, {peaks['many'][1]:.1f} s"
+        print(f"{name:20} {told}", flush=True)
 
 
 if __name__ == "__main__":

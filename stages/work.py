@@ -30,8 +30,9 @@ from splatpipe.pipeline.train.limits import (
     worthwhile_iterations,
 )
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
+from splatpipe.pipeline.web.options import format_names
 from splatpipe.stages.block_work import BEGINNING_S, LAYOUT_S, BlockLoad, BlockWork
-from splatpipe.stages.costs import Costs
+from splatpipe.stages.costs import FORMAT_COSTS, IN_LEVELS, LEVELS_CPU, WITH_PHOTOS, Costs
 from splatpipe.stages.options import LineConfig
 
 MEGA = 1e6
@@ -398,8 +399,8 @@ class Work:
                 memory = min(memory, most)
             found[stage] = Need(
                 int(memory),
-                (cost.cpu * units.cpu + self._beginning_s(stage)) / speed,
-                int(cost.disk * units.disk) + self._disk_of_blocks(stage),
+                (cost.cpu * units.cpu + self._beginning_s(stage) + self._formats_s(stage)) / speed,
+                int(cost.disk * units.disk) + self._disk_of_blocks(stage) + self._disk_of_formats(stage),
                 self._scratch(stage, units),
                 PARALLEL.get(stage, 0.0),
             )
@@ -413,6 +414,19 @@ class Work:
             "blocks": LAYOUT_S * self.size.photos * self.blocks.looks,
             "train": BEGINNING_S * self.blocks.division.blocks,
         }.get(stage, 0.0)
+
+    def _formats_s(self, stage: str) -> float:
+        """CPU seconds of what is made of the splat besides."""
+        asked = format_names(self.config.export.formats) if stage == "export" else ()
+        each = sum(FORMAT_COSTS[name].cpu for name in asked if name in FORMAT_COSTS)
+        return self.gaussians * (each + (LEVELS_CPU if IN_LEVELS & set(asked) else 0.0))
+
+    def _disk_of_formats(self, stage: str) -> int:
+        """Bytes that those leave."""
+        asked = format_names(self.config.export.formats) if stage == "export" else ()
+        photos = self.size.photos * self.kept_at if WITH_PHOTOS & set(asked) else 0.0
+        each = sum(FORMAT_COSTS[name].disk for name in asked if name in FORMAT_COSTS)
+        return int(self.gaussians * each + self.costs.stages["undistort"].disk * photos)
 
     def _disk_of_blocks(self, stage: str) -> int:
         """Bytes that a stage leaves besides where the scene is trained in blocks."""

@@ -19,9 +19,10 @@ from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.needs import Need, whole
 from splatpipe.pipeline.train.blocks.division import Division, SceneSize
 from splatpipe.pipeline.train.limits import bytes_per_gaussian
+from splatpipe.pipeline.web.options import FORMATS
 from splatpipe.stages import work as work_module
 from splatpipe.stages.block_work import BEGINNING_S
-from splatpipe.stages.costs import REFERENCE
+from splatpipe.stages.costs import FORMAT_COSTS, REFERENCE, WITH_PHOTOS
 from splatpipe.stages.forecast import (
     CaptureSize,
     Forecaster,
@@ -58,6 +59,22 @@ def test_what_is_turned_off_costs_nothing() -> None:
     )
     assert off == Need(0, 0.0, 0)
     assert min(on.memory_bytes, on.cpu_seconds, on.disk_bytes) > 0
+
+
+def test_each_further_format_takes_its_time_and_disk_of_the_export_alone() -> None:
+    def needs(formats: str) -> dict[str, Need]:
+        return forecast(SIZE, resolve(LineConfig, [load_preset("preview"), {"export": {"formats": formats}}]))
+
+    plain = needs("")
+    each = {name: needs(name) for name in FORMATS}
+    assert set(FORMATS) == set(FORMAT_COSTS) | WITH_PHOTOS
+    for found in each.values():
+        assert found["export"].disk_bytes > plain["export"].disk_bytes
+        assert {**found, "export": plain["export"]} == plain
+    assert all(each[name]["export"].cpu_seconds > plain["export"].cpu_seconds for name in FORMAT_COSTS)
+    both = needs("tiles,web")["export"].cpu_seconds  # the levels are made once
+    assert both < each["tiles"]["export"].cpu_seconds + each["web"]["export"].cpu_seconds - plain["export"].cpu_seconds
+    assert needs("colmap,transforms") == each["colmap"]  # one folder of photos
 
 
 def test_more_photos_and_larger_ones_take_more() -> None:
