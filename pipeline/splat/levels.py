@@ -10,22 +10,25 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 
+from splatpipe.pipeline.splat import reduction
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.moments import moments_of
 from splatpipe.pipeline.splat.reduction import Reduction, reduce_further
 
 MOST_PER_NODE = 60_000
 CHILDREN = 4
-"""Of a node, at most: a surface twice as coarse has a quarter as many Gaussians."""
+"""Of a node, at most: a surface twice as coarse has a quarter as many Gaussians. The root has one more."""
 BOX_SIGMAS = 3.0
-ERROR_PER_SPREAD = 36.0
+ERROR_PER_SPREAD = 40.0
 """World units of a node's error for each of the spread of its merged Gaussians: at an error of 16 pixels the spread is
-less than half a pixel, and models of unlike captures are within 32 dB there (`benchmarks/levels.py`). With more, a
-node's picture is nearer still to what the full model is, but not to what is drawn of it: much of a pixel's many
-Gaussians is fainter than an 8-bit step then, and left out."""
+0.4 pixels, and models of unlike captures are within 32 dB there (`benchmarks/levels.py`). From farther away a node is
+nearer still to what the full model is, but not to what is drawn of it, which leaves out what is fainter than an 8-bit
+step: most of a pixel's many Gaussians."""
 LARGE_POWER = 0.5
 """In place of ``reduction.LARGE_POWER``: all of a node is seen from about one distance, and what is large is large in
 the picture."""
+FIRST_POWER = reduction.LARGE_POWER
+"""For the root, which is seen first, and then from the photos' places: what is small is near them."""
 _SPREAD_QUANTILE = 0.9  # the coarsest tenth may lie beyond
 _ERROR_STEP = 1.01  # that a node's error is at least above its children's
 _FAR_SIDES = 2.0  # what lies so many sides of the middle 80 % beyond them is far: sky, floaters
@@ -76,11 +79,14 @@ def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> Le
     if not len(gaussians) or most_per_node < 1:
         raise ValueError(f"levels of {len(gaussians)} Gaussians, at most {most_per_node} in a node")
     means = gaussians.means.detach().to(torch.float64).numpy()
-    outside = _outside(gaussians, means)
-    parts = [np.flatnonzero(~outside), np.flatnonzero(outside)]
-    if len(means) <= most_per_node or not all(len(part) for part in parts):
+    far_or_large = _outside(gaussians, means)
+    if len(means) <= most_per_node:
         return _branch(gaussians, means, np.arange(len(means)), most_per_node).node
-    return _joined([_branch(gaussians, means, part, most_per_node) for part in parts], most_per_node).node
+    inside, outside = np.flatnonzero(~far_or_large), np.flatnonzero(far_or_large)
+    below = _branches(gaussians, means, inside, most_per_node)
+    if len(outside):
+        below.append(_branch(gaussians, means, outside, most_per_node))
+    return _joined(below, most_per_node, FIRST_POWER).node
 
 
 def select_nodes(
@@ -115,21 +121,28 @@ class _Branch:
 def _branch(
     gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], part: Int64[np.ndarray, " m"], most: int
 ) -> _Branch:
-    """The tree of a part: as low as nodes of this size allow, its leaves alike in number."""
-    if len(part) <= most:
-        own = gaussians.select(torch.from_numpy(np.sort(part)))
-        return _Branch(LevelNode(_box(own), 0.0, own, ()), Reduction.none_yet(own))
-    height = 0
+    """The tree of a part, its leaves alike in number."""
+    if len(part) > most:
+        return _joined(_branches(gaussians, means, part, most), most, LARGE_POWER)
+    own = gaussians.select(torch.from_numpy(np.sort(part)))
+    return _Branch(LevelNode(_box(own), 0.0, own, ()), Reduction.none_yet(own))
+
+
+def _branches(
+    gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], part: Int64[np.ndarray, " m"], most: int
+) -> list[_Branch]:
+    """A part divided into the trees of its children: as low as nodes of this size allow."""
+    height = 1
     while most * CHILDREN**height < len(part):
         height += 1
     count = math.ceil(len(part) / (most * CHILDREN ** (height - 1)))
-    return _joined([_branch(gaussians, means, cell, most) for cell in _cells(means, part, count)], most)
+    return [_branch(gaussians, means, cell, most) for cell in _cells(means, part, count)]
 
 
-def _joined(branches: Sequence[_Branch], most: int) -> _Branch:
+def _joined(branches: Sequence[_Branch], most: int, large_power: float) -> _Branch:
     """The node over some: what they hold, merged until it fits."""
     children = tuple(branch.node for branch in branches)
-    reduced = reduce_further(Reduction.joined([branch.held for branch in branches]), most, LARGE_POWER)
+    reduced = reduce_further(Reduction.joined([branch.held for branch in branches]), most, large_power)
     boxes = np.stack([child.box for child in children])
     box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
     error = max(_ERROR_STEP * max(child.error for child in children), ERROR_PER_SPREAD * _spread(reduced))
