@@ -89,3 +89,11 @@ def test_from_near_the_full_model_is_chosen_from_afar_the_root_and_every_part_is
 def test_levels_of_nothing_are_refused() -> None:
     with pytest.raises(ValueError, match="levels of 0"):
         build_levels(Gaussians.empty(0, 0))
+
+
+def test_where_all_are_enormous_they_have_levels_too() -> None:
+    gaussians = a_wall(100)
+    gaussians.log_scales[:] = 3.0
+    root = build_levels(gaussians, 10)
+    assert sum(len(node.gaussians) for node in root.nodes() if not node.children) == 100
+    assert len(root.gaussians) <= 10

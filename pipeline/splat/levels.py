@@ -83,7 +83,7 @@ def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> Le
     if len(means) <= most_per_node:
         return _branch(gaussians, means, np.arange(len(means)), most_per_node).node
     inside, outside = np.flatnonzero(~far_or_large), np.flatnonzero(far_or_large)
-    below = _branches(gaussians, means, inside, most_per_node)
+    below = _branches(gaussians, means, inside, most_per_node) if len(inside) else []
     if len(outside):
         below.append(_branch(gaussians, means, outside, most_per_node))
     return _joined(below, most_per_node, FIRST_POWER).node
