@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 
-from splatpipe.pipeline.splat import reduction
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.moments import moments_of
 from splatpipe.pipeline.splat.reduction import Reduction, reduce_further
@@ -27,8 +26,9 @@ step: most of a pixel's many Gaussians."""
 LARGE_POWER = 0.5
 """In place of ``reduction.LARGE_POWER``: all of a node is seen from about one distance, and what is large is large in
 the picture."""
-FIRST_POWER = reduction.LARGE_POWER
-"""For the root, which is seen first, and then from the photos' places: what is small is near them."""
+FIRST_POWER = 0.2
+"""For the root, which is seen first, and then from the photos' places: what is small is near them. At 0.1 what is
+enormous, far around, becomes thin."""
 _SPREAD_QUANTILE = 0.9  # the coarsest tenth may lie beyond
 _ERROR_STEP = 1.01  # that a node's error is at least above its children's
 _FAR_SIDES = 2.0  # what lies so many sides of the middle 80 % beyond them is far: sky, floaters
