@@ -26,8 +26,8 @@ step: most of a pixel's many Gaussians."""
 LARGE_POWER = 0.5
 """In place of ``reduction.LARGE_POWER``: all of a node is seen from about one distance, and what is large is large in
 the picture."""
-FIRST_POWER = 0.2
-"""For the root, which is seen first, and then from the photos' places: what is small is near them. At 0.1 what is
+FIRST_POWER = 0.3
+"""For the root, which is seen first, and then from the photos' places: what is small is near them. With less, what is
 enormous, far around, becomes thin."""
 _SPREAD_QUANTILE = 0.9  # the coarsest tenth may lie beyond
 _ERROR_STEP = 1.01  # that a node's error is at least above its children's
