@@ -126,7 +126,7 @@ export class Stage {
     this.camera.updateMatrixWorld(true);
     const began = performance.now();
     if (this.splatsShown && this.splats.children.length) {
-      if (resting || slow) await this.sortNow();
+      if (resting || slow || glimpsed) await this.sortNow(); // a first picture has to show something, even while one moves
       else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate(), this.failed);
     }
     this.setQuality(!resting && slow, glimpsed ? GLIMPSE_RESOLUTION : 1);
