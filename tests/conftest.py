@@ -1,5 +1,6 @@
 """Shared by all tests: where the real photos are, and a browser."""
 
+import fcntl
 import os
 import shutil
 import signal
@@ -14,6 +15,9 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from splatpipe.demo import capture_path
 
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import PATIENCE_S
+
 DEMO = (
     "features.extractor=opencv-sift",
     "features.max_image_size=1400",
@@ -25,12 +29,14 @@ DEMO = (
     "ortho.gsd_m=0.3",
     "split.every=4",
 )
-PATIENCE_MS = 240_000.0  # for what the browser is to show: far more than it takes, of a busy machine
+WORKER = "PYTEST_XDIST_WORKER"  # set where tests run in several processes beside each other
 
 
 def pytest_configure() -> None:
     """Hear Ctrl-C: a run of tests in the background has SIGINT ignored, and so would all that it starts."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    if WORKER in os.environ:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: the other cores are other workers'
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -75,12 +81,22 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the whole demo capture with its control, at 0.1 megapixels: 26 dB. To be read only."""
-    out = tmp_path_factory.mktemp("demo") / "out"
+    out = shared_folder(tmp_path_factory) / "demo_run"
     sets = [part for text in DEMO for part in ("--set", text)]
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *sets]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    with (out.parent / "demo_run.lock").open("a+") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the first worker makes it, the others wait
+        if not lock.tell():
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            lock.write("done")
     return out
+
+
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Temporary, and the same for all workers of one run of the tests."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if WORKER in os.environ else folder
 
 
 @pytest.fixture(scope="session")
@@ -121,7 +137,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Watched]]:
 
     def open_page(address: str, width: int = 1440, height: int = 900, touch: bool = False) -> Watched:
         context = browser.new_context(viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch)
-        context.set_default_timeout(PATIENCE_MS)
+        context.set_default_timeout(1000.0 * PATIENCE_S)
         contexts.append(context)
         watched = Watched(context.new_page())
         watched.open(address)

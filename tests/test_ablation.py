@@ -3,13 +3,14 @@
 import json
 import math
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import wait_until
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import ablation
 import comparison
@@ -223,8 +224,7 @@ def test_ending_early_leaves_no_process(dataset: Path, tmp_path: Path) -> None:
     ended = next(ends)
     assert ended.command.name == "fails" and "There is no folder" in ended.failure
     running = processes_with(str(tmp_path / "out"))
-    while not any(processes_with(pid) for pid in running):  # a worker names its parent
-        time.sleep(0.02)
+    wait_until(lambda: any(processes_with(pid) for pid in running), "a worker")  # which names its parent
     ends.close()
     assert not processes_with(str(tmp_path / "out")) and not (tmp_path / "never").exists()
     assert not any(processes_with(pid) for pid in running)

@@ -31,8 +31,10 @@ from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED, Stopped
 from splatpipe.stages.line import LINE
 
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import wait_until
+
 SLOW = ("--until", "features", "--set", "features.extractor=sift")
-PATIENCE_S = 120.0  # for what a busy machine does in a second
 
 
 def command(captures: Path, out: Path, *more: str) -> list[str]:
@@ -136,15 +138,15 @@ def alive(processes: dict[int, str]) -> list[str]:
 
 def worker_of(running: subprocess.Popen[str], out: Path, but: int = 0) -> int:
     """Waits until the stage features runs; the number of the process that runs it."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
+
+    def found() -> int:
         assert running.poll() is None
-        if b'"stage_started", "stage": "features"' in events(out).get("house", b""):
-            for child, told in descendants(running.pid).items():
-                if "engine.worker" in told and child != but:
-                    return child
-        time.sleep(0.2)
-    raise AssertionError("features never ran")
+        if b'"stage_started", "stage": "features"' not in events(out).get("house", b""):
+            return 0
+        workers = (child for child, told in descendants(running.pid).items() if "engine.worker" in told)
+        return next((child for child in workers if child != but), 0)
+
+    return wait_until(found, "the stage features")
 
 
 def test_a_killed_stage_is_begun_again_and_ctrl_c_ends_all_in_order(tmp_path: Path) -> None:
@@ -173,10 +175,7 @@ def test_a_batch_that_is_killed_leaves_nothing_at_work_and_no_lie(tmp_path: Path
         others = descendants(running.pid)
         assert json.loads((out / "batch.json").read_text())["at_work"]
         running.kill()
-    deadline = time.monotonic() + PATIENCE_S
-    while alive(others) and time.monotonic() < deadline:
-        time.sleep(0.2)
-    assert alive(others) == []
+    wait_until(lambda: not alive(others), "the end of what it had started")
     told = json.loads((out / "batch.json").read_text())
     assert states(told) == {"house": "stopped"} and not told["at_work"] and "killed" in told["message"]
     assert states(batch(tmp_path / "captures", out, "--until", "ingest")) == {"house": "reused"}

@@ -6,16 +6,18 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from pathlib import Path
 
 import pytest
 
 from splatpipe.pipeline.engine.children import run_children
 from splatpipe.pipeline.engine.errors import StageError
 
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import wait_until
+
 CODE = "timeit"  # runs its arguments as statements; the first of them is our process number, which does no harm
 SLEEP = (CODE, "import time, splatpipe.pipeline.engine.children as c; c.die_with_parent({parent}); time.sleep(300)")
-WAIT_S = 60.0
 
 
 def sleeping() -> tuple[str, ...]:
@@ -59,21 +61,18 @@ def test_an_interruption_ends_them_at_once() -> None:
 
 
 @pytest.mark.parametrize("platform", [sys.platform, "darwin"])
-def test_they_die_with_the_process_that_started_them(platform: str) -> None:
-    statement = SLEEP[1].format(parent="os.getppid()")
+def test_they_die_with_the_process_that_started_them(tmp_path: Path, platform: str) -> None:
+    asked = tmp_path / "asked"
+    statement = SLEEP[1].format(parent="os.getppid()").replace("time.sleep", f"open({str(asked)!r}, 'w'); time.sleep")
     statement = statement.replace("c.die", f"import os; c.sys.platform = '{platform}'; c.die")
     script = (
         "from splatpipe.pipeline.engine.children import run_children\n"
         f"run_children([('{CODE}', {statement!r})], lambda: None, '')"
     )
     parent = subprocess.Popen([sys.executable, "-c", script])
-    end = time.monotonic() + WAIT_S
-    while not (born := children_of(parent.pid)):
-        assert time.monotonic() < end and parent.poll() is None
-        time.sleep(0.05)
-    time.sleep(1.0)  # it has to have asked the kernel
+    wait_until(asked.exists, "its asking the kernel")
+    born = children_of(parent.pid)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    while any(map(is_alive, born)):
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    assert born
+    wait_until(lambda: not any(map(is_alive, born)), "their end")

@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -14,9 +13,11 @@ from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.batch.plan import Call
 from splatpipe.pipeline.app.batch.snakemake_process import snakemake_environment
 
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import PATIENCE_S, wait_until
+
 DOCKER = Path(__file__).resolve().parents[1] / "docker"
 SLURM = DOCKER / "slurm.sh"
-PATIENCE_S = 240.0  # of a busy machine
 REASONS = ("There is no folder", "Name a folder of capture folders", "holds no run", "CUDA does not work here")
 COMMAND = re.compile(r"^ +(?:command|args): \[([^]]+)\]", re.MULTILINE)
 
@@ -66,9 +67,7 @@ def test_the_slurm_job_hands_the_warning_on_waits_for_the_end_and_is_queued_agai
     out, told_slurm = tmp_path / "out", tmp_path / "told_slurm"
     monkeypatch.setenv("TOLD_SLURM", str(told_slurm))
     process = slurm(tmp_path, capture_path(), out, "--preset", "preview")
-    until_s = time.monotonic() + PATIENCE_S
-    while not (out / "events.jsonl").exists() and time.monotonic() < until_s and process.poll() is None:
-        time.sleep(0.05)
+    wait_until(lambda: (out / "events.jsonl").exists() or process.poll() is not None, "the run")
     process.send_signal(number)  # Slurm's B: the shell alone
     _, told = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 143, told

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,9 @@ from PIL import Image
 
 from splatpipe.demo import capture_path
 from splatpipe.stages.line import LINE
+
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import PATIENCE_S, wait_until
 
 QUICK = (
     "features.extractor=opencv-sift",
@@ -240,11 +242,10 @@ def test_a_stopped_command_says_so_and_goes_on_later(
     pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([*command, *longer], **pipes) as running:
         events = copy_of_run / "events.jsonl"
-        while '"what": "training"' not in events.read_text()[told_before:]:
-            assert running.poll() is None, running.stderr and running.stderr.read()
-            time.sleep(0.1)
+        wait_until(lambda: '"what": "training"' in events.read_text()[told_before:] or running.poll() is not None)
+        assert running.poll() is None, running.stderr and running.stderr.read()
         running.send_signal(number)
-        _, said = running.communicate(timeout=60)
+        _, said = running.communicate(timeout=PATIENCE_S)
     assert running.returncode == code
     assert "Stopped" in said
     assert "Traceback" not in said

@@ -2,10 +2,10 @@
 
 import io
 import math
+import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,8 @@ from playwright.sync_api import Page
 from splatpipe.demo import capture_path
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import PATIENCE_S, wait_until
 from served import Served, linked_copy, serving
-
-PATIENCE_S = 240.0  # far more than it takes; of a busy machine
 
 
 @pytest.fixture
@@ -29,30 +28,35 @@ def training(demo_run: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.
     out = linked_copy(demo_run, tmp_path / "out")
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out)]
     command += ["--threads", "1", "--config", str(demo_run / "config.toml"), "--set", "train.iterations=20000"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    nothing = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=nothing, stderr=nothing, start_new_session=True)
     yield out, process
+    hold(process, signal.SIGCONT)
     process.send_signal(signal.SIGTERM)
     process.wait(timeout=PATIENCE_S)
 
 
+def hold(process: subprocess.Popen[bytes], how: signal.Signals = signal.SIGSTOP) -> None:
+    """Stop a run with all its processes where it is, or let it go on: what is seen meanwhile is of that very moment."""
+    if process.poll() is None:
+        os.killpg(process.pid, how)
+
+
 def wait(page: Page, until: Callable[[Any], bool]) -> Any:
     """The page's state, as soon as it is as wanted."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
+
+    def state() -> Any:
         told = page.evaluate("splatpipe.live.state()")
-        if told is not None and until(told):
-            return told
-        page.wait_for_timeout(250)
-    raise AssertionError(told and {**told, "curves": {}, "views": []})
+        return told if told is not None and until(told) else None
+
+    return wait_until(state, "what the page is to say")
 
 
-def wait_for_work(out: Path) -> None:
-    from splatpipe.pipeline.engine.run_folder import open_run_folder
-    from splatpipe.stages.line import LINE
-
-    deadline = time.monotonic() + PATIENCE_S
-    while not open_run_folder(out, LINE).at_work and time.monotonic() < deadline:
-        time.sleep(0.1)
+def wait_for_losses(out: Path) -> None:
+    """Until the training has begun; its first checkpoint comes 20 seconds later."""
+    log = out / "events.jsonl"
+    before = len(log.read_bytes())  # of the run that it was copied from
+    wait_until(lambda: b'"loss"' in log.read_bytes()[before:], "the training")
 
 
 def shown(page: Page, name: str) -> np.ndarray:
@@ -72,7 +76,8 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
     training: tuple[Path, subprocess.Popen[bytes]], open_page: Callable
 ) -> None:
     out, process = training
-    wait_for_work(out)
+    wait_for_losses(out)
+    hold(process)
     with serving(out) as server:
         assert server.start == "live"
         watched = open_page(f"{server.address}/{server.start}")
@@ -84,9 +89,10 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         ] * 2
         first, photo = shown(page, "render"), shown(page, "photo")
         assert first.shape == photo.shape
+        hold(process, signal.SIGCONT)
         follow_the_curves(page, len(told["curves"]["loss"]))
         before = page.evaluate("document.getElementById('render').src")
-        told = wait(page, lambda told: told["model"]["kind"] == "checkpoint" and told["model"]["iteration"] > 800)
+        told = wait(page, lambda told: told["model"]["kind"] == "checkpoint" and told["model"]["iteration"] > 200)
         wait_for_picture(page, "(before) => document.getElementById('render').src !== before", before)
         assert page.locator("#iteration").inner_text().startswith("iteration ")
         assert psnr(shown(page, "render"), photo) > psnr(first, photo) + 3.0

@@ -30,6 +30,9 @@ from splatpipe.pipeline.app.report.placing import placing_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
 
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+from patience import PATIENCE_S, wait_until
+
 QUICK = (
     *("features.extractor=opencv-sift", "features.max_image_size=700", "undistort.max_megapixels=0.03"),
     *("depths.max_megapixels=0.01", "dsm.cell_m=0.3", "ortho.gsd_m=0.3"),
@@ -182,11 +185,12 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "stage", "train", str(copy_of_run)]
     command += sets("train.iterations=100000")
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
-        while (copy_of_run / "events.jsonl").read_text()[before:].count('"name": "loss"') < 3:
-            assert running.poll() is None, running.stderr and running.stderr.read()
-            time.sleep(0.1)
+        events = copy_of_run / "events.jsonl"
+        begun = re.compile('("name": "loss".*){3}', re.DOTALL)
+        wait_until(lambda: begun.search(events.read_text(), before) or running.poll() is not None, "the training")
+        assert running.poll() is None, running.stderr and running.stderr.read()
         running.send_signal(signal.SIGINT)
-        _, said = running.communicate(timeout=240)
+        _, said = running.communicate(timeout=PATIENCE_S)
     assert running.returncode == 130 and "Traceback" not in said
     assert not list(copy_of_run.glob("report.html.*"))
     splatpipe("report", copy_of_run)

@@ -32,6 +32,7 @@ from splatpipe.pipeline.web.viewer_scene import Look, viewer_scene, write_viewer
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
+from patience import wait_until
 
 COUNT, MOST_PER_NODE = 1200, 100
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up
@@ -136,14 +137,6 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10.0 * np.log10(255.0**2 / max(np.mean((a.astype(float) - b.astype(float)) ** 2), 1e-9)))
 
 
-def wait_until(page: Page, happened: Callable[[], bool]) -> None:
-    for _ in range(2400):
-        if happened():
-            return
-        page.wait_for_timeout(100)
-    raise AssertionError("it did not happen within four minutes")
-
-
 def test_it_is_whole_at_once_stays_whole_and_is_the_full_model_in_the_end(
     site: Path, scene: ViewerScene, open_page: Callable
 ) -> None:
@@ -228,7 +221,7 @@ def test_a_file_that_is_lost_is_told_once_and_leaves_no_hole(site: Path, open_pa
         assert host.asked[leaf["file"]] == 3
         host.missing = set()
         page.evaluate("() => dispatchEvent(new Event('online'))")
-        wait_until(page, lambda: page.evaluate("() => splatpipe.shown().gaussians") == COUNT)
+        wait_until(lambda: page.evaluate("() => splatpipe.shown().gaussians") == COUNT)
 
 
 def test_photos_points_and_what_was_measured_are_as_in_the_page(
@@ -244,7 +237,7 @@ def test_photos_points_and_what_was_measured_are_as_in_the_page(
         page.evaluate("() => splatpipe.ready")
         assert page.title() == scene.title
         assert page.locator("#fold").inner_text() == "1 volume"
-        wait_until(page, lambda: bool(page.evaluate("() => document.querySelector('#strip img').naturalWidth")))
+        wait_until(lambda: bool(page.evaluate("() => document.querySelector('#strip img').naturalWidth")))
         splats = picture(page)
         page.evaluate("() => splatpipe.complete()")
         page.evaluate("() => splatpipe.showPoints(true)")

@@ -33,6 +33,7 @@ from splatpipe.pipeline.web.viewer_scene import Look, upright, viewer_scene, wri
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
+from patience import wait_until
 
 LIKE_OURS_DB = 25.0
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up
@@ -90,15 +91,6 @@ def picture(page: Page) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
 
 
-def wait_until(page: Page, happened: Callable[[], bool]) -> None:
-    """The browser draws in software: what takes a moment may take seconds on a busy machine."""
-    for _ in range(2400):
-        if happened():
-            return
-        page.wait_for_timeout(100)
-    raise AssertionError("it did not happen within four minutes")
-
-
 def state(page: Page) -> dict:
     return page.evaluate("() => splatpipe.cameraState()")
 
@@ -137,7 +129,7 @@ def test_the_demos_page_shows_what_our_rasterizer_renders(demo_run: Path, view: 
     for camera in cameras:
         size = {"width": camera.width, "height": camera.height}
         page.set_viewport_size(size)
-        wait_until(page, lambda size=size: all(state(page)[name] == side for name, side in size.items()))
+        wait_until(lambda size=size: all(state(page)[name] == side for name, side in size.items()))
         assert page.evaluate("name => splatpipe.goToCamera(name)", camera.name)
         ours = render_pixels((model, sky), camera, options)
         assert psnr(picture(page), ours) >= LIKE_OURS_DB
@@ -196,7 +188,7 @@ def test_a_click_on_a_frustum_moves_the_camera_into_it(demo_run: Path, view: Ope
         if found:
             break
     assert found
-    wait_until(page, lambda: state(page)["photo"] == found)
+    wait_until(lambda: state(page)["photo"] == found)
     camera = next(c for c in page.evaluate("() => splatpipe.facts.cameras") if c["name"] == found)
     np.testing.assert_allclose(state(page)["position"], camera["centre"], atol=1e-9)
 
@@ -319,13 +311,13 @@ def test_drag_wheel_and_keys_move_the_view(tiny: Path, view: Opened) -> None:
     assert state(page)["photo"] is None
     before = away(page)
     page.mouse.wheel(0, -300)
-    wait_until(page, lambda: away(page) < before)
+    wait_until(lambda: away(page) < before)
     before = away(page)
     page.keyboard.down("s")
-    wait_until(page, lambda: away(page) > before)
+    wait_until(lambda: away(page) > before)
     page.keyboard.up("s")
     page.keyboard.press("h")
-    wait_until(page, lambda: state(page)["photo"] == first["photo"])
+    wait_until(lambda: state(page)["photo"] == first["photo"])
 
 
 def test_fingers_turn_and_pinch_on_a_phone(tiny: Path, view: Opened) -> None:
@@ -349,7 +341,7 @@ def test_fingers_turn_and_pinch_on_a_phone(tiny: Path, view: Opened) -> None:
     touch("touchEnd")
     assert away(page) < before
     page.locator("#strip button").nth(1).tap()
-    wait_until(page, lambda: state(page)["photo"] == "flight 1/photo_1.png")
+    wait_until(lambda: state(page)["photo"] == "flight 1/photo_1.png")
     for name in ("home", "distance", "help_button"):  # all that one needs is within the screen
         box = page.locator(f"#{name}").bounding_box()
         assert box is not None
@@ -386,7 +378,7 @@ def test_next_and_previous_count_from_the_photo_chosen_last(tiny: Path, view: Op
     page = view(tiny / "viewer.html")
     page.evaluate("() => splatpipe.goToCamera(splatpipe.facts.cameras[0].name)")
     page.keyboard.type("nNb")  # faster than the view travels
-    wait_until(page, lambda: state(page)["photo"] == "flight 1/photo_1.png")
+    wait_until(lambda: state(page)["photo"] == "flight 1/photo_1.png")
 
 
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844), (844, 390)])
@@ -433,7 +425,7 @@ def test_sections_and_volumes_are_lines_a_list_and_a_chart(tiny_measured: Path, 
     ]
     assert page.locator("#profile").is_hidden()
     section.click()
-    wait_until(page, lambda: np.allclose([state(page)["yaw"], state(page)["pitch"]], [np.pi / 2.0, -0.45], atol=1e-9))
+    wait_until(lambda: np.allclose([state(page)["yaw"], state(page)["pitch"]], [np.pi / 2.0, -0.45], atol=1e-9))
     left, right = (page.evaluate("end => splatpipe.project(end).x", end) for end in ([-1.5, 0, 0], [1.5, 0, 1.5]))
     assert page.locator("#results").bounding_box()["width"] < left < right < 1000.0  # its start is on the left
     box = page.locator("#chart").bounding_box()
@@ -462,9 +454,7 @@ def test_on_a_phone_the_list_is_folded_and_leaves_room(tiny_measured: Path, view
     assert page.locator("#chart").is_visible()
     assert box["x"] + box["width"] <= tools["x"]
     assert box["y"] + box["height"] <= where["y"]
-    wait_until(
-        page, lambda: box["y"] + box["height"] < page.evaluate("() => splatpipe.project([0, 0, 1]).y") < where["y"]
-    )
+    wait_until(lambda: box["y"] + box["height"] < page.evaluate("() => splatpipe.project([0, 0, 1]).y") < where["y"])
 
 
 def test_the_screenshot_is_the_picture(tiny: Path, view: Opened, tmp_path: Path) -> None:

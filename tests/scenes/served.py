@@ -14,7 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-PATIENCE_S = 240.0  # far more than an end takes, of a busy machine
+from patience import PATIENCE_S
+
 WRITTEN_INTO = ("events.jsonl", "splatpipe.log", ".lock")
 ADDRESS = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)")
 
