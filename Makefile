@@ -41,6 +41,9 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
+# The tests of a file share what they set up, so that a file stays with one worker.
+WORKERS = -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+
 .PHONY: run test test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
@@ -55,7 +58,7 @@ endif
 
 test: .venv/.tested
 	@echo "== tests"
-	@$(BIN)/python -m pytest -q -m "not captures and not cuda"
+	@$(BIN)/python -m pytest -q -m "not captures and not cuda" $(WORKERS)
 
 # The tests of the kernels take each instruction set that this CPU has; all the others take the best. Here a training and
 # the whole line take the others, too.
