@@ -16,9 +16,9 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from commands import Command, End, run_all, splatpipe
+from commands import Command, CommandEnd, run_all, splatpipe
 from comparison import MEASURES, differences, means, written
-from finished import Finished, best_and_end, clear, figures, tidy, work_folder
+from finished import ResultLog, best_and_end, clear, figures, tidy, work_folder
 from measure import SilentReporter, machine, write_figures
 from tables import Row, print_table
 from variants import NAME, Variant, base_of, choose, config_of, split
@@ -41,7 +41,7 @@ FRONT = ("ingest", "features", "matches", "sparse", "georef", "undistort")
 
 
 @dataclass(frozen=True)
-class Case:
+class AblationCase:
     """A training to be measured.
 
     Attributes:
@@ -66,7 +66,7 @@ class Case:
         """A row of the result."""
         return {"variant": self.variant, "capture": self.capture, "seed": self.seed} | figures
 
-    def figures(self, end: End, threads: int) -> Row:
+    def figures(self, end: CommandEnd, threads: int) -> Row:
         """What the command left."""
         return best_and_end(self.out / CURVE) if self.followed else figures(self.out / "out", end, threads)
 
@@ -158,7 +158,7 @@ def cases_of(
     reduced: Mapping[str, Path],
     work: Path,
     arguments: argparse.Namespace,
-) -> list[Case]:
+) -> list[AblationCase]:
     """Every variant on every capture with every seed; whole rounds of a seed first.
 
     Args:
@@ -183,13 +183,13 @@ def cases_of(
                 out = work / "runs" / name
                 words = ("run", str(dataset), str(out / "out"), "--seed", str(seed), *options(sets))
                 command = splatpipe(name, (*words, "--threads", str(arguments.threads)), out / "log")
-                cases.append(Case(variant.name, capture, seed, key, command, out))
+                cases.append(AblationCase(variant.name, capture, seed, key, command, out))
                 if capture in reduced:
                     cases.append(followed(cases[-1], sets, reduced[capture], arguments))
     return cases
 
 
-def followed(case: Case, sets: Sequence[str], dataset: Path, arguments: argparse.Namespace) -> Case:
+def followed(case: AblationCase, sets: Sequence[str], dataset: Path, arguments: argparse.Namespace) -> AblationCase:
     """The same training once more, to the bit, its held-out photos measured on the way."""
     name = f"{case.command.name}-curve"
     out = case.out.with_name(name)
@@ -200,10 +200,10 @@ def followed(case: Case, sets: Sequence[str], dataset: Path, arguments: argparse
     words = [word for key, value in facts.items() for word in (f"--{key}", str(value))]
     command = Command(name, (str(FOLLOW), *words, "--held-out", config.split.views, "--set", *sets), out / "log")
     key = digest([case.key, arguments.curve])
-    return Case(case.variant, case.capture, case.seed, key, command, out, followed=True)
+    return AblationCase(case.variant, case.capture, case.seed, key, command, out, followed=True)
 
 
-def run_cases(cases: Sequence[Case], finished: Finished, arguments: argparse.Namespace) -> dict[str, str]:
+def run_cases(cases: Sequence[AblationCase], finished: ResultLog, arguments: argparse.Namespace) -> dict[str, str]:
     """Run what is not finished, and keep its figures.
 
     Returns:
@@ -270,7 +270,7 @@ def ablate(arguments: argparse.Namespace) -> int:
         if arguments.curve is not None:
             reduced, lost_here = placed(datasets, work, arguments, base_sets(arguments), photos_only=False)
             lost += lost_here
-        finished = Finished(work)
+        finished = ResultLog(work)
         cases = cases_of(variants, datasets, reduced, work, arguments)
         failures = run_cases(cases, finished, arguments)
         rows = rows_of(cases, finished.rows)
@@ -286,7 +286,7 @@ def ablate(arguments: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def rows_of(cases: Sequence[Case], finished: Mapping[str, Row]) -> list[Row]:
+def rows_of(cases: Sequence[AblationCase], finished: Mapping[str, Row]) -> list[Row]:
     """A row a training, with what following it showed."""
     curves = {(case.variant, case.capture, case.seed): finished.get(case.key, {}) for case in cases if case.followed}
     return [

@@ -49,7 +49,7 @@ def main() -> None:
     if folder.exists():
         sys.exit(f"{folder} is there already; name a folder that is not.")
     captures = make_captures(data, folder / "captures")
-    night = Night(folder / "captures.toml", folder / "out")
+    night = BatchTrial(folder / "captures.toml", folder / "out")
     night.write_list(captures)
     first(night)
     repeated(night)
@@ -59,7 +59,7 @@ def main() -> None:
     print("All as it should be.")
 
 
-class Night:
+class BatchTrial:
     """A list of captures and the batch's folder."""
 
     def __init__(self, listed: Path, out: Path) -> None:
@@ -104,7 +104,7 @@ class Night:
         return {path.parent.name: path.read_bytes() for path in self.out.glob("*/events.jsonl")}
 
 
-def first(night: Night) -> None:
+def first(night: BatchTrial) -> None:
     """The night itself."""
     print("The night:")
     process = night.start()
@@ -128,7 +128,7 @@ def first(night: Night) -> None:
     )
 
 
-def repeated(night: Night) -> None:
+def repeated(night: BatchTrial) -> None:
     """At once again: nothing may start but the command itself."""
     print("The same at once:")
     before, seen = night.events(), set()
@@ -143,7 +143,7 @@ def repeated(night: Night) -> None:
     check(told["exit_code"] == 1, "exit code 1, since not all succeeded")
 
 
-def changed(night: Night, captures: Mapping[str, Path]) -> None:
+def changed(night: BatchTrial, captures: Mapping[str, Path]) -> None:
     """One more capture, and an option of another: those two run, and of the changed one what the option reaches."""
     print("One added, one changed:")
     night.write_list(captures, {"orbit": ["train.iterations=120"]})
@@ -161,11 +161,11 @@ def changed(night: Night, captures: Mapping[str, Path]) -> None:
     check(states["added"] == states["orbit"] == "done" and states["nadir"] == "reused", "both are done, others reused")
 
 
-def dry_run(night: Night, name: str, plugin: str) -> None:
+def dry_run(night: BatchTrial, name: str, plugin: str) -> None:
     """What Snakemake would send to a cluster."""
     if importlib.util.find_spec(plugin) is None:
         sys.exit(f"{plugin} is not installed: pip install {plugin.replace('_', '-')}")
-    with_profile = Night(night.listed, night.out.with_name(name))
+    with_profile = BatchTrial(night.listed, night.out.with_name(name))
     command = with_profile.command("--profile", str(PROFILES / name), "--dry-run")
     done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
     jobs = [line for line in done.stderr.splitlines() if line.strip().startswith("resources:") and "runtime" in line]

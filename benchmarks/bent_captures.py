@@ -32,12 +32,12 @@ from tables import Row, print_table
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.sfm.capture import Capture
+from splatpipe.pipeline.sfm.capture import MappingInput
 from splatpipe.pipeline.sfm.judging import judge
 from splatpipe.pipeline.sfm.ladder import climb
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
-from splatpipe.pipeline.sfm.verified import Verified, read_verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 from splatpipe.stages.line import LINE, MATCHES
 
 GUESS = 1.2  # of the longer side: COLMAP's where nothing is known
@@ -50,7 +50,7 @@ Truth = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Variant:
+class ThinnedGraph:
     """How a view graph is thinned.
 
     Attributes:
@@ -60,14 +60,14 @@ class Variant:
     """
 
     name: str
-    pairs: Callable[[Verified], Collection[Pair]]
+    pairs: Callable[[ViewGraph], Collection[Pair]]
     middle: float = 1.0
 
 
-def tree(seed: int, least: int, triangles: int) -> Callable[[Verified], Collection[Pair]]:
+def tree(seed: int, least: int, triangles: int) -> Callable[[ViewGraph], Collection[Pair]]:
     """A random spanning tree of the pairs with so many matches, and some pairs that close a triangle with it."""
 
-    def choose(verified: Verified) -> Collection[Pair]:
+    def choose(verified: ViewGraph) -> Collection[Pair]:
         rng = np.random.default_rng(seed)
         strong = [pair for pair, rows in verified.matches.items() if len(rows) >= least]
         group = {number: number for number in verified.names}
@@ -86,21 +86,21 @@ def tree(seed: int, least: int, triangles: int) -> Callable[[Verified], Collecti
     return choose
 
 
-def sequence(reach: int, bridges: Collection[Pair]) -> Callable[[Verified], Collection[Pair]]:
+def sequence(reach: int, bridges: Collection[Pair]) -> Callable[[ViewGraph], Collection[Pair]]:
     """Photos that follow each other, and a few pairs between the flights."""
     return lambda verified: {pair for pair in verified.matches if pair[1] - pair[0] <= reach or pair in bridges}
 
 
 BRIDGES = {(7, 22), (16, 17), (31, 32), (1, 16), (12, 26)}
 VARIANTS = [
-    *(Variant(f"tree {seed}", tree(seed, 200, 0)) for seed in (3, 4, 6, 7, 8)),
-    *(Variant(f"triangles {seed}", tree(seed, 80, 15)) for seed in (3, 5, 7)),
-    Variant("sequence", sequence(1, BRIDGES)),
-    Variant("middle", lambda verified: verified.matches, middle=0.3),
+    *(ThinnedGraph(f"tree {seed}", tree(seed, 200, 0)) for seed in (3, 4, 6, 7, 8)),
+    *(ThinnedGraph(f"triangles {seed}", tree(seed, 80, 15)) for seed in (3, 5, 7)),
+    ThinnedGraph("sequence", sequence(1, BRIDGES)),
+    ThinnedGraph("middle", lambda verified: verified.matches, middle=0.3),
 ]
 
 
-def thin(source: Path, target: Path, variant: Variant) -> None:
+def thin(source: Path, target: Path, variant: ThinnedGraph) -> None:
     """Write a variant of a database of matches."""
     verified = read_verified(source)
     kept = set(variant.pairs(verified))
@@ -127,7 +127,7 @@ def thin(source: Path, target: Path, variant: Variant) -> None:
                 new.write_two_view_geometry(i, j, geometry)
 
 
-def _in_middle(verified: Verified, number: int, rows: np.ndarray, variant: Variant) -> np.ndarray:
+def _in_middle(verified: ViewGraph, number: int, rows: np.ndarray, variant: ThinnedGraph) -> np.ndarray:
     camera = verified.cameras[verified.camera_of[number]]
     size = np.array([camera.width, camera.height])
     off = np.abs(verified.keypoints[number][rows] - size / 2.0)
@@ -170,12 +170,12 @@ def error_m(model: pycolmap.Reconstruction, truth: Truth) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def open_capture(out: Path, scratch: Path) -> Capture:
+def open_capture(out: Path, scratch: Path) -> MappingInput:
     """What the stage `sparse` would see of a run."""
     folder = open_run_folder(out, LINE)
     photos_dir, _ = folder.settings()
     at = {name: part.path for name, part in folder.lineage(MATCHES).items()}
-    return Capture(
+    return MappingInput(
         database=at["matches.database"],
         features=at["features.database"],
         colours=np.load(at["features.colours"]),
@@ -188,7 +188,7 @@ def open_capture(out: Path, scratch: Path) -> Capture:
     )
 
 
-def answer(capture: Capture) -> tuple[pycolmap.Reconstruction, Row]:
+def answer(capture: MappingInput) -> tuple[pycolmap.Reconstruction, Row]:
     """The line's cameras and what it says of them."""
     began = time.process_time()
     config, report = SparseConfig(), SilentReporter()

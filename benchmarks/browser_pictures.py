@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from captures import Picture
-from others import READERS, Others
+from others import READERS, OtherPrograms
 from playwright.sync_api import Page, sync_playwright
 
 from splatpipe.pipeline.engine.errors import MachineError
@@ -34,7 +34,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 
 @contextmanager
-def drawing_page(others: Others, folder: Path) -> Iterator[Page]:
+def drawing_page(others: OtherPrograms, folder: Path) -> Iterator[Page]:
     """A page that draws the files of a folder, into which its script is put.
 
     Raises:

@@ -26,7 +26,7 @@ AXES: tuple[Axes, ...] = ("z up", "y up", "y down")
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
+class CaptureRun:
     """A run.
 
     Attributes:
@@ -50,7 +50,7 @@ class Capture:
             return [np.asarray(colour.clamp(0.0, 1.0).numpy(), np.float64) for colour in colours]
 
 
-def open_capture(out: Path, most_views: int = 5) -> Capture:
+def open_capture(out: Path, most_views: int = 5) -> CaptureRun:
     """Open a finished run.
 
     Raises:
@@ -64,7 +64,7 @@ def open_capture(out: Path, most_views: int = 5) -> Capture:
         raise UsageError(f"{out} is no finished run.", hint="splatpipe run PHOTOS OUT, to the end.") from error
     held_out = {view["name"] for view in metrics["per_view"]}
     cameras = [_camera(row) for row in rows if row["img_name"] in held_out]
-    return Capture(out.name, read_scene(out / "splat.ply"), cameras[:most_views])
+    return CaptureRun(out.name, read_scene(out / "splat.ply"), cameras[:most_views])
 
 
 def _camera(row: dict[str, object]) -> Camera:
@@ -86,7 +86,7 @@ def decibels(pictures: Sequence[Picture], originals: Sequence[Picture]) -> float
     return -10.0 * math.log10(mean) if mean > 0.0 else math.inf
 
 
-def likely_frame(capture: Capture, scene: Scene, originals: Sequence[Picture]) -> tuple[str, Scene]:
+def likely_frame(capture: CaptureRun, scene: Scene, originals: Sequence[Picture]) -> tuple[str, Scene]:
     """The frame in which a splat looks most like the original to the first camera: its name, and the splat in it.
 
     Of the axes, and of those turned by 180° about the vertical: heading is a matter of taste to files without a place.

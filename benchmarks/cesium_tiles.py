@@ -34,13 +34,13 @@ from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.levels import build_levels
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 from splatpipe.pipeline.survey.geodesy import geodetic_from_ecef
 from splatpipe.pipeline.survey.globe import write_tiles_on_globe
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-PLACE = Place(52.2, 21.0, 150.0, "ellipsoidal", "EPSG:32634")
+PLACE = SplatOrigin(52.2, 21.0, 150.0, "ellipsoidal", "EPSG:32634")
 WIDTH, HEIGHT = 640, 420
 NEAR_PX = 12  # around where a point should be: what is bright there is the point
 MOST_OFF_PX = 2.0
@@ -52,7 +52,7 @@ PATIENCE_MS = 300_000.0
 
 
 @dataclass
-class Heard:
+class PageProblems:
     """What a page said and asked for that it should not have."""
 
     errors: list[str] = field(default_factory=list)
@@ -146,7 +146,7 @@ def check_splat(folder: Path, path: Path, modules: Path, pictures: Path | None) 
     middle = np.median(means, axis=0)
     size = float(np.percentile(np.linalg.norm(means - middle, axis=1), 60.0))
     with opened(folder, modules) as (page, heard):
-        place(page, Place(lies.latitude, lies.longitude, lies.height_m + raised))
+        place(page, SplatOrigin(lies.latitude, lies.longitude, lies.height_m + raised))
         for turn in (20.0, 110.0, 200.0, 290.0):
             away = np.array([math.sin(math.radians(turn)), math.cos(math.radians(turn)), 0.8])
             drawn, picture = seen(page, middle + 1.6 * size * away, middle)
@@ -158,19 +158,19 @@ def check_splat(folder: Path, path: Path, modules: Path, pictures: Path | None) 
         report(heard)
 
 
-def raise_of(ecef_from_local: np.ndarray, lies: Place) -> float:
+def raise_of(ecef_from_local: np.ndarray, lies: SplatOrigin) -> float:
     """By how much a placement is above its place's height: the geoid, where it is known."""
     height = float(geodetic_from_ecef(ecef_from_local[:3, 3][None])[0, 2])
     return height - lies.height_m
 
 
 @contextmanager
-def opened(folder: Path, modules: Path) -> Iterator[tuple[Page, Heard]]:
+def opened(folder: Path, modules: Path) -> Iterator[tuple[Page, PageProblems]]:
     """The page in a browser that draws in software, over a server of this machine."""
     roots = {"cesium": modules / "cesium/Build/Cesium", "tiles": folder, "page": Path(__file__).parent}
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, roots=roots))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    home, heard = f"http://127.0.0.1:{server.server_address[1]}/", Heard()
+    home, heard = f"http://127.0.0.1:{server.server_address[1]}/", PageProblems()
     with sync_playwright() as playwright:
         path = shutil.which("chromium") or shutil.which("google-chrome")
         browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
@@ -192,7 +192,7 @@ def foreign(url: str, home: str) -> bool:
     return not url.startswith((home, "data:", f"blob:{home}"))
 
 
-def report(heard: Heard) -> None:
+def report(heard: PageProblems) -> None:
     """End where something was said or asked for.
 
     Raises:
@@ -202,7 +202,7 @@ def report(heard: Heard) -> None:
         raise SystemExit("\n".join([*heard.errors, *heard.strangers]))
 
 
-def place(page: Page, lies: Place) -> None:
+def place(page: Page, lies: SplatOrigin) -> None:
     """Open the tiles."""
     where = [lies.longitude, lies.latitude, lies.height_m]
     page.evaluate("([x, y, h]) => openTiles('/tiles/tileset.json', x, y, h)", where)

@@ -33,7 +33,7 @@ QUALITY = 95
 
 
 @dataclass(frozen=True)
-class Fault:
+class CaptureFault:
     """One fault: what it is, the photos concerned, and the codes of findings that tell it."""
 
     kind: str
@@ -119,40 +119,42 @@ def halve(path: Path) -> str:
     return "half the size"
 
 
-def put_faults(photos: Path, trial: int) -> list[Fault]:
+def put_faults(photos: Path, trial: int) -> list[CaptureFault]:
     """Faults of one trial, put into a copy of the demo's photos."""
     generator = np.random.default_rng(trial)
     names = sorted(path.name for path in photos.iterdir())
-    faults: list[Fault] = []
+    faults: list[CaptureFault] = []
     if trial % 2 == 0:
         start = int(generator.integers(2, len(names) - 5))
         strip = names[start : start + 3]
         for name in strip:
             (photos / name).unlink()
-        faults.append(Fault("strip missing", (names[start - 1], names[start + 3]), "gap|orphan|overlap"))
+        faults.append(CaptureFault("strip missing", (names[start - 1], names[start + 3]), "gap|orphan|overlap"))
         left = [name for name in names if name not in names[start - 2 : start + 5]]
         blurred, dark, one, two, cut = (str(name) for name in generator.choice(left, 5, replace=False))
-        faults.append(Fault(defocus(photos / blurred, generator), (blurred,), "blur"))
-        faults.append(Fault(expose(photos / dark, -1.5), (dark,), "expos|dark"))
-        faults.append(Fault(swap_positions(photos / one, photos / two), (one, two), "position"))
+        faults.append(CaptureFault(defocus(photos / blurred, generator), (blurred,), "blur"))
+        faults.append(CaptureFault(expose(photos / dark, -1.5), (dark,), "expos|dark"))
+        faults.append(CaptureFault(swap_positions(photos / one, photos / two), (one, two), "position"))
         whole = (photos / cut).read_bytes()
         (photos / cut).write_bytes(whole[: int(len(whole) * generator.uniform(0.3, 0.9))])
-        faults.append(Fault("truncated", (cut,), "unreadable|truncated|broken"))
+        faults.append(CaptureFault("truncated", (cut,), "unreadable|truncated|broken"))
     else:
         blurred, light, twin, other, small = (str(name) for name in generator.choice(names, 5, replace=False))
-        faults.append(Fault(shake(photos / blurred, generator), (blurred,), "blur"))
-        faults.append(Fault(expose(photos / light, 1.5), (light,), "expos|bright"))
+        faults.append(CaptureFault(shake(photos / blurred, generator), (blurred,), "blur"))
+        faults.append(CaptureFault(expose(photos / light, 1.5), (light,), "expos|bright"))
         again = f"copy of {twin}"
         shutil.copy(photos / twin, photos / again)
         if trial % 4 == 1:
             rewrite(photos / again, lambda pixels: pixels)
-        faults.append(Fault("duplicate" + (", saved again" if trial % 4 == 1 else ""), (twin, again), "duplicate"))
-        faults.append(Fault(second_camera(photos / other, generator), (other,), "camera|focal"))
-        faults.append(Fault(halve(photos / small), (small,), "resized|size|camera"))
+        faults.append(
+            CaptureFault("duplicate" + (", saved again" if trial % 4 == 1 else ""), (twin, again), "duplicate")
+        )
+        faults.append(CaptureFault(second_camera(photos / other, generator), (other,), "camera|focal"))
+        faults.append(CaptureFault(halve(photos / small), (small,), "resized|size|camera"))
     return faults
 
 
-def is_told(fault: Fault, findings: list[dict[str, object]]) -> bool:
+def is_told(fault: CaptureFault, findings: list[dict[str, object]]) -> bool:
     """A finding of the right kind names one of its photos."""
     for finding in findings:
         if re.search(fault.codes, str(finding["code"])):

@@ -37,7 +37,7 @@ def splatpipe(name: str, arguments: Sequence[str], log: Path) -> Command:
 
 
 @dataclass(frozen=True)
-class End:
+class CommandEnd:
     """How a command ended.
 
     Attributes:
@@ -53,7 +53,7 @@ class End:
     cpu_s: float
 
 
-def run_all(commands: Sequence[Command], jobs: int) -> Iterator[End]:
+def run_all(commands: Sequence[Command], jobs: int) -> Iterator[CommandEnd]:
     """Run commands; those that run when this ends early are ended.
 
     Args:
@@ -95,7 +95,7 @@ class _Running:
             process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=told, stderr=log, start_new_session=True)
         return _Running(command, process, time.perf_counter())
 
-    def poll(self) -> End | None:
+    def poll(self) -> CommandEnd | None:
         """Its end, once; None while it runs."""
         pid, status, usage = os.wait4(self.process.pid, os.WNOHANG)
         if pid == 0:
@@ -103,7 +103,7 @@ class _Running:
         self.process.returncode = os.waitstatus_to_exitcode(status)
         failure = _failure(self.command, self.process.returncode)
         _told(self.command).unlink()
-        return End(self.command, failure, time.perf_counter() - self.since, usage.ru_utime + usage.ru_stime)
+        return CommandEnd(self.command, failure, time.perf_counter() - self.since, usage.ru_utime + usage.ru_stime)
 
 
 def _told(command: Command) -> Path:

@@ -23,11 +23,11 @@ import torch
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import write_splat_parts
-from splatpipe.pipeline.splat.scene import Place, SceneFacts
+from splatpipe.pipeline.splat.scene import SceneFacts, SplatOrigin
 
 BYTES = 236  # of a Gaussian of degree 3 in memory
 PART = 500_000
-FACTS = SceneFacts("z up", False, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
+FACTS = SceneFacts("z up", False, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
 CAMERA_HEIGHT_M, CAMERA_PX = 30.0, (1200, 900)  # of the photos of the run that is cleaned
 CAMERA_PLACES_M = (-25.0, 0.0, 25.0)  # along both axes
 

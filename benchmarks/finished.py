@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from commands import End
+from commands import CommandEnd
 from tables import Row
 
 from splatpipe.pipeline.engine.errors import UsageError
@@ -21,7 +21,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 METRICS = "metrics.json"
 
 
-class Finished:
+class ResultLog:
     """Rows by key, a JSON line each in `results.jsonl`; a line that a crash cut off is passed over.
 
     Args:
@@ -61,7 +61,7 @@ def tidy(out: Path) -> None:
     clear(out / "out")
 
 
-def figures(out: Path, end: End, threads: int) -> Row:
+def figures(out: Path, end: CommandEnd, threads: int) -> Row:
     """What a run's OUT and its end say: every number of `metrics.json`, nested ones under dotted names.
 
     Args:

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.sfm.footprints import Views
+from splatpipe.pipeline.sfm.footprints import StatedPoses
 from splatpipe.pipeline.sfm.pairs import Layout, Pair, select_pairs
 
 WIDTH, HEIGHT, FOCAL_PX, RADIAL = 2000, 1500, 1500.0, -0.04
@@ -38,7 +38,7 @@ LEAST_MATCHES = 15
 
 
 @dataclass(frozen=True)
-class Flight:
+class SyntheticFlight:
     """The truth; photo i has COLMAP's number i + 1.
 
     Attributes:
@@ -69,7 +69,7 @@ def lens(off: float = 1.0) -> pycolmap.Camera:
     return pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=parameters)
 
 
-def make_flight(count: int, seed: int, observations: int = OBSERVATIONS) -> Flight:
+def make_flight(count: int, seed: int, observations: int = OBSERVATIONS) -> SyntheticFlight:
     """Fly so many photos over ground without end, and see about so many points in each."""
     rng = np.random.default_rng(seed)
     centres, rotations = _poses(count, rng)
@@ -83,7 +83,7 @@ def make_flight(count: int, seed: int, observations: int = OBSERVATIONS) -> Flig
     point = np.concatenate([found for found, _ in seen])
     places = np.concatenate([where for _, where in seen])
     kept = _capped(point, rng)
-    return Flight(centres, rotations, points, photo[kept], point[kept], places[kept])
+    return SyntheticFlight(centres, rotations, points, photo[kept], point[kept], places[kept])
 
 
 def _poses(count: int, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3 3"]]:
@@ -150,14 +150,14 @@ def _capped(point: Int64[np.ndarray, " m"], rng: np.random.Generator) -> np.ndar
     return kept
 
 
-def choose_pairs(flight: Flight, seed: int, neighbours: int = 20) -> list[Pair]:
+def choose_pairs(flight: SyntheticFlight, seed: int, neighbours: int = 20) -> list[Pair]:
     """The line's own choice, from positions that err and angles of the gimbal."""
     rng = np.random.default_rng(seed)
     count = len(flight.centres_m)
     centres = flight.centres_m + rng.normal(0.0, POSITION_NOISE_M, (count, 3))
     enu_from_camera = np.swapaxes(flight.cam_from_enu, 1, 2)
     half = np.tile([WIDTH / FOCAL_PX / 2.0, HEIGHT / FOCAL_PX / 2.0], (count, 1))
-    views = Views(centres, enu_from_camera, half, np.zeros(count), POSITION_NOISE_M)
+    views = StatedPoses(centres, enu_from_camera, half, np.zeros(count), POSITION_NOISE_M)
     names = [f"{number:05d}.jpg" for number in range(count)]
     sigmas = np.full(count, POSITION_NOISE_M)
     layout = Layout(names, np.arange(count, dtype=np.float64), centres, sigmas, views.axes, views)
@@ -169,7 +169,7 @@ def choose_pairs(flight: Flight, seed: int, neighbours: int = 20) -> list[Pair]:
 
 
 def matches(
-    flight: Flight, pairs: list[Pair], seed: int
+    flight: SyntheticFlight, pairs: list[Pair], seed: int
 ) -> Iterator[tuple[Pair, Int64[np.ndarray, "_ 2"], np.ndarray]]:
     """Verified matches of the pairs that have enough, a fifth of them wrong, with the true fundamental matrix."""
     rng = np.random.default_rng(seed)
@@ -186,7 +186,9 @@ def matches(
             yield (i, j), found[np.lexsort((found[:, 1], found[:, 0]))], fundamental
 
 
-def _fundamental(flight: Flight, i: int, j: int, pinhole: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+def _fundamental(
+    flight: SyntheticFlight, i: int, j: int, pinhole: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "3 3"]:
     rotation = flight.cam_from_enu[j] @ flight.cam_from_enu[i].T
     x, y, z = flight.cam_from_enu[j] @ (flight.centres_m[i] - flight.centres_m[j])
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -195,7 +197,7 @@ def _fundamental(flight: Flight, i: int, j: int, pinhole: Float64[np.ndarray, "3
 
 
 def _wrong(
-    flight: Flight,
+    flight: SyntheticFlight,
     rows: tuple[slice, slice],
     true: Int64[np.ndarray, "t 2"],
     fundamental: Float64[np.ndarray, "3 3"],
@@ -220,7 +222,7 @@ def _wrong(
     return np.column_stack([tried[near], free[1][pick[near]]])
 
 
-def write_database(flight: Flight, path: Path, seed: int) -> int:
+def write_database(flight: SyntheticFlight, path: Path, seed: int) -> int:
     """Write what matching would leave; returns how many pairs have matches."""
     prior = lens(FOCAL_OFF)
     prior.has_prior_focal_length = True

@@ -33,7 +33,7 @@ Depth = Float64[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FloaterView:
     """What a camera sees of a model.
 
     Attributes:
@@ -55,7 +55,7 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
-class Planted:
+class FloaterScene:
     """Floaters, and what they were planted into.
 
     Attributes:
@@ -71,24 +71,24 @@ class Planted:
     building: Bool[np.ndarray, " t"]
 
 
-def sights_of(model: Gaussians, cameras: Sequence[Camera], options: rasterizer.RenderOptions) -> list[Sight]:
+def sights_of(model: Gaussians, cameras: Sequence[Camera], options: rasterizer.RenderOptions) -> list[FloaterView]:
     """Depths of a model from some cameras, spread evenly."""
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(CAMERAS, len(cameras))).round().astype(int))
     found = []
     with torch.no_grad():
         for index in chosen:
             depth = rasterizer.render(model, cameras[index], options.for_depths()).median_depth
-            found.append(Sight(cameras[index], depth.double().numpy()))
+            found.append(FloaterView(cameras[index], depth.double().numpy()))
     return found
 
 
 def plant(
     model: Gaussians,
-    sights: Sequence[Sight],
+    sights: Sequence[FloaterView],
     options: rasterizer.RenderOptions,
     per_kind: int,
     generator: np.random.Generator,
-) -> Planted:
+) -> FloaterScene:
     """Plant floaters of each kind, as many as are asked for or their share of that.
 
     Each lies on a ray of a random pixel of a random camera before the surface there, as far along it as is uniform in
@@ -109,16 +109,16 @@ def plant(
             left -= len(part)
             parts.append(part)
             kinds += [kind] * len(part)
-    return Planted(Gaussians.concat([model, *parts]), np.array(kinds), len(model), building)
+    return FloaterScene(Gaussians.concat([model, *parts]), np.array(kinds), len(model), building)
 
 
-def on_surfaces(model: Gaussians, sights: Sequence[Sight]) -> Bool[np.ndarray, " n"]:
+def on_surfaces(model: Gaussians, sights: Sequence[FloaterView]) -> Bool[np.ndarray, " n"]:
     """Which Gaussians lie where at least two cameras see a surface."""
     opaque = torch.sigmoid(model.opacity_logits).numpy() > SEEN_ALPHA
     return np.asarray(_at_surfaces(model, sights, DEPTH_MARGIN) & opaque)
 
 
-def _at_surfaces(gaussians: Gaussians, sights: Sequence[Sight], margin: float) -> Bool[np.ndarray, " n"]:
+def _at_surfaces(gaussians: Gaussians, sights: Sequence[FloaterView], margin: float) -> Bool[np.ndarray, " n"]:
     means, agreeing = gaussians.means.double().numpy(), np.zeros(len(gaussians), int)
     for sight in sights:
         agreeing += np.abs(sight.gaps(means)) < margin  # NaN is not near
@@ -133,7 +133,7 @@ def _donors(model: Gaussians, building: Bool[np.ndarray, " n"]) -> Int64[np.ndar
 def _attempt(
     model: Gaussians,
     donors: Int64[np.ndarray, " d"],
-    sight: Sight,
+    sight: FloaterView,
     kind: int,
     options: rasterizer.RenderOptions,
     generator: np.random.Generator,
@@ -188,7 +188,7 @@ def _logits(kind: int, count: int, generator: np.random.Generator) -> Float[torc
     return torch.from_numpy(np.log(opacity / (1.0 - opacity))).float()
 
 
-def _stands(found: Gaussians, sight: Sight, options: rasterizer.RenderOptions) -> Bool[np.ndarray, " n"]:
+def _stands(found: Gaussians, sight: FloaterView, options: rasterizer.RenderOptions) -> Bool[np.ndarray, " n"]:
     """Which are clear of the surface, before the camera, and to be seen."""
     means = found.means.double().numpy()
     depth = sight.camera.depths(means)

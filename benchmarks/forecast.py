@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from forecast_fit import Outcome, Run, compared, fit, left_out, read_run
+from forecast_fit import FinishedRun, ForecastRatio, compared, fit, left_out, read_run
 from tables import print_table
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
@@ -68,18 +68,18 @@ def configured(preset: str, differing: Mapping[str, Any] | None = None) -> LineC
     return resolve(LineConfig, [load_preset(preset), differing or {}])
 
 
-def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[Run], list[Run]]:
+def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[FinishedRun], list[FinishedRun]]:
     """The runs of the preset that is fitted to, and the others."""
-    runs = [(row["preset"], Run.of_row(row, configured(row["preset"], row.get("set")))) for row in rows]
+    runs = [(row["preset"], FinishedRun.of_row(row, configured(row["preset"], row.get("set")))) for row in rows]
     return [run for preset, run in runs if preset == FITTED_TO], [run for preset, run in runs if preset != FITTED_TO]
 
 
-def holds(outcome: Outcome) -> tuple[bool, bool]:
+def holds(outcome: ForecastRatio) -> tuple[bool, bool]:
     """Whether the whole run's peak memory and its CPU time were foretold well enough."""
     return abs(outcome.memory - 1.0) <= MEMORY_WITHIN, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
 
 
-def show(title: str, outcomes: Sequence[Outcome]) -> None:
+def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
     """Print what came of it."""
     table = []
     for outcome in outcomes:

@@ -32,7 +32,7 @@ the demo, beside 250 of the stage's own. Training's is from before its frames we
 
 
 @dataclass(frozen=True)
-class Run:
+class FinishedRun:
     """A finished run, as its manifests tell it.
 
     Attributes:
@@ -63,13 +63,13 @@ class Run:
         }
 
     @staticmethod
-    def of_row(row: Mapping[str, Any], config: LineConfig) -> Run:
+    def of_row(row: Mapping[str, Any], config: LineConfig) -> FinishedRun:
         """The inverse of ``as_row``, with the preset's options."""
         used = {stage: dict(zip(KINDS, figures, strict=True)) for stage, figures in row["used"].items()}
-        return Run(row["name"], CaptureSize(*row["size"]), config, row["threads"], row["counts"], used)
+        return FinishedRun(row["name"], CaptureSize(*row["size"]), config, row["threads"], row["counts"], used)
 
 
-def read_run(out: Path, config: LineConfig, name: str) -> Run:
+def read_run(out: Path, config: LineConfig, name: str) -> FinishedRun:
     """A run from the newest manifest of each stage in its OUT.
 
     Raises:
@@ -92,7 +92,7 @@ def read_run(out: Path, config: LineConfig, name: str) -> Run:
         "iterations": float(summaries["train"]["iterations"]),
     }
     used = {stage: _used(manifest) for stage, manifest in manifests.items() if stage not in SELDOM}
-    return Run(name, size, config, int(manifests["train"]["machine"]["threads"]), counts, used)
+    return FinishedRun(name, size, config, int(manifests["train"]["machine"]["threads"]), counts, used)
 
 
 def _used(manifest: Mapping[str, Any]) -> dict[str, float]:
@@ -104,7 +104,7 @@ def _used(manifest: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def fit(runs: Sequence[Run], base: Costs = REFERENCE) -> Costs:
+def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
     """The costs that explain these runs: what scenes typically have, and what a unit of the work takes that they had.
 
     What these runs do not tell (of an extractor that none used, of a film) is taken from ``base``.
@@ -140,7 +140,7 @@ def fit(runs: Sequence[Run], base: Costs = REFERENCE) -> Costs:
     )
 
 
-def scene_of(run: Run, base: Costs) -> Costs:
+def scene_of(run: FinishedRun, base: Costs) -> Costs:
     """Costs with what this run's scene had, which is known afterwards only: the units of its work come out as done."""
     bare = Work.of(run.size, run.config, replace(base, gaussians=1.0), run.threads)
     options, counts = run.config, run.counts
@@ -157,11 +157,11 @@ def scene_of(run: Run, base: Costs) -> Costs:
     )
 
 
-def _uses(run: Run, extractor: str) -> bool:
+def _uses(run: FinishedRun, extractor: str) -> bool:
     return run.config.features.extractor == extractor
 
 
-def _every(run: Run) -> float:
+def _every(run: FinishedRun) -> float:
     return run.size.photos * (run.size.photos - 1) / 2
 
 
@@ -183,7 +183,7 @@ def _line(those: Sequence[tuple[Mapping[str, float], Units]], slope: float | Non
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ForecastRatio:
     """A run beside its forecast: forecast over used.
 
     Attributes:
@@ -194,14 +194,14 @@ class Outcome:
         stages: Of the CPU time of single stages.
     """
 
-    run: Run
+    run: FinishedRun
     memory: float
     cpu: float
     disk: float
     stages: Mapping[str, float]
 
 
-def compared(run: Run, costs: Costs) -> Outcome:
+def compared(run: FinishedRun, costs: Costs) -> ForecastRatio:
     """What the costs tell of a run, over what it used."""
     needs = forecast(run.size, run.config, run.threads, costs=costs)
     used = run.used
@@ -209,7 +209,7 @@ def compared(run: Run, costs: Costs) -> Outcome:
     def ratio(join: Callable[[Iterable[float]], float], told: Mapping[str, float], kind: str) -> float:
         return join(told.values()) / join(used[stage][kind] for stage in used)
 
-    return Outcome(
+    return ForecastRatio(
         run,
         ratio(max, {stage: float(needs[stage].memory_bytes) for stage in used}, "peak_memory_bytes"),
         ratio(sum, {stage: needs[stage].cpu_seconds for stage in used}, "cpu_seconds"),
@@ -218,6 +218,6 @@ def compared(run: Run, costs: Costs) -> Outcome:
     )
 
 
-def left_out(runs: Sequence[Run]) -> list[Outcome]:
+def left_out(runs: Sequence[FinishedRun]) -> list[ForecastRatio]:
     """Each run against costs fitted to the other captures."""
     return [compared(run, fit([other for other in runs if other.name != run.name])) for run in runs]

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from browser_pictures import SPARK_TYPES, draw, drawing_page
-from captures import Capture, decibels, likely_frame, open_capture
+from captures import CaptureRun, decibels, likely_frame, open_capture
 from glb_accessors import PREFIX, largest_differences, read_glb
-from others import READERS, THEIR_AXES, Others, find_others
+from others import READERS, THEIR_AXES, OtherPrograms, find_others
 from round_trips import splat_file, working_folder, written
 from survey_readers import check_colmap, check_laz
 from tables import Row, print_table
@@ -49,10 +49,10 @@ class Bench:
         others: Programs.
     """
 
-    capture: Capture
+    capture: CaptureRun
     out: Path
     folder: Path
-    others: Others
+    others: OtherPrograms
 
     def file(self, kind: SplatFormat) -> Path:
         """The run's splat in a format; written once."""

@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from others import READERS, THEIR_AXES, Ended, Others, find_others
+from others import READERS, THEIR_AXES, OtherPrograms, ProgramEnd, find_others
 from round_trips import MOST_LARGER, bytes_of, working_folder, written
 from tables import Row, print_table
 
@@ -106,7 +106,7 @@ def _used() -> tuple[float, int]:
     return seconds, 1024 * (own.ru_maxrss + children.ru_maxrss)
 
 
-def row_of(kind: SplatFormat, source: Path, folder: Path, theirs: tuple[int, Ended] | None) -> Row:
+def row_of(kind: SplatFormat, source: Path, folder: Path, theirs: tuple[int, ProgramEnd] | None) -> Row:
     """A format's row."""
     wrote = measured(kind, source, folder, "written")
     row: Row = {"format": kind.name, "bytes": wrote["size"], "write_s": wrote["cpu_s"], "write_bytes": wrote["bytes"]}
@@ -126,7 +126,7 @@ def row_of(kind: SplatFormat, source: Path, folder: Path, theirs: tuple[int, End
     return row | {"bars": f"missed: {', '.join(missed)}" if missed else "met"}
 
 
-def theirs_of(kind: SplatFormat, scene: Scene, folder: Path, others: Others) -> tuple[int, Ended]:
+def theirs_of(kind: SplatFormat, scene: Scene, folder: Path, others: OtherPrograms) -> tuple[int, ProgramEnd]:
     """The size of splat-transform's file of a splat, and what it took."""
     source = folder / "theirs_from.ply"
     write_splat(source, scene.turned(THEIR_AXES).gaussians)

@@ -23,7 +23,7 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from gpu_parts import Outcome, Part, Row, run_parts
+from gpu_parts import GpuPart, PartOutcome, Row, run_parts
 
 ROOT = Path(__file__).resolve().parents[1]
 NATIVE = ROOT / "pipeline" / "raster" / "native"
@@ -39,12 +39,12 @@ COUNTS = (100_000, 1_000_000, 5_000_000)
 LINES = ("demo-standard", "ochota-standard")  # with `high` the pack is too large to travel
 
 
-def proofs(iterations: int) -> list[Part]:
+def proofs(iterations: int) -> list[GpuPart]:
     """What has to be right; trainings on the CPU run beside the rest, two threads each."""
     trainings = [{"capture": name, "seed": seed, "iterations": iterations} for name in TRAININGS for seed in SEEDS]
     return [
         *(
-            Part(
+            GpuPart(
                 f"train {job['capture']} {job['seed']} on the CPU",
                 "gpu_proofs:training",
                 job | {"on": "cpu"},
@@ -53,29 +53,29 @@ def proofs(iterations: int) -> list[Part]:
             )
             for job in trainings
         ),
-        Part("tests marked cuda", "gpu_proofs:marked_tests", {}, 150),
-        Part("agreement with the CPU", "gpu_proofs:agreement", {}, 90),
-        Part("the same bits twice", "gpu_proofs:same_bits_twice", {}, 60),
+        GpuPart("tests marked cuda", "gpu_proofs:marked_tests", {}, 150),
+        GpuPart("agreement with the CPU", "gpu_proofs:agreement", {}, 90),
+        GpuPart("the same bits twice", "gpu_proofs:same_bits_twice", {}, 60),
         *(
-            Part(f"train {job['capture']} {job['seed']} on cuda", "gpu_proofs:training", job | {"on": "cuda"}, 120)
+            GpuPart(f"train {job['capture']} {job['seed']} on cuda", "gpu_proofs:training", job | {"on": "cuda"}, 120)
             for job in trainings
         ),
-        *(Part(f"compute-sanitizer {tool}", "gpu_proofs:sanitized", {"tool": tool}, 75) for tool in TOOLS),
+        *(GpuPart(f"compute-sanitizer {tool}", "gpu_proofs:sanitized", {"tool": tool}, 75) for tool in TOOLS),
     ]
 
 
-def measures() -> list[Part]:
+def measures() -> list[GpuPart]:
     """What is to be fast and small, the most telling first; the peer is compiled beside it."""
     return [
-        Part("peers compiled", "gpu_peers:compiled", {}, 400, beside=True),
-        Part("the card", "gpu_speed:card", {}, 30),
-        *(Part(f"{count:,} Gaussians", "gpu_speed:speed", {"count": count}, 60) for count in COUNTS),
-        Part("10 M Gaussians, memory", "gpu_speed:memory", {"count": 10_000_000}, 60),
-        Part("more than 2^31 pairs", "gpu_speed:many_pairs", {}, 60),
-        Part("30,000 iterations", "gpu_speed:whole_training", {}, 200),
-        *(Part(f"gsplat, {count:,} Gaussians", "gpu_peers:speed", {"count": count}, 60) for count in COUNTS),
+        GpuPart("peers compiled", "gpu_peers:compiled", {}, 400, beside=True),
+        GpuPart("the card", "gpu_speed:card", {}, 30),
+        *(GpuPart(f"{count:,} Gaussians", "gpu_speed:speed", {"count": count}, 60) for count in COUNTS),
+        GpuPart("10 M Gaussians, memory", "gpu_speed:memory", {"count": 10_000_000}, 60),
+        GpuPart("more than 2^31 pairs", "gpu_speed:many_pairs", {}, 60),
+        GpuPart("30,000 iterations", "gpu_speed:whole_training", {}, 200),
+        *(GpuPart(f"gsplat, {count:,} Gaussians", "gpu_peers:speed", {"count": count}, 60) for count in COUNTS),
         *(
-            Part(f"{name}, as the line trains", "gpu_speed:line", {"capture": name}, 120)
+            GpuPart(f"{name}, as the line trains", "gpu_speed:line", {"capture": name}, 120)
             for name in ("demo-standard", "ochota-standard", "demo-high", "ochota-high")  # those that were packed
         ),
     ]
@@ -104,7 +104,7 @@ def environment(pack: Path) -> dict[str, str]:
     return {**os.environ, **mine}
 
 
-def build() -> Outcome:
+def build() -> PartOutcome:
     """Both libraries, beside their Python: what the CPU does, and CUDA for the device that is there."""
     began, said = time.monotonic(), []
     folder = SCRATCH / "build"
@@ -125,7 +125,7 @@ def build() -> Outcome:
     text = (folder / "cuda.txt").read_text().strip() if (folder / "cuda.txt").exists() else "cmake failed"
     rows: list[Row] = [{"built": text, "libraries": [path.name for path in made]}]
     state = "done" if len(made) == len(targets) else "failed"
-    return Outcome("build", state, round(time.monotonic() - began, 1), rows, "\n".join(said))
+    return PartOutcome("build", state, round(time.monotonic() - began, 1), rows, "\n".join(said))
 
 
 def machine() -> Row:
@@ -145,18 +145,18 @@ def machine() -> Row:
     }
 
 
-def day(name: str, parts: list[Part], out: Path, pack: Path, seconds: float) -> None:
+def day(name: str, parts: list[GpuPart], out: Path, pack: Path, seconds: float) -> None:
     """Build, run the parts, write the JSON after each of them, print the table at the end."""
     deadline = time.monotonic() + seconds
     out.mkdir(parents=True, exist_ok=True)
     facts, built = machine(), build()
     print(f"-- build: {built.state}, {built.seconds:.0f} s: {built.rows[0]['built']}", flush=True)
 
-    def write(outcomes: list[Outcome]) -> None:
+    def write(outcomes: list[PartOutcome]) -> None:
         told = {"benchmark": f"gpu_day {name}", "machine": facts, "parts": [asdict(one) for one in [built, *outcomes]]}
         (out / f"{name}.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
 
-    outcomes: list[Outcome] = []
+    outcomes: list[PartOutcome] = []
     write(outcomes)
     for outcomes in run_parts(parts, SCRATCH / name, environment(pack), deadline):
         write(outcomes)

@@ -27,7 +27,7 @@ GRACE_S = 3.0  # from the polite signal to the other one
 
 
 @dataclass(frozen=True)
-class Part:
+class GpuPart:
     """Something to be proven or measured.
 
     Attributes:
@@ -46,7 +46,7 @@ class Part:
 
 
 @dataclass
-class Outcome:
+class PartOutcome:
     """What became of a part.
 
     Attributes:
@@ -64,10 +64,10 @@ class Outcome:
     error: str = ""
 
 
-class Running:
+class PartProcess:
     """A part's process."""
 
-    def __init__(self, part: Part, folder: Path, environment: dict[str, str]) -> None:
+    def __init__(self, part: GpuPart, folder: Path, environment: dict[str, str]) -> None:
         self.part = part
         stem = "".join(letter if letter.isalnum() else "_" for letter in part.name)
         self._rows, self._log = folder / f"{stem}.jsonl", folder / f"{stem}.log"
@@ -77,7 +77,7 @@ class Running:
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(words, stdout=log, stderr=log, env=environment, start_new_session=True)
 
-    def end(self, deadline: float) -> Outcome:
+    def end(self, deadline: float) -> PartOutcome:
         """Wait until it has ended or its time is over."""
         limit = min(deadline, self._began + self.part.limit_s)
         state = "late"
@@ -88,7 +88,7 @@ class Running:
             self._stop()
         rows = [json.loads(line) for line in self._rows.read_text().splitlines()] if self._rows.exists() else []
         error = "" if state == "done" else self._log.read_text(errors="replace")[-LONGEST_ERROR:]
-        return Outcome(self.part.name, state, round(time.monotonic() - self._began, 1), rows, error)
+        return PartOutcome(self.part.name, state, round(time.monotonic() - self._began, 1), rows, error)
 
     def _stop(self) -> None:
         """It and all that it started, politely and then for certain."""
@@ -100,8 +100,8 @@ class Running:
 
 
 def run_parts(
-    parts: Sequence[Part], folder: Path, environment: dict[str, str], deadline: float
-) -> Iterator[list[Outcome]]:
+    parts: Sequence[GpuPart], folder: Path, environment: dict[str, str], deadline: float
+) -> Iterator[list[PartOutcome]]:
     """Run parts in their order, those ``beside`` beside the others.
 
     Args:
@@ -114,17 +114,17 @@ def run_parts(
         All outcomes so far, after each part.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    outcomes: list[Outcome] = []
-    beside: list[Running] = []
+    outcomes: list[PartOutcome] = []
+    beside: list[PartProcess] = []
     try:
         for part in parts:
             if deadline - time.monotonic() < LEAST_S:
-                outcomes.append(Outcome(part.name, "not begun", 0.0, [], "no time was left"))
+                outcomes.append(PartOutcome(part.name, "not begun", 0.0, [], "no time was left"))
             elif part.beside:
-                beside.append(Running(part, folder, environment))
+                beside.append(PartProcess(part, folder, environment))
                 continue
             else:
-                outcomes.append(Running(part, folder, environment).end(deadline))
+                outcomes.append(PartProcess(part, folder, environment).end(deadline))
             print_outcome(outcomes[-1])
             yield outcomes
         while beside:
@@ -136,7 +136,7 @@ def run_parts(
             running.end(0.0)
 
 
-def print_outcome(outcome: Outcome) -> None:
+def print_outcome(outcome: PartOutcome) -> None:
     """A part's rows, one a line."""
     print(f"-- {outcome.name}: {outcome.state}, {outcome.seconds:.1f} s", flush=True)
     for row in outcome.rows:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 from gpu_scenes import PARTS
-from measure import DEFAULT_START, Start, prepare, size_factor
+from measure import DEFAULT_START, InitialSettings, prepare, size_factor
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.run_folder import open_run_folder
@@ -65,7 +65,7 @@ def pack_bench(dataset: Path, points: str, megapixels: float, target: Path) -> N
     names = [path.name for path in sorted((dataset / IMAGES).iterdir())]
     split = split_views(names, SplitConfig().every, "")
     with tempfile.TemporaryDirectory() as scratch:
-        start = Start(DEFAULT_START.options, split.held_out)
+        start = InitialSettings(DEFAULT_START.options, split.held_out)
         made = prepare(dataset, points, size_factor(dataset, megapixels), Path(scratch) / "made", start=start)
         split_file = Path(scratch) / "split.json"
         split_file.write_text(split.to_json())

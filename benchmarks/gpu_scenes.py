@@ -20,7 +20,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 
 PACK = Path(os.environ.get("SPLATPIPE_PACK", ".gpu_day"))
 HARNESS = "SPLATPIPE_HARNESS"  # a libsplat_cuda built for the CPU, to try the parts themselves without a GPU
@@ -110,7 +110,7 @@ def gaussians(capture: str, count: int, where: torch.device, seed: int = 0) -> G
     )
 
 
-def plain_plan(capture: str, count: int, **options: object) -> Plan:
+def plain_plan(capture: str, count: int, **options: object) -> TrainingPlan:
     """Of a training that does what every trainer does, with all bands of colour from the first iteration."""
     config = TrainConfig.model_validate({"iterations": PUBLISHED_ITERATIONS} | PLAIN | options)
     given = inputs(capture, "cpu")

@@ -25,10 +25,10 @@ from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import write_splat
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.windows import TrainingSize
 
 CAPTURE = "speed"  # as `prepare` packs it
 MEGAPIXELS = 1.6
@@ -91,7 +91,7 @@ def iteration_times(count: int, megapixels: float, where: torch.device, repeats:
     steps = WARMUP + repeats
     with tempfile.TemporaryDirectory() as cache, choose_rules(where):
         state = TrainState.begin(gpu_scenes.gaussians(CAPTURE, count, where), plan, make_techniques(plan))
-        with PhotoStream.over(views, [Look()] * steps, 0, 1, Path(cache), megapixels).to(where) as photos:
+        with PhotoStream.over(views, [TrainingSize()] * steps, 0, 1, Path(cache), megapixels).to(where) as photos:
             for photo in islice(photos, WARMUP):
                 iterate(state, plan, photo)
             forget_peak(where)

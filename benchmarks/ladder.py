@@ -19,7 +19,7 @@ import pycolmap
 from tables import Row, print_table
 
 from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.ladder import climb
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
@@ -49,7 +49,7 @@ class SilentReporter:
     def warning(self, message: str, hint: str = "") -> None: ...
 
 
-def read_capture(out: Path, photos_dir: Path, scratch: Path) -> Capture:
+def read_capture(out: Path, photos_dir: Path, scratch: Path) -> MappingInput:
     """A run's capture, from the artifacts of its stages."""
     ingest, features, matches = (
         next((out / "stages").glob(f"{stage}-*")) for stage in ("ingest", "features", "matches")
@@ -57,7 +57,7 @@ def read_capture(out: Path, photos_dir: Path, scratch: Path) -> Capture:
     photos = load_photo_list(ingest / "photos")
     numbers = {photo.name: number for number, photo in enumerate(photos.photos, start=1)}
     pairs = json.loads((matches / "pairs.json").read_text(encoding="utf-8"))["pairs"]
-    return Capture(
+    return MappingInput(
         database=matches / "database.db",
         features=features / "database.db",
         colours=np.load(features / "colours.npy"),
@@ -71,7 +71,7 @@ def read_capture(out: Path, photos_dir: Path, scratch: Path) -> Capture:
     )
 
 
-def with_photos_left(capture: Capture) -> Capture:
+def with_photos_left(capture: MappingInput) -> MappingInput:
     """The same capture with pairs forgotten, and with photos that have hardly any keypoints."""
     target = capture.scratch / "left.db"
     forgotten = set()
@@ -96,7 +96,7 @@ def with_photos_left(capture: Capture) -> Capture:
     return replace(capture, database=target, tried=capture.tried - forgotten)
 
 
-def measured(name: str, capture: Capture, mapper: str) -> list[Row]:
+def measured(name: str, capture: MappingInput, mapper: str) -> list[Row]:
     """The rows of one capture."""
     began = time.process_time()
     config = SparseConfig(mapper=mapper)  # type: ignore[arg-type]
@@ -116,7 +116,7 @@ def measured(name: str, capture: Capture, mapper: str) -> list[Row]:
     return [{"capture": name, "of": len(capture.photos), **row} for row in rows]
 
 
-def _end(found: Found, cpu_s: float) -> Row:
+def _end(found: MappingResult, cpu_s: float) -> Row:
     model = found.model
     focal = next(iter(model.cameras.values())).mean_focal_length()
     return {

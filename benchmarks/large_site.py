@@ -59,7 +59,7 @@ COLUMNS = {
 }
 
 
-class Quiet:
+class WarningReporter:
     """A reporter that tells notes and warnings alone."""
 
     def progress(self, done: float, total: float, what: str, unit: str = "") -> None:
@@ -151,7 +151,11 @@ def trained(number: int, site: SitePlan, parts: dict[str, Path], config: LineCon
         out=str(out),
         shard=asdict(Shard(number, len(site.blocks))),
     )
-    executor, disk, report = Executor(work / "log", (), {"OMP_NUM_THREADS": str(threads)}), DiskUse(out), Quiet()
+    executor, disk, report = (
+        Executor(work / "log", (), {"OMP_NUM_THREADS": str(threads)}),
+        DiskUse(out),
+        WarningReporter(),
+    )
 
     def show(event: Event) -> None:
         if event.kind in ("note", "warning"):
@@ -210,7 +214,7 @@ def main() -> None:
     inputs = Inputs(parts, arguments.work, machine=Machine("cpu", arguments.threads))
     shutil.rmtree(arguments.work / PROSPECTS, ignore_errors=True)
     (arguments.work / PROSPECTS).mkdir()
-    site, told = lay_out(config.train, inputs, work.blocks.division, arguments.work, Quiet())
+    site, told = lay_out(config.train, inputs, work.blocks.division, arguments.work, WarningReporter())
     (arguments.work / "blocks.json").write_text(site.to_json(), encoding="utf-8")
     print(
         f"{len(load_views(parts['undistort.dataset'])):,} photos laid out and cut: {time.process_time() - began:.0f} s"

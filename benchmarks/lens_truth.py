@@ -26,7 +26,7 @@ from PIL import Image
 from tables import Row, print_table
 
 from splatpipe.demo import CAPTURE
-from splatpipe.demo.cameras import Lens, brown_lens
+from splatpipe.demo.cameras import BrownLens, brown_lens
 from splatpipe.pipeline.sfm.lens_model import apart_px, simplest
 
 BORDER_PX = 8.0  # marks nearer to the edge are dropped
@@ -51,12 +51,12 @@ COLUMNS = {
 }
 
 
-def camera_of(lens: Lens) -> pycolmap.Camera:
+def camera_of(lens: BrownLens) -> pycolmap.Camera:
     """COLMAP's camera."""
     return pycolmap.Camera(camera_id=1, **lens.colmap())
 
 
-def covered(lens: Lens, source: Lens) -> Lens:
+def covered(lens: BrownLens, source: BrownLens) -> BrownLens:
     """The lens with the shortest focal length whose pictures the source's pictures cover."""
     x, y = np.meshgrid(np.linspace(0.0, lens.width, 61), np.linspace(0.0, lens.height, 46))
     for focal in np.arange(source.f, 1.5 * source.f, 1.0):
@@ -68,7 +68,7 @@ def covered(lens: Lens, source: Lens) -> Lens:
     raise ValueError("no focal length is covered")
 
 
-def make_capture(folder: Path, lens: Lens, source: Lens) -> None:
+def make_capture(folder: Path, lens: BrownLens, source: BrownLens) -> None:
     """Write the demo's photos and ``gcp_list.txt`` as the lens would have them."""
     (folder / "photos").mkdir(parents=True, exist_ok=True)
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
@@ -108,7 +108,7 @@ def _metadata(jpeg: bytes) -> list[bytes]:
     return found
 
 
-def measure(name: str, out: Path, lens: Lens) -> Row:
+def measure(name: str, out: Path, lens: BrownLens) -> Row:
     """What the line found, against the lens."""
     parts = {stage: next((out / "stages").glob(f"{stage}-*")) for stage in ("sparse", "georef")}
     models = json.loads((parts["sparse"] / "models.json").read_text(encoding="utf-8"))
@@ -143,7 +143,7 @@ def main() -> None:
     options.add_argument("--set", action="append", default=[], help="options of the runs")
     options.add_argument("--only", choices=["demo", "simple", "brown"], action="append")
     arguments = options.parse_args()
-    source = Lens()
+    source = BrownLens()
     brown = covered(brown_lens(), source)
     lenses = {"demo": source, "simple": replace(source, f=brown.f), "brown": brown}
     rows = []

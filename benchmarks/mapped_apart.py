@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from flight_scene import Flight, choose_pairs, lens, make_flight
+from flight_scene import SyntheticFlight, choose_pairs, lens, make_flight
 from jaxtyping import Float64
 from tables import Row
 
@@ -84,7 +84,7 @@ def _map(how: str, database: Path, made: list[int]) -> list[pycolmap.Reconstruct
         return sorted(found.values(), key=lambda model: -model.num_reg_images())
 
 
-def oracle(flight: Flight) -> pycolmap.Reconstruction:
+def oracle(flight: SyntheticFlight) -> pycolmap.Reconstruction:
     """Everything free, starting from the truth, without a wrong match: what noise alone leaves of it."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(lens())

@@ -41,12 +41,12 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import iteration
 from splatpipe.pipeline.train.draws import permutation
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.windows import TrainingSize
 from splatpipe.stages import initialize
 
 PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
@@ -54,7 +54,7 @@ PARTS = ("forward", "loss", "backward", "adam")
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialSettings:
     """How the points of a dataset become Gaussians.
 
     Attributes:
@@ -66,7 +66,7 @@ class Start:
     held_out: tuple[str, ...] = ()
 
 
-DEFAULT_START = Start(InitializeConfig(dense=False))  # the sparse points alone fix the work
+DEFAULT_START = InitialSettings(InitializeConfig(dense=False))  # the sparse points alone fix the work
 
 
 class SilentReporter:
@@ -79,7 +79,7 @@ class SilentReporter:
 
 
 @dataclass(frozen=True)
-class Case:
+class TimingCase:
     """Training iterations to be timed, in a process of their own.
 
     Attributes:
@@ -104,7 +104,7 @@ class Case:
 
 
 @dataclass
-class Parts:
+class IterationParts:
     """Seconds that each part of an iteration took, one value an iteration.
 
     Attributes:
@@ -142,7 +142,7 @@ class Parts:
 
 
 @contextlib.contextmanager
-def timed_parts(parts: Parts) -> Iterator[None]:
+def timed_parts(parts: IterationParts) -> Iterator[None]:
     """Put a clock around the functions that ``iterate`` calls; they stay what they are."""
     places = ((rasterizer, "render"), (iteration, "photo_loss"), (torch.Tensor, "backward"), (TrainState, "step"))
     with contextlib.ExitStack() as undo:
@@ -153,7 +153,7 @@ def timed_parts(parts: Parts) -> Iterator[None]:
         yield
 
 
-def time_case(case: Case) -> Row:
+def time_case(case: TimingCase) -> Row:
     """Train a few iterations by training's own code, the number of Gaussians fixed, and take their times.
 
     Memory is what the process takes at most above what it took with its libraries imported, which this call finds.
@@ -174,8 +174,11 @@ def time_case(case: Case) -> Row:
     steps = warmup + case.repeats
     if steps >= plan.schedule.density.first:
         raise SystemExit(f"{steps} iterations reach density control; take fewer repeats.")
-    parts, pairs, pixels = Parts(), [], 0
-    with same_bits(case.threads), PhotoStream.over(views, [Look()] * steps, case.seed, 1, Path(case.dataset)) as photos:
+    parts, pairs, pixels = IterationParts(), [], 0
+    with (
+        same_bits(case.threads),
+        PhotoStream.over(views, [TrainingSize()] * steps, case.seed, 1, Path(case.dataset)) as photos,
+    ):
         state = TrainState.begin(start, plan, make_techniques(plan))
         for photo in islice(photos, warmup):
             iterate(state, plan, photo)
@@ -236,7 +239,7 @@ def prepare(
     factor: float,
     folder: Path,
     photos: int | None = None,
-    start: Start = DEFAULT_START,
+    start: InitialSettings = DEFAULT_START,
 ) -> Path:
     """Write a dataset's photos and cameras in another size, lossless, as training reads them.
 
@@ -315,7 +318,7 @@ def parse(options: argparse.ArgumentParser) -> argparse.Namespace:
     return arguments
 
 
-def run_apart(command: Sequence[str], case: Case) -> Row:
+def run_apart(command: Sequence[str], case: TimingCase) -> Row:
     """Run a script's ``--case`` in a process of its own and return the JSON that it prints last.
 
     Args:

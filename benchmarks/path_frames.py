@@ -72,7 +72,7 @@ Depth = Float[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PathFrame:
     """A camera, its render, and the median depth of that."""
 
     camera: Camera
@@ -99,7 +99,7 @@ def same_places(
     return here[agree], there[agree]
 
 
-def change(frame: Frame, following: Frame) -> Row:
+def change(frame: PathFrame, following: PathFrame) -> Row:
     """What changes from a frame to the next in the places that both show; 8-bit steps."""
     here, there = same_places(frame.camera, frame.depth, following.camera, following.depth)
     if len(here) == 0:
@@ -117,7 +117,7 @@ def change(frame: Frame, following: Frame) -> Row:
     }
 
 
-class Surroundings:
+class SceneClearance:
     """What the photos say of how near things are."""
 
     def __init__(self, run: OpenedRun, cameras: Sequence[Camera]) -> None:
@@ -125,7 +125,7 @@ class Surroundings:
         self.seen = [points.xyz[tracks[camera.name]] for camera in cameras]
         self.medians = [_median(run.median_depth(camera)) for camera in cameras]
 
-    def look(self, frame: Frame, index: int) -> Row:
+    def look(self, frame: PathFrame, index: int) -> Row:
         """How near a frame's things are, between photo ``index`` and the next."""
         points = np.vstack(self.seen[index : index + 2])
         _, _, z = frame.camera.in_view(points)
@@ -178,12 +178,12 @@ def nearest_first(cameras: Sequence[Camera]) -> list[Camera]:
 def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder: Path) -> list[Row]:
     """Render and write the frames and their contact sheet; a row a frame."""
     capture = open_scene({name: part.path for name, part in run.parts.items()}, 1, cpu()).capture
-    surroundings = Surroundings(run, cameras)
+    surroundings = SceneClearance(run, cameras)
     rows: list[Row] = []
     small: list[Pixels] = []
-    before: Frame | None = None
+    before: PathFrame | None = None
     for number, (place, camera) in enumerate(path(capture, cameras, frames)):
-        frame = Frame(camera, run.picture(camera), run.median_depth(camera))
+        frame = PathFrame(camera, run.picture(camera), run.median_depth(camera))
         index = min(int(place), len(cameras) - 2)
         names = " ".join(Path(photo.name).stem for photo in cameras[index : index + 2])
         row: Row = {"frame": number, "between": names, "luminance": float((frame.pixels @ LUMA).mean())}

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from floater_planting import KINDS, Planted, plant, sights_of
+from floater_planting import KINDS, FloaterScene, plant, sights_of
 from jaxtyping import Bool
 from opened_run import OpenedRun, open_run
 from tables import Row, print_table
@@ -67,7 +67,7 @@ def kept_by_cleaner(model: Gaussians, photos: Photos | None) -> Bool[np.ndarray,
     return np.asarray(clean_scene(model, photos).keep.numpy())
 
 
-def kind_rows(planted: Planted, kept: Bool[np.ndarray, " n"]) -> list[Row]:
+def kind_rows(planted: FloaterScene, kept: Bool[np.ndarray, " n"]) -> list[Row]:
     """How many of each kind were taken away, and of all."""
     gone = ~kept[planted.trained :]
     rows = []
@@ -79,7 +79,7 @@ def kind_rows(planted: Planted, kept: Bool[np.ndarray, " n"]) -> list[Row]:
     return rows
 
 
-def loss_row(planted: Planted, kept: Bool[np.ndarray, " n"], model: str) -> Row:
+def loss_row(planted: FloaterScene, kept: Bool[np.ndarray, " n"], model: str) -> Row:
     """What was lost of the trained model."""
     gone = ~kept[: planted.trained]
     lost = float(gone[planted.building].mean())

@@ -41,7 +41,7 @@ QUANTITIES = ("east", "north", "height", "heading", "up", "scale")
 
 
 @dataclass(frozen=True)
-class Case:
+class PositionError:
     """A kind of error.
 
     Attributes:
@@ -65,23 +65,23 @@ class Case:
 
 NADIR, LINE = (31, 40), (0, 6)
 CASES = (
-    Case("13 m", (13.0, 13.0, 13.0)),
-    Case("13 m, ten wrong by 500 m", (13.0, 13.0, 13.0), wrong=10),
-    Case("13 m, gimbal off by 3°", (13.0, 13.0, 13.0), gimbal_deg=3.0),
-    Case("13 m, correlated 0.6", (13.0, 13.0, 13.0), correlation=0.6),
-    Case("13 m, correlated 0.9", (13.0, 13.0, 13.0), correlation=0.9),
-    Case("3 m, 5 m in height, as stated", STATED_M),
-    Case("0.5 m, and as stated together", (0.5, 0.5, 0.8), common_m=(2.96, 2.96, 4.94)),
-    Case("8 m, 20 m in height", (8.0, 8.0, 20.0)),
-    Case("30 m", (30.0, 30.0, 30.0)),
-    Case("nadir strips only, 1 m", (1.0, 1.0, 1.0), photos=NADIR),
-    Case("nadir strips, 3 m, gimbal off by 3°", (3.0, 3.0, 3.0), gimbal_deg=3.0, photos=NADIR),
-    Case("a sixth of the orbit, 3 m, gimbal off by 3°", (3.0, 3.0, 3.0), gimbal_deg=3.0, photos=LINE),
+    PositionError("13 m", (13.0, 13.0, 13.0)),
+    PositionError("13 m, ten wrong by 500 m", (13.0, 13.0, 13.0), wrong=10),
+    PositionError("13 m, gimbal off by 3°", (13.0, 13.0, 13.0), gimbal_deg=3.0),
+    PositionError("13 m, correlated 0.6", (13.0, 13.0, 13.0), correlation=0.6),
+    PositionError("13 m, correlated 0.9", (13.0, 13.0, 13.0), correlation=0.9),
+    PositionError("3 m, 5 m in height, as stated", STATED_M),
+    PositionError("0.5 m, and as stated together", (0.5, 0.5, 0.8), common_m=(2.96, 2.96, 4.94)),
+    PositionError("8 m, 20 m in height", (8.0, 8.0, 20.0)),
+    PositionError("30 m", (30.0, 30.0, 30.0)),
+    PositionError("nadir strips only, 1 m", (1.0, 1.0, 1.0), photos=NADIR),
+    PositionError("nadir strips, 3 m, gimbal off by 3°", (3.0, 3.0, 3.0), gimbal_deg=3.0, photos=NADIR),
+    PositionError("a sixth of the orbit, 3 m, gimbal off by 3°", (3.0, 3.0, 3.0), gimbal_deg=3.0, photos=LINE),
 )
 
 
 @dataclass(frozen=True)
-class Scene:
+class SimulatedCameras:
     """The cameras: in the model, and truly."""
 
     model: SparseModel
@@ -90,7 +90,7 @@ class Scene:
     cam_from_world: Float64[np.ndarray, "n 3 3"]
 
 
-def true_scene(run: Path | None) -> Scene:
+def true_scene(run: Path | None) -> SimulatedCameras:
     """The demo's cameras, from a run's sparse model or their truth."""
     truth = {photo["name"]: photo for photo in TRUTH["photos"]}
     centres = np.array([photo["centre_m"] for photo in truth.values()])
@@ -99,7 +99,7 @@ def true_scene(run: Path | None) -> Scene:
         source, rotations = MODEL_FROM_WORLD.apply(centres), turns @ MODEL_FROM_WORLD.rotation.T
         places = MODEL_FROM_WORLD.apply(np.random.default_rng(1).uniform(-12.0, 12.0, (500, 3)) * [1.0, 1.0, 0.3])
         model = SparseModel(list(truth), source, rotations, places, (), pycolmap.Reconstruction())
-        return Scene(model, MODEL_FROM_WORLD.inverse(), centres, turns)
+        return SimulatedCameras(model, MODEL_FROM_WORLD.inverse(), centres, turns)
     from splatpipe.pipeline.survey.model import model_of
 
     folder = next(run.glob("stages/sparse-*/sparse/0"))
@@ -107,10 +107,10 @@ def true_scene(run: Path | None) -> Scene:
     centres = np.array([truth[name]["centre_m"] for name in model.names])
     turns = np.array([np.array(truth[name]["cam_from_world"])[:3, :3] for name in model.names])
     scale, rotation, translation = fit_similarity(model.centres, centres, np.ones(len(centres)))
-    return Scene(model, Similarity(float(scale), rotation, translation), centres, turns)
+    return SimulatedCameras(model, Similarity(float(scale), rotation, translation), centres, turns)
 
 
-def only(scene: Scene, between: tuple[int, int]) -> Scene:
+def only(scene: SimulatedCameras, between: tuple[int, int]) -> SimulatedCameras:
     """Some of the cameras."""
     model, photos = scene.model, slice(*between)
     part = SparseModel(
@@ -121,10 +121,10 @@ def only(scene: Scene, between: tuple[int, int]) -> Scene:
         model.image_ids[photos],
         model.reconstruction,
     )
-    return Scene(part, scene.world_from_model, scene.centres[photos], scene.cam_from_world[photos])
+    return SimulatedCameras(part, scene.world_from_model, scene.centres[photos], scene.cam_from_world[photos])
 
 
-def stated(scene: Scene, case: Case, seed: int) -> tuple[Positions, list[str]]:
+def stated(scene: SimulatedCameras, case: PositionError, seed: int) -> tuple[Positions, list[str]]:
     """Positions with errors, and which of them are wrong."""
     rng = np.random.default_rng(seed)
     count = len(scene.centres)
@@ -157,7 +157,7 @@ def gimbal_angles(enu_from_cam: Float64[np.ndarray, "3 3"]) -> dict[str, float]:
     return {"yaw_deg": math.degrees(yaw), "pitch_deg": math.degrees(pitch), "roll_deg": math.degrees(roll)}
 
 
-def errors_of(frame: Frame, scene: Scene) -> Float64[np.ndarray, " 6"]:
+def errors_of(frame: Frame, scene: SimulatedCameras) -> Float64[np.ndarray, " 6"]:
     """East, north, height of the cameras' middle; heading and up in degrees; scale in per cent."""
     assert frame.origin is not None
     placed = PLACE.enu_from_geodetic(frame.origin.geodetic_from_enu(frame.world_from_model.apply(scene.model.centres)))
@@ -169,7 +169,7 @@ def errors_of(frame: Frame, scene: Scene) -> Float64[np.ndarray, " 6"]:
     return np.array([*off, *angles, 100.0 * scale])
 
 
-def row_of(scene: Scene, case: Case, seeds: int) -> Row:
+def row_of(scene: SimulatedCameras, case: PositionError, seeds: int) -> Row:
     """A case: how many were placed, how often the truth lies within what was stated, and how right the sigmas are."""
     part = only(scene, case.photos)
     photos: dict[str, Photo] = {}

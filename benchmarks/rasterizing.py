@@ -14,13 +14,13 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import _native, rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.iteration import render_options
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.state import TrainState
 
 WARMUP = 3  # renders that do not count
 
 
-def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> dict[str, Any]:
+def raster_alone(state: TrainState, plan: TrainingPlan, cameras: Sequence[Camera]) -> dict[str, Any]:
     """Forward and backward pass of the rasterizer one after the other, with nothing of training between them.
 
     Args:
@@ -50,7 +50,7 @@ def raster_alone(state: TrainState, plan: Plan, cameras: Sequence[Camera]) -> di
     return {"alone_wall_s": statistics.median(wall), "alone_gpairs_per_s_per_core": 1e-9 * pairs / cpu}
 
 
-def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: Plan, iteration: int) -> int:
+def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: TrainingPlan, iteration: int) -> int:
     """Pixel-Gaussian pairs that training's render in an iteration blends: alpha ≥ 1/255, before the pixel's end.
 
     Args:

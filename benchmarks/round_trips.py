@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from captures import Capture, Picture, decibels, likely_frame, open_capture
-from others import READERS, THEIR_AXES, Others, find_others
+from captures import CaptureRun, Picture, decibels, likely_frame, open_capture
+from others import READERS, THEIR_AXES, OtherPrograms, find_others
 from position_errors import position_row, site_of
 from tables import Row, print_table
 
@@ -62,7 +62,7 @@ POSITION_COLUMNS = {
 
 
 @dataclass(frozen=True)
-class Work:
+class TripFolder:
     """Where files go, and who else reads them.
 
     Attributes:
@@ -72,7 +72,7 @@ class Work:
     """
 
     folder: Path
-    others: Others
+    others: OtherPrograms
     slow: frozenset[str] = field(default_factory=frozenset)
 
     def theirs(self, name: str, scene: Scene) -> Path | None:
@@ -91,7 +91,7 @@ class Work:
         return path.rename(folder / f"{name}~{path.name}")
 
 
-def round_trip(capture: Capture, originals: Sequence[Picture], kind: SplatFormat, work: Work) -> Row:
+def round_trip(capture: CaptureRun, originals: Sequence[Picture], kind: SplatFormat, work: TripFolder) -> Row:
     """A format's row."""
     path = written(capture.scene, kind, work.folder / capture.name)
     row: Row = {"format": kind.name, "bytes": bytes_of(path)}
@@ -122,13 +122,15 @@ def round_trip(capture: Capture, originals: Sequence[Picture], kind: SplatFormat
     return row | {"bars": f"missed: {', '.join(missed)}" if missed else "met"}
 
 
-def _by_them(capture: Capture, originals: Sequence[Picture], path: Path, work: Work) -> Row:
+def _by_them(capture: CaptureRun, originals: Sequence[Picture], path: Path, work: TripFolder) -> Row:
     read = work.others.read(path)
     frame, placed = likely_frame(capture, read, originals)
     return {"by_them_db": decibels(capture.pictures(placed), originals), "by_them_axes": frame}
 
 
-def _their_file(capture: Capture, originals: Sequence[Picture], kind: SplatFormat, path: Path, work: Work) -> Row:
+def _their_file(
+    capture: CaptureRun, originals: Sequence[Picture], kind: SplatFormat, path: Path, work: TripFolder
+) -> Row:
     """Likeness of splat-transform's own file, read by it and by us."""
     row: Row = {}
     if work.others.reads(kind.name):
@@ -190,7 +192,7 @@ def working_folder(kept: Path | None) -> Iterator[Path]:
             yield Path(folder)
 
 
-def measure(out: Path, kinds: Sequence[SplatFormat], work: Work, views: int) -> tuple[list[Row], list[Row]]:
+def measure(out: Path, kinds: Sequence[SplatFormat], work: TripFolder, views: int) -> tuple[list[Row], list[Row]]:
     """Tables of a run: likeness and bytes, positions."""
     capture = open_capture(out, views)
     originals = capture.pictures(capture.scene)
@@ -221,7 +223,7 @@ def main() -> None:
     kinds = [kind for kind in SPLAT_FORMATS if not wanted or kind.name in wanted]
     tables: dict[str, dict[str, list[Row]]] = {}
     with working_folder(options.work) as folder:
-        work = Work(folder, find_others(options.readers), frozenset(options.slow.split(",")))
+        work = TripFolder(folder, find_others(options.readers), frozenset(options.slow.split(",")))
         for out in options.outs:
             rows, errors = measure(out, kinds, work, options.views)
             print_table(f"round trips of {out.name}", rows, COLUMNS)

@@ -22,9 +22,9 @@ from pathlib import Path
 
 import torch
 from measure import (
-    Case,
     Row,
     SilentReporter,
+    TimingCase,
     contributing_pairs,
     machine,
     parse,
@@ -47,9 +47,9 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train import plan as planned
-from splatpipe.pipeline.train.lengths import Footage
+from splatpipe.pipeline.train.lengths import PhotoSizes
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.schedule import UNKNOWN, Schedule, resolve_schedule
 from splatpipe.stages import train
 
@@ -82,7 +82,7 @@ def scattered(base: Gaussians, count: int) -> Gaussians:
     return made
 
 
-def sized(gaussians: Gaussians, cameras: Sequence[Camera], plan: Plan, wanted: float) -> Gaussians:
+def sized(gaussians: Gaussians, cameras: Sequence[Camera], plan: TrainingPlan, wanted: float) -> Gaussians:
     """The Gaussians, larger or smaller all alike, so that ``wanted`` of them contribute to the mean pixel.
 
     Args:
@@ -112,7 +112,7 @@ def write_start(dataset: Path, count: int, wanted: float, threads: int) -> Path:
     return path
 
 
-def grown_in_the_middle(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedule:
+def grown_in_the_middle(config: TrainConfig, footage: PhotoSizes = UNKNOWN) -> Schedule:
     """A schedule with one step of density control, in which everything that was seen grows: the cap decides."""
     schedule = resolve_schedule(config, footage)
     middle = schedule.iterations // 2
@@ -120,7 +120,7 @@ def grown_in_the_middle(config: TrainConfig, footage: Footage = UNKNOWN) -> Sche
     return replace(schedule, sh_every=1, density=density)
 
 
-def stage_case(case: Case) -> Row:
+def stage_case(case: TimingCase) -> Row:
     """The whole training stage of a few iterations, with density control up to the cap and checkpoints."""
     before = restart_peak()
     start = Path(case.splat)
@@ -186,7 +186,7 @@ def main() -> None:
     arguments = parse(options)
     if arguments.case is not None:
         measured = stage_case if arguments.stage else time_case
-        print(json.dumps(measured(Case(**json.loads(arguments.case)))))
+        print(json.dumps(measured(TimingCase(**json.loads(arguments.case)))))
         return
     facts, rows, done = machine(arguments.threads), [], {}
     with scratch() as folder:
@@ -210,7 +210,7 @@ def run_case(
         prepare(arguments.data, "sparse", size_factor(arguments.data, megapixels), dataset, arguments.photos)
     begun_with = round(MEMORY_START * count) if memory else count
     start = write_start(dataset, begun_with, arguments.pairs, arguments.threads)
-    case = Case(str(dataset), str(start), threads, arguments.repeats, warmup=arguments.photos)
+    case = TimingCase(str(dataset), str(start), threads, arguments.repeats, warmup=arguments.photos)
     row = {"megapixels": megapixels} | run_apart([__file__, *(["--stage"] if memory else [])], case)
     start.unlink()
     return row

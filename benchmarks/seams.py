@@ -30,7 +30,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.train.blocks.cutting import cut, site, work_map
 from splatpipe.pipeline.train.blocks.partition import Border, Partition
-from splatpipe.pipeline.train.blocks.sight import sights
+from splatpipe.pipeline.train.blocks.photo_coverage import sights
 
 GRADES = {  # what is planted: pixels empty, pixels higher, of the colour's range
     "gap": (1.0, 2.0, 4.0, 8.0),
@@ -53,7 +53,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
+class SeamScene:
     """What borders are looked at in.
 
     Attributes:
@@ -80,7 +80,7 @@ class Site:
         return height / cameras[0].fx
 
 
-def open_site(arguments: argparse.Namespace) -> Site:
+def open_site(arguments: argparse.Namespace) -> SeamScene:
     """Read what the command line names.
 
     Raises:
@@ -99,10 +99,10 @@ def open_site(arguments: argparse.Namespace) -> Site:
         seen = sights(cameras, [tracks[camera.name] for camera in cameras], run.median_depth)
         plan = GroundPlan.across(frame.rotation[2])
         partition = cut(work_map(plan, site(plan, seen, points.xyz), seen, points.xyz), arguments.blocks)
-    return Site(run, partition, cameras, read_splat(arguments.coarse), frame.scale)
+    return SeamScene(run, partition, cameras, read_splat(arguments.coarse), frame.scale)
 
 
-def judged(place: Site, splat: Gaussians, border: Border) -> Iterator[Row]:
+def judged(place: SeamScene, splat: Gaussians, border: Border) -> Iterator[Row]:
     """A row for each seam of a border, or one that says that there is none."""
     facts: Row = {"border": f"{border.blocks[0]}–{border.blocks[1]}", "length": border.line.length * place.metres}
     seams = place.seams(splat, border.line)
@@ -122,7 +122,7 @@ def judged(place: Site, splat: Gaussians, border: Border) -> Iterator[Row]:
         yield facts | {"found": "-"}
 
 
-def planted(place: Site, splat: Gaussians, border: Border) -> Iterator[Row]:
+def planted(place: SeamScene, splat: Gaussians, border: Border) -> Iterator[Row]:
     """Rows of each seam that was put on a border: what was found of its kind, or the first of what else was."""
     plan, line = place.partition.plan, border.line
     pixel = place.pixel(splat, line)

@@ -14,7 +14,7 @@ import shutil
 from pathlib import Path
 
 from commands import run_all, splatpipe
-from finished import Finished
+from finished import ResultLog
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.run_folder import open_run_folder
@@ -103,7 +103,7 @@ def main() -> None:
     options.add_argument("--option", action="append", default=[], help="of all runs: --option=--preset=standard")
     arguments = options.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
-    base, finished = prepared(arguments.photos, arguments.work, arguments.option), Finished(arguments.work)
+    base, finished = prepared(arguments.photos, arguments.work, arguments.option), ResultLog(arguments.work)
     for arm in arguments.arms:
         if arm not in finished.rows:
             finished.add(arm, train(base, arguments.photos, arm, arguments.option))

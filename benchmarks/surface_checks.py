@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float64, UInt8
 from roof_edges import edge_distances, edge_figures
 from surface_measures import figures, fitted_colours, harmonic, near_steps, psnr, reached, relief_errors, rmse
 from surface_products import Facade, Points, Raster, colours
-from surface_scene import GSD_M, STEP_CELLS, STEP_M, Site, Truth, site_of, true_picture
+from surface_scene import GSD_M, STEP_CELLS, STEP_M, SceneTruth, TruthGrid, site_of, true_picture
 from tables import Row
 from triangle_distances import Surface, spread, surface_of, thinned
 
 from splatpipe.demo import CAPTURE
 from splatpipe.demo.orthographic import AHEAD_M, MARGIN_M, facade_view, top_view, wall_planes
 from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED
-from splatpipe.demo.relief import seen_in
+from splatpipe.demo.relief import relief_in
 from splatpipe.demo.visibility import FEWEST, photos_that_see
 from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
 
@@ -37,7 +37,7 @@ WALL_PARTS = (HOUSE, PLAIN, BRICKS)
 MAIN_ROOF_M = 4.3  # its eaves' height, less a little; the annex and the canopy are lower
 
 
-def measure_dsm(site: Site, raster: Raster) -> list[Row]:
+def measure_dsm(site: TruthGrid, raster: Raster) -> list[Row]:
     """A row for what counts, each class of it, and what is counted apart."""
     found = site.cut(np.where(raster.there, raster.bands[0].astype(np.float64), np.nan), np.nan)
     errors = relief_errors(found, site.relief.height, site.relief.cosine)
@@ -57,7 +57,7 @@ def measure_dsm(site: Site, raster: Raster) -> list[Row]:
 
 
 def target_differences(
-    site: Site, picture: UInt8[np.ndarray, "h w 3"], cell_m: float
+    site: TruthGrid, picture: UInt8[np.ndarray, "h w 3"], cell_m: float
 ) -> dict[str, Float64[np.ndarray, " 2"]]:
     """Metres east and south from each target's true place to where the orthophoto shows it; NaN where it does not.
 
@@ -87,7 +87,7 @@ def target_difference(
     return near if np.hypot(*near) <= FOUND_PX else np.full(2, np.nan)
 
 
-def measure_ortho(site: Site, raster: Raster, true: Path | None) -> tuple[Row, list[Row]]:
+def measure_ortho(site: TruthGrid, raster: Raster, true: Path | None) -> tuple[Row, list[Row]]:
     """Its figures, and a row of contrasts of each texture; without the true picture only the targets.
 
     Args:
@@ -114,7 +114,10 @@ def measure_ortho(site: Site, raster: Raster, true: Path | None) -> tuple[Row, l
 
 
 def _contrasts(
-    site: Site, picture: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], counts: Bool[np.ndarray, "h w"]
+    site: TruthGrid,
+    picture: UInt8[np.ndarray, "h w 3"],
+    truth: UInt8[np.ndarray, "h w 3"],
+    counts: Bool[np.ndarray, "h w"],
 ) -> list[Row]:
     from texture_contrast import EDGE_PX  # here, for it loads torch
     from texture_contrast import figures as contrast_figures
@@ -151,12 +154,12 @@ def facade_errors(facade: Facade, points: Points, normals: Points) -> Float64[np
     return np.asarray(np.where(inside, facade.depth[at] - depth, np.nan) * np.abs(normals @ normal))
 
 
-def measure_facades(truth: Truth, facades: list[Facade]) -> list[Row]:
+def measure_facades(truth: SceneTruth, facades: list[Facade]) -> list[Row]:
     """A row a wall, then all of them and the plain ones; a wall that no elevation is of is missing altogether."""
     rows, every, plain = [], [], []
     for name, (wall, span, _high) in wall_planes().items():
         view = facade_view(name, GSD_M)
-        relief = seen_in(view, truth.triangles)
+        relief = relief_in(view, truth.triangles)
         parts = np.where(relief.triangle >= 0, truth.parts[relief.triangle], -1)
         near = np.abs(relief.height + AHEAD_M[name]) < WALL_M
         clear = ~near_steps(relief.height, STEP_M, STEP_CELLS)
@@ -188,7 +191,7 @@ def corner_distance(facade: Facade, left: Float64[np.ndarray, " 3"], right: Floa
 
 
 def measure_points(
-    truth: Truth, surface: Surface, points: Points, distances_to: Callable[[Points], Float64[np.ndarray, " n"]]
+    truth: SceneTruth, surface: Surface, points: Points, distances_to: Callable[[Points], Float64[np.ndarray, " n"]]
 ) -> Row:
     """Precision, recall and F1 at 2 GSD of a cloud, or of places spread over a mesh.
 
@@ -209,7 +212,7 @@ def measure_points(
     return figure | {"f1": harmonic(precision, recall)}
 
 
-def near_triangles(truth: Truth) -> Bool[np.ndarray, " m"]:
+def near_triangles(truth: SceneTruth) -> Bool[np.ndarray, " m"]:
     """Triangles of which some part may lie below the flight."""
     (west, south), (east, north) = truth.flown_box
     x, y = truth.triangles[..., 0], truth.triangles[..., 1]
@@ -218,7 +221,7 @@ def near_triangles(truth: Truth) -> Bool[np.ndarray, " m"]:
     )
 
 
-def seen_places(truth: Truth, rng: np.random.Generator) -> Points:
+def seen_places(truth: SceneTruth, rng: np.random.Generator) -> Points:
     """Places of the true surface below the flight that at least three photos see, as many a square metre everywhere."""
     rows = np.flatnonzero(near_triangles(truth))
     places, of = spread(truth.triangles[rows], 3 * SAMPLES, rng)
@@ -227,11 +230,11 @@ def seen_places(truth: Truth, rng: np.random.Generator) -> Points:
     return places[photos_that_see(places, truth.normals[of], truth.sights) >= FEWEST]
 
 
-def true_surface_of(truth: Truth) -> Surface:
+def true_surface_of(truth: SceneTruth) -> Surface:
     """What precision is measured to."""
     return surface_of(truth.triangles[near_triangles(truth)], SPACING_M, np.random.default_rng(SEED))
 
 
-def ortho_site(truth: Truth, raster: Raster, crs_from_true: Callable[[Points], Points]) -> Site:
+def ortho_site(truth: SceneTruth, raster: Raster, crs_from_true: Callable[[Points], Points]) -> TruthGrid:
     """The truth on an orthophoto's grid: whether photos see it is told for 4 × 4 pixels at a time."""
     return site_of(truth, raster, crs_from_true, every=4)

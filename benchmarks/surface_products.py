@@ -103,7 +103,7 @@ def colours(raster: Raster) -> UInt8[np.ndarray, "h w 3"]:
 
 
 @dataclass(frozen=True)
-class Frames:
+class ProductTransform:
     """The way between a product's coordinates and the truth's local metres.
 
     Attributes:
@@ -139,7 +139,7 @@ def true_frame(crs: str) -> Frame:
     return Frame("enu", Similarity.identity(), Origin(**origin), ELLIPSOIDAL, crs=crs)
 
 
-def frames_of(out: Path, crs: str, align: str) -> Frames:
+def frames_of(out: Path, crs: str, align: str) -> ProductTransform:
     """Of a run's products, or of files in a folder that is no run's, whose local frame is then the truth's.
 
     Args:
@@ -152,18 +152,18 @@ def frames_of(out: Path, crs: str, align: str) -> Frames:
     if "georef.frame" not in parts:
         if align != "none":
             raise UsageError(f"{out} has no cameras to lay it over the truth by.")
-        return Frames(truth, truth, None)
+        return ProductTransform(truth, truth, None)
     frame = load_frame(parts["georef.frame"].path)
     run = open_world(Frame(frame.kind, frame.world_from_model, frame.origin, frame.vertical_datum, crs=crs))
     if align == "none":
-        return Frames(truth, run, None)
+        return ProductTransform(truth, run, None)
     model = pycolmap.Reconstruction(parts["georef.model"].path)
     poses = {
         image.name: np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
         for image in model.images.values()
         if image.has_pose
     }
-    return Frames(truth, run, truth_from_model(poses).compose(frame.world_from_model.inverse()))
+    return ProductTransform(truth, run, truth_from_model(poses).compose(frame.world_from_model.inverse()))
 
 
 def _parts(out: Path) -> dict[str, Any]:

@@ -15,11 +15,11 @@ from scipy.spatial import Delaunay
 from surface_measures import near_steps
 from surface_products import Points, Raster
 
-from splatpipe.demo.orthographic import View
+from splatpipe.demo.orthographic import ParallelView
 from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED, parts_of, unit_normals
 from splatpipe.demo.relief import Relief, surface_model
 from splatpipe.demo.truth import Triangles, centre, true_poses, true_surface
-from splatpipe.demo.visibility import FEWEST, Sight, photos_that_see, true_sights
+from splatpipe.demo.visibility import FEWEST, TrueView, photos_that_see, true_sights
 
 GSD_M = 0.028  # of the original photos, at the house
 STEP_M = 4.0 * GSD_M  # more than roofs (slope 0.9) rise between cells of 2 GSD; chimneys, dormers and walls are higher
@@ -35,7 +35,7 @@ LINEAR_OF_CODED = np.where(
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class SceneTruth:
     """The demo scene and its flight.
 
     Attributes:
@@ -46,7 +46,7 @@ class Truth:
 
     triangles: Triangles
     parts: Int8[np.ndarray, " m"]
-    sights: list[Sight]
+    sights: list[TrueView]
 
     @cached_property
     def normals(self) -> Float64[np.ndarray, "m 3"]:
@@ -67,14 +67,14 @@ class Truth:
         return np.stack([self._flown.points.min(axis=0), self._flown.points.max(axis=0)])
 
 
-def load_truth(depths: Path | None = None) -> Truth:
+def load_truth(depths: Path | None = None) -> SceneTruth:
     """Of the capture; depths as ``true_sights`` takes them."""
     triangles = true_surface()
-    return Truth(triangles, parts_of(triangles), true_sights(triangles, depths))
+    return SceneTruth(triangles, parts_of(triangles), true_sights(triangles, depths))
 
 
 @dataclass(frozen=True)
-class Way:
+class AffineMap:
     """An affine map of points and its inverse: a frame's axes and zero.
 
     Attributes:
@@ -93,7 +93,7 @@ class Way:
         return np.asarray(np.linalg.solve(self.matrix, (points - self.offset).T).T)
 
 
-def straight(way: Callable[[Points], Points], cell: float) -> Way:
+def straight(way: Callable[[Points], Points], cell: float) -> AffineMap:
     """The affine map that a map is within the scene.
 
     Args:
@@ -105,11 +105,11 @@ def straight(way: Callable[[Points], Points], cell: float) -> Way:
     solved = np.linalg.lstsq(known, there, rcond=None)[0]
     off = np.abs(known @ solved - there) * [cell, cell, 1.0]
     assert off.max() < STRAIGHT_M, off.max()
-    return Way(solved[:3].T, solved[3])
+    return AffineMap(solved[:3].T, solved[3])
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
+class TruthGrid:
     """The truth on a part of a product's grid, which is all that was flown over.
 
     Attributes:
@@ -122,8 +122,8 @@ class Site:
         below: What lies below the flight.
     """
 
-    truth: Truth
-    way: Way
+    truth: SceneTruth
+    way: AffineMap
     left: int
     top: int
     relief: Relief
@@ -179,7 +179,7 @@ class Site:
         return part
 
 
-def site_of(truth: Truth, raster: Raster, crs_from_true: Callable[[Points], Points], every: int = 1) -> Site:
+def site_of(truth: SceneTruth, raster: Raster, crs_from_true: Callable[[Points], Points], every: int = 1) -> TruthGrid:
     """The truth on a product's grid.
 
     Args:
@@ -192,14 +192,14 @@ def site_of(truth: Truth, raster: Raster, crs_from_true: Callable[[Points], Poin
     (west, south), (east, north) = truth.flown_box
     corners = whole(np.array([[x, y, 0.0] for x in (west, east) for y in (south, north)]))[:, :2]
     (left, top), (right, bottom) = np.floor(corners.min(axis=0)).astype(int), np.ceil(corners.max(axis=0)).astype(int)
-    way = Way(whole.matrix, whole.offset - [left, top, 0.0])
+    way = AffineMap(whole.matrix, whole.offset - [left, top, 0.0])
     relief = surface_model(truth.triangles, way, int(right - left), int(bottom - top), raster.cell)
     seen, below = _seen(truth, relief, way, every)
-    return Site(truth, way, int(left), int(top), relief, seen, below)
+    return TruthGrid(truth, way, int(left), int(top), relief, seen, below)
 
 
 def _seen(
-    truth: Truth, relief: Relief, way: Way, every: int
+    truth: SceneTruth, relief: Relief, way: AffineMap, every: int
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     height, width = relief.height.shape
     row, column = np.mgrid[every // 2 : height + every // 2 : every, every // 2 : width + every // 2 : every]
@@ -215,7 +215,9 @@ def _seen(
     return seen, flown
 
 
-def true_picture(path: Path, view: View, site: Site) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+def true_picture(
+    path: Path, view: ParallelView, site: TruthGrid
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """The true picture on a site's grid, each pixel the mean of the light on it, and where there is one.
 
     Args:

@@ -21,15 +21,15 @@ from splatpipe.demo.depth_maps import load
 from splatpipe.pipeline.surface.exposures import exposure_levels
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.heights import TILE as HEIGHTS_TILE
-from splatpipe.pipeline.surface.heights import Capture, surface_heights
+from splatpipe.pipeline.surface.heights import HeightInput, surface_heights
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
+from splatpipe.pipeline.surface.orthophoto import TILE, OrthoInput, orthophotos
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, Relief, Shelf
+from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, MetricMap
 
 GSD_M = 0.028  # of the original photos, at the house
 HALF_M = 9.0  # of the part's side
-RELIEF = Relief(-2.0, 14.0)
+RELIEF = HeightRange(-2.0, 14.0)
 HELD_BYTES = 1 << 30
 EVERY = 5  # cells of the surface model from place to place that exposures are compared at
 FIGURES = {"what": "what:", "cells": "cells:,", "CPU s": "cpu:.2f", "s a million": "million:.1f", "known": "known:.4f"}
@@ -51,7 +51,7 @@ def timed(make: Callable[[], Result]) -> tuple[Result, float]:
 def heights_of(sources: list[DepthSource], lattice: Lattice) -> HeightField:
     """The surface model."""
     height = np.full((lattice.height, lattice.width), np.nan, np.float32)
-    capture = Capture(sources, lattice, RELIEF, Shelf(HELD_BYTES))
+    capture = HeightInput(sources, lattice, RELIEF, LruCache(HELD_BYTES))
     for part in surface_heights(capture, list(lattice.tiles(HEIGHTS_TILE)), threads=1):
         height[part.tile.slices] = part.height
     return HeightField(lattice, height)
@@ -63,7 +63,7 @@ def coloured(photos: list[PhotoSource], surface: HeightField, lattice: Lattice) 
     places = np.concatenate([centres, surface.height[..., None].astype(np.float64)], axis=-1)
     places = places[::EVERY, ::EVERY].reshape(-1, 3)
     levels = exposure_levels(photos, places[np.isfinite(places[:, 2])], 2.0 * lattice.cell_m, threads=1)
-    album = Album(photos, surface, lattice, RELIEF, levels, Shelf(HELD_BYTES), Shelf(HELD_BYTES))
+    album = OrthoInput(photos, surface, lattice, RELIEF, levels, LruCache(HELD_BYTES), LruCache(HELD_BYTES))
     tiles = list(lattice.tiles(TILE))
     known = sum(int(part.known.sum()) for part in orthophotos(album, tiles, threads=1))
     return known / (lattice.width * lattice.height)

@@ -30,8 +30,16 @@ from surface_checks import (
     ortho_site,
     true_surface_of,
 )
-from surface_products import Frames, find_products, frames_of, read_cloud, read_facades, read_mesh, read_raster
-from surface_scene import Truth, load_truth, site_of
+from surface_products import (
+    ProductTransform,
+    find_products,
+    frames_of,
+    read_cloud,
+    read_facades,
+    read_mesh,
+    read_raster,
+)
+from surface_scene import SceneTruth, load_truth, site_of
 from tables import Row, print_table
 from triangle_distances import areas, spread, surface_of
 
@@ -190,7 +198,7 @@ def measure(
     return tables | ({"points": rows} if rows else {})
 
 
-def _measure_cloud_or_mesh(name: str, path: Path, truth: Truth, frames: Frames) -> Row:
+def _measure_cloud_or_mesh(name: str, path: Path, truth: SceneTruth, frames: ProductTransform) -> Row:
     surface, rng = true_surface_of(truth), np.random.default_rng(SEED)
     distances_to: Callable[[np.ndarray], np.ndarray]
     if name == "cloud":

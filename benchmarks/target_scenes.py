@@ -23,7 +23,7 @@ WHITE_MARGIN = 1.0  # of a coded target, cells
 
 
 @dataclass(frozen=True)
-class Look:
+class TargetAppearance:
     """How targets look in a photo.
 
     Attributes:
@@ -46,7 +46,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Rendered:
+class RenderedTarget:
     """A target as it was put into a photo.
 
     Attributes:
@@ -138,7 +138,7 @@ def draw(photo: Floats, pattern: Pattern, homography: Floats, levels: tuple[Floa
     return result
 
 
-def blur_kernel(look: Look, rng: np.random.Generator) -> Floats:
+def blur_kernel(look: TargetAppearance, rng: np.random.Generator) -> Floats:
     """Defocus and motion, at a sample a pixel."""
     size = int(2 * np.ceil(3 * look.defocus_px[1] + look.motion_px) + 1)
     fine = np.zeros((size * SAMPLES, size * SAMPLES))
@@ -155,8 +155,8 @@ def blur_kernel(look: Look, rng: np.random.Generator) -> Floats:
 
 
 def render(
-    photo: Bytes, kinds: list[tuple[str, Pattern]], look: Look, rng: np.random.Generator, apart_px: float
-) -> tuple[Bytes, list[Rendered]]:
+    photo: Bytes, kinds: list[tuple[str, Pattern]], look: TargetAppearance, rng: np.random.Generator, apart_px: float
+) -> tuple[Bytes, list[RenderedTarget]]:
     """A photo with one target of each kind at random places, and where they are."""
     height, width = photo.shape[:2]
     canvas, placed = photo.astype(np.float64), []
@@ -172,7 +172,9 @@ def render(
         corners = corners[:, :2] / corners[:, 2:]
         where = homography[:, 2] / homography[2, 2]
         thin = _area(corners) / max(np.linalg.norm(corners[2] - corners[0]), np.linalg.norm(corners[3] - corners[1]))
-        placed.append(Rendered((float(where[0]), float(where[1])), float(np.sqrt(_area(corners))), float(thin), name))
+        placed.append(
+            RenderedTarget((float(where[0]), float(where[1])), float(np.sqrt(_area(corners))), float(thin), name)
+        )
     canvas = 255.0 * np.clip(canvas / 255.0 * 2.0 ** (rng.uniform(*look.exposures_ev) / 2.2), 0, 1)
     canvas += rng.normal(0.0, rng.uniform(0, look.noise), canvas.shape)
     done = np.clip(np.rint(canvas), 0, 255).astype(np.uint8)
@@ -182,7 +184,7 @@ def render(
 
 
 def _place(
-    placed: list[Rendered], size: tuple[int, int], border: float, apart_px: float, rng: np.random.Generator
+    placed: list[RenderedTarget], size: tuple[int, int], border: float, apart_px: float, rng: np.random.Generator
 ) -> Floats:
     for _ in range(1000):
         centre = np.array([rng.uniform(border, size[0] - border), rng.uniform(border, size[1] - border)])

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from target_scenes import Look, Pattern, Rendered, bow_tie, coded, disc, quadrants, render
+from target_scenes import Pattern, RenderedTarget, TargetAppearance, bow_tie, coded, disc, quadrants, render
 
 from splatpipe.pipeline.photos.coded_targets import DICTIONARIES, find_coded_targets
 from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
@@ -71,7 +71,7 @@ def trial(
     photo: np.ndarray, kinds: list[tuple[str, Pattern]], least: float, rng: np.random.Generator, results: Results
 ) -> None:
     """Draw targets into a photo and look for them."""
-    drawn, placed = render(photo, kinds, Look((least, SIZES_PX[-1])), rng, APART_PX)
+    drawn, placed = render(photo, kinds, TargetAppearance((least, SIZES_PX[-1])), rng, APART_PX)
     finds = {"": [(t.x, t.y) for t in find_quadrant_targets(drawn)]} if least < SIZES_PX[1] else {}
     if not finds:
         for target in find_coded_targets(drawn):
@@ -81,7 +81,7 @@ def trial(
         results[target.name.split(":")[0], size].append(error_of(target, finds.get(target.name, finds.get("", []))))
 
 
-def error_of(target: Rendered, finds: list[tuple[float, float]]) -> tuple[float, float] | None:
+def error_of(target: RenderedTarget, finds: list[tuple[float, float]]) -> tuple[float, float] | None:
     """Of the find that is nearest; None where none is near."""
     errors = [(x - target.centre[0], y - target.centre[1]) for x, y in finds]
     near = [error for error in errors if np.hypot(*error) < NEAR_PX]

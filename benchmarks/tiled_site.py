@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.blocks.coarse import SKIES
 from splatpipe.pipeline.train.blocks.cutting import site
 from splatpipe.pipeline.train.blocks.layout import upward
 from splatpipe.pipeline.train.blocks.partition import Cell
-from splatpipe.pipeline.train.blocks.sight import sights
+from splatpipe.pipeline.train.blocks.photo_coverage import sights
 from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.sky_file import write_skies

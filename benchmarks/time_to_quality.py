@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from measure import (
+    InitialSettings,
     Row,
     SilentReporter,
-    Start,
     machine,
     parse,
     parser,
@@ -38,9 +38,9 @@ from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.loop import looks_of
+from splatpipe.pipeline.train.loop import training_sizes
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
@@ -111,7 +111,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
 
     def visits(history: History) -> PhotoVisits:
         return PhotoVisits(
-            [view.camera for view in trained_on], looks_of(whole, history), whole.options.seed, whole.megapixels
+            [view.camera for view in trained_on], training_sizes(whole, history), whole.options.seed, whole.megapixels
         )
 
     with same_bits(arguments.threads):
@@ -140,7 +140,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
                 clocks.start()
 
 
-def held_out(state: TrainState, plan: Plan, dataset: Path) -> Row:
+def held_out(state: TrainState, plan: TrainingPlan, dataset: Path) -> Row:
     """Mean PSNR, PSNR after a colour fit and SSIM of the views that were held out, as `evaluate` measures them."""
     gaussians = state.finished()
     options = plan.rendering().options(gaussians)
@@ -186,7 +186,7 @@ def main() -> None:
         wanted = arguments.megapixels
         factor = arguments.scale if wanted is None else size_factor(arguments.data, wanted)
         names = [view.camera.name for view in load_views(arguments.data)]
-        start = Start(config.initialize, split_views(names, config.split.every, arguments.held_out).held_out)
+        start = InitialSettings(config.initialize, split_views(names, config.split.every, arguments.held_out).held_out)
         dataset = prepare(arguments.data, arguments.points, factor, folder / "dataset", start=start)
         rows = list(follow(dataset, config, arguments))
     facts |= {

@@ -11,9 +11,9 @@ from __future__ import annotations
 import json
 
 from measure import (
-    Case,
+    InitialSettings,
     Row,
-    Start,
+    TimingCase,
     machine,
     parse,
     parser,
@@ -61,17 +61,17 @@ def main() -> None:
     options.add_argument("--warmup", type=int, default=5, help="iterations before them, at least an epoch")
     arguments = parse(options)
     if arguments.case is not None:
-        print(json.dumps(time_case(Case(**json.loads(arguments.case)))))
+        print(json.dumps(time_case(TimingCase(**json.loads(arguments.case)))))
         return
     facts = machine(arguments.threads)
     rows: list[Row] = []
-    start = Start(InitializeConfig(max_angle=arguments.max_angle, dense=False))
+    start = InitialSettings(InitializeConfig(max_angle=arguments.max_angle, dense=False))
     with scratch() as folder:
         for points in arguments.points or [path.name for path in point_sets(arguments.data)]:
             for megapixels in arguments.megapixels:
                 factor = size_factor(arguments.data, megapixels)
                 dataset = prepare(arguments.data, points, factor, folder / f"{points}-{megapixels}", start=start)
-                case = Case(
+                case = TimingCase(
                     str(dataset),
                     str(dataset / "init.ply"),
                     arguments.threads,

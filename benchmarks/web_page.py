@@ -57,7 +57,7 @@ def main() -> None:
         for size in options.sizes.split(","):
             for page in options.pages.split(","):
                 browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
-                Visit(browser, size, options).go(f"{address}/{page}", options.folder)
+                PageVisit(browser, size, options).go(f"{address}/{page}", options.folder)
                 browser.close()
 
 
@@ -115,7 +115,7 @@ class Traffic:
         return f"{self.received / 1e6:.1f} MB in {len(self.requests)} requests to {len(self.hosts)} host"
 
 
-class Visit:
+class PageVisit:
     """One page in a fresh browser behind a slow network.
 
     Args:

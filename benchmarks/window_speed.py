@@ -35,12 +35,12 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
+from splatpipe.pipeline.train.windows import TrainingSize
 
 WARMUP = 4  # iterations of each that do not count
 ROUNDING = 1.01  # sides are whole pixels, so that a quarter of 4 MP is a little more than 1 MP
@@ -59,7 +59,7 @@ COLUMNS = {
 
 
 @dataclass
-class Runner:
+class TimedTraining:
     """A training on photos of one size, and what its iterations took.
 
     Attributes:
@@ -76,7 +76,7 @@ class Runner:
 
     name: str
     megapixels: float
-    plan: Plan
+    plan: TrainingPlan
     state: TrainState
     photos: PhotoStream
     cpu_s: list[float] = field(default_factory=list)
@@ -96,7 +96,7 @@ class Runner:
         self.rendered += size
         self.pairs += contributing_pairs(self.state.gaussians, photo.camera, self.plan, self.state.iteration)
 
-    def row(self, whole: Runner) -> Row:
+    def row(self, whole: TimedTraining) -> Row:
         """Its figures beside those of the whole photos."""
         turns = len(self.cpu_s)
         median, mean = statistics.median(self.cpu_s), statistics.fmean(self.cpu_s)
@@ -117,7 +117,9 @@ class Runner:
         }
 
 
-def begin(dataset: Path, start: Gaussians, looks: list[Look], threads: int) -> tuple[Plan, TrainState, PhotoStream]:
+def begin(
+    dataset: Path, start: Gaussians, looks: list[TrainingSize], threads: int
+) -> tuple[TrainingPlan, TrainState, PhotoStream]:
     """A training of a fixed number of Gaussians with the rates of a long run, its photos decoded, its sky found."""
     views = load_views(dataset)
     config = TrainConfig(iterations=PUBLISHED_ITERATIONS, max_gaussians=10**9, exposure="affine")
@@ -134,17 +136,17 @@ def begin(dataset: Path, start: Gaussians, looks: list[Look], threads: int) -> t
 def measure(arguments: argparse.Namespace, folder: Path) -> list[Row]:
     """The figures of each size."""
     window = round(1e6 * arguments.window * ROUNDING)
-    runners: list[Runner] = []
+    runners: list[TimedTraining] = []
     with contextlib.ExitStack() as open_streams:
         for megapixels in (arguments.window, *arguments.megapixels):
             factor = size_factor(arguments.data, megapixels)
             dataset = prepare(arguments.data, arguments.points, factor, folder / str(megapixels), arguments.photos)
             start = read_splat(folder / str(arguments.window) / "init.ply")
             is_whole = megapixels == arguments.window
-            looks = [Look(0, 0 if is_whole else window)] * (WARMUP + arguments.repeats)
+            looks = [TrainingSize(0, 0 if is_whole else window)] * (WARMUP + arguments.repeats)
             plan, state, photos = begin(dataset, start, looks, arguments.threads)
             name = "whole" if is_whole else "in windows"
-            runners.append(Runner(name, megapixels, plan, state, open_streams.enter_context(photos)))
+            runners.append(TimedTraining(name, megapixels, plan, state, open_streams.enter_context(photos)))
         with same_bits(arguments.threads):
             for runner in runners:
                 for photo in islice(runner.photos, WARMUP):

@@ -20,7 +20,7 @@ UNDISTORT_STEPS = 30  # each leaves a third of the error at the corner of the st
 
 
 @dataclass(frozen=True)
-class Lens:
+class BrownLens:
     """Brown's lens (COLMAP's FULL_OPENCV without its denominator); with k alone COLMAP's SIMPLE_RADIAL.
 
     The ray (x, y, 1) is seen at pixel f (x', y') + (cx, cy), with x' = x (1 + k r^2 + k2 r^4 + k3 r^6) + 2 p1 x y
@@ -43,7 +43,7 @@ class Lens:
         """Whether SIMPLE_RADIAL says all of it."""
         return not (self.k2 or self.k3 or self.p1 or self.p2)
 
-    def scaled(self, factor: float) -> Lens:
+    def scaled(self, factor: float) -> BrownLens:
         """The same lens for photos of another size."""
         return replace(
             self,
@@ -91,9 +91,9 @@ BROWN_TIMES = (
 BROWN_OFFSET_PX = (16.0, -12.0)  # of the principal point: 20 px
 
 
-def brown_lens(simple: Lens | None = None) -> Lens:
+def brown_lens(simple: BrownLens | None = None) -> BrownLens:
     """A lens like the P1's for the demo's field of view: the same curve from centre to corner, twice as strong."""
-    plain = simple or Lens()
+    plain = simple or BrownLens()
     corner = float(np.hypot(plain.width, plain.height)) / 2 / plain.f
     inward = P1_CORNER / corner
     k, k2, k3 = (BROWN_TIMES * value * inward ** (2 * n) for n, value in enumerate(P1_RADIAL, 1))
@@ -102,7 +102,7 @@ def brown_lens(simple: Lens | None = None) -> Lens:
     return replace(plain, cx=plain.cx + dx, cy=plain.cy + dy, k=k, k2=k2, k3=k3, p1=p1, p2=p2)
 
 
-LENSES = {"simple": Lens, "brown": brown_lens}
+LENSES = {"simple": BrownLens, "brown": brown_lens}
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from PIL import Image
 
 from splatpipe.demo import capture_path
-from splatpipe.demo.cameras import Lens
+from splatpipe.demo.cameras import BrownLens
 from splatpipe.demo.truth import depth_map, true_poses, true_surface
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.resampling import resample
@@ -40,9 +40,9 @@ CONFIRMED = 0.7  # of the photos that see a place, those that confirm a noisy de
 UNLIMITED_MEGAPIXELS = 1e6
 
 
-def true_cameras(lens: Lens | None = None) -> tuple[pycolmap.Camera, list[Camera]]:
+def true_cameras(lens: BrownLens | None = None) -> tuple[pycolmap.Camera, list[Camera]]:
     """The lens of the capture, and its photos' pinhole cameras, in name order, as ``undistort`` would choose them."""
-    source = pycolmap.Camera(camera_id=1, **(lens or Lens()).colmap())
+    source = pycolmap.Camera(camera_id=1, **(lens or BrownLens()).colmap())
     target = pinhole_camera(source, UNLIMITED_MEGAPIXELS, 1)
     focal, middle = (target.focal_length_x, target.focal_length_y), (target.principal_point_x, target.principal_point_y)
     poses = sorted(true_poses().items())

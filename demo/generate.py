@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .cameras import LENSES, Lens, Pose, flight
+from .cameras import LENSES, BrownLens, Pose, flight
 from .geodesy import Origin
 from .mesh import Array
-from .metadata import Position, build_exif, build_xmp, position_attributes, with_metadata
+from .metadata import GpsPosition, build_exif, build_xmp, position_attributes, with_metadata
 from .render import Renderer
-from .scene import PLOT_YAW_DEG, Scene, build_scene, surface_of
+from .scene import PLOT_YAW_DEG, DemoScene, build_scene, surface_of
 from .survey import gcp_list, sightings
 
 SEED = 2026
@@ -85,10 +85,10 @@ def compress(photos: list[NDArray[np.uint8]], budget: float) -> list[bytes]:
     return files
 
 
-def render_all(scene: Renderer, poses: list[Pose], lens: Lens, spp: int, work: Path) -> list[Path]:
+def render_all(scene: Renderer, poses: list[Pose], lens: BrownLens, spp: int, work: Path) -> list[Path]:
     """Render what is not there yet; returns the files with radiance as float16."""
     work.mkdir(parents=True, exist_ok=True)
-    tag = f"{spp}" if lens == Lens() else f"{spp}.{sha256(repr(lens).encode()).hexdigest()[:8]}"
+    tag = f"{spp}" if lens == BrownLens() else f"{spp}.{sha256(repr(lens).encode()).hexdigest()[:8]}"
     files = [work / f"{pose.name}.{tag}.npy" for pose in poses]
     for number, (pose, file) in enumerate(zip(poses, files, strict=True)):
         if not file.exists():
@@ -99,7 +99,7 @@ def render_all(scene: Renderer, poses: list[Pose], lens: Lens, spp: int, work: P
     return files
 
 
-def _flight_attributes(pose: Pose, lens: Lens, barometer_m: float, rng: np.random.Generator) -> dict[str, str]:
+def _flight_attributes(pose: Pose, lens: BrownLens, barometer_m: float, rng: np.random.Generator) -> dict[str, str]:
     """DJI's XMP about angles and height; angles to 0.1 degrees with the gimbal's own error."""
     yaw, pitch, roll = np.array([pose.yaw_deg, pose.pitch_deg, pose.roll_deg]) + rng.normal(0, 0.2, 3)
     flight_yaw = yaw + rng.normal(0, 1.0)
@@ -117,7 +117,7 @@ def _flight_attributes(pose: Pose, lens: Lens, barometer_m: float, rng: np.rando
         "FlightPitchDegree": f"{rng.normal(0, 2):+.2f}",
         "CamReverse": "0",
         "GimbalReverse": "0",
-        "CalibratedFocalLength": f"{CALIBRATED_FOCAL_PX * lens.width / Lens.width:.6f}",
+        "CalibratedFocalLength": f"{CALIBRATED_FOCAL_PX * lens.width / BrownLens.width:.6f}",
         "CalibratedOpticalCenterX": f"{lens.width / 2:.6f}",
         "CalibratedOpticalCenterY": f"{lens.height / 2:.6f}",
         "DewarpFlag": "0",
@@ -125,7 +125,7 @@ def _flight_attributes(pose: Pose, lens: Lens, barometer_m: float, rng: np.rando
 
 
 def write_photos(
-    out: Path, renders: list[Path], poses: list[Pose], lens: Lens, origin: Origin
+    out: Path, renders: list[Path], poses: list[Pose], lens: BrownLens, origin: Origin
 ) -> list[dict[str, object]]:
     """Develop, compress and tag the photos, write ``rtk.json``; returns each photo's entry in truth.json."""
     rng = np.random.default_rng(SEED)
@@ -141,12 +141,12 @@ def write_photos(
     ]
     (out / "photos").mkdir(parents=True, exist_ok=True)
     start, entries = datetime(2026, 6, 18, 13, 42, 5), []
-    budget = PHOTO_BUDGET_BYTES * (lens.width * lens.height) / (Lens.width * Lens.height)
+    budget = PHOTO_BUDGET_BYTES * (lens.width * lens.height) / (BrownLens.width * BrownLens.height)
     for k, (pose, jpeg) in enumerate(zip(poses, compress(developed, budget), strict=True)):
         taken = (start + timedelta(seconds=7 * k + (45 if k >= 16 else 0) + (60 if k >= 31 else 0))).strftime(
             "%Y:%m:%d %H:%M:%S"
         )
-        position = Position(*(float(x) for x in fixes[k]))
+        position = GpsPosition(*(float(x) for x in fixes[k]))
         exif = build_exif((lens.width, lens.height), taken, 2 ** exposures[k] / 640, position)
         xmp = build_xmp(taken, {**_flight_attributes(pose, lens, barometer[k], rng), **position_attributes(position)})
         (out / "photos" / pose.name).write_bytes(with_metadata(jpeg, exif, xmp))
@@ -170,7 +170,7 @@ def write_photos(
 
 
 def write_survey(
-    out: Path, scene: Scene, renderer: Renderer, poses: list[Pose], lens: Lens, origin: Origin
+    out: Path, scene: DemoScene, renderer: Renderer, poses: list[Pose], lens: BrownLens, origin: Origin
 ) -> list[dict[str, object]]:
     """Write ``gcp_list.txt``; returns the points' entries in truth.json."""
     rng = np.random.default_rng(SEED + 1)
@@ -194,7 +194,7 @@ def write_survey(
     ]
 
 
-def write_surface(path: Path, scene: Scene) -> None:
+def write_surface(path: Path, scene: DemoScene) -> None:
     """The scene's triangles as binary PLY, east, north, up, with 16-bit indices."""
     vertices, triangles = surface_of(scene)
     assert len(vertices) < 2**16

@@ -31,7 +31,7 @@ WOOD = planks(("6a4a30", "7d5a3a", "5a3d28"), 0.14, 1.5)
 
 
 @dataclass(frozen=True)
-class Window:
+class HouseWindow:
     """An opening in a wall: lower left and upper right corner in the wall's plane, panes across, shutters or not."""
 
     left: float
@@ -46,7 +46,7 @@ class Window:
         return self.left, self.low, self.right, self.high
 
 
-def add_window(b: Builder, wall: Plane, w: Window, seed: int, reveal: Painter) -> None:
+def add_window(b: Builder, wall: Plane, w: HouseWindow, seed: int, reveal: Painter) -> None:
     """Reveal, pane with a room behind, frame, mullions, sill, shutters."""
     depth = -0.16
     corners = [(w.left, w.low), (w.right, w.low), (w.right, w.high), (w.left, w.high)]
@@ -75,7 +75,7 @@ def add_wall(
     b: Builder,
     wall: Plane,
     outline: Sequence[tuple[float | int, float | int]],
-    windows: Sequence[Window],
+    windows: Sequence[HouseWindow],
     paint: Painter,
     seed: int,
 ) -> None:
@@ -89,26 +89,28 @@ def _walls(b: Builder) -> None:
     length, width = 2 * HALF_LENGTH, 2 * HALF_WIDTH
     green, blue = "4f6f5c", "54708a"
     south = Plane.make((-HALF_LENGTH, -HALF_WIDTH, 0), (1, 0, 0), (0, 0, 1))
-    front = [Window(a, 0.95, a + 1.2, 2.35, 2, green) for a in (1.2, 3.9)] + [Window(9.3, 0.95, 10.9, 2.35, 3)]
-    front += [Window(a, 3.35, a + 1.15, 4.65, 2, green) for a in (1.2, 3.9)]
-    front += [Window(6.75, 3.35, 7.65, 4.65, 1), Window(9.5, 3.35, 10.7, 4.65, 2, green)]
+    front = [HouseWindow(a, 0.95, a + 1.2, 2.35, 2, green) for a in (1.2, 3.9)] + [
+        HouseWindow(9.3, 0.95, 10.9, 2.35, 3)
+    ]
+    front += [HouseWindow(a, 3.35, a + 1.15, 4.65, 2, green) for a in (1.2, 3.9)]
+    front += [HouseWindow(6.75, 3.35, 7.65, 4.65, 1), HouseWindow(9.5, 3.35, 10.7, 4.65, 2, green)]
     box = [(0.0, 0.0), (length, 0.0), (length, EAVES), (0.0, EAVES)]
     add_wall(b, south, box, front, CREAM, 0)
     north = Plane.make((HALF_LENGTH, HALF_WIDTH, 0), (-1, 0, 0), (0, 0, 1))
-    back = [Window(4.6, 0.35, 7.2, 2.45, 3), Window(1.3, 1.0, 2.6, 2.3), Window(9.0, 0.95, 10.5, 2.3, 3)]
-    back += [Window(a, 3.35, a + 1.2, 4.6, 2, blue) for a in (1.4, 5.3, 9.2)]
+    back = [HouseWindow(4.6, 0.35, 7.2, 2.45, 3), HouseWindow(1.3, 1.0, 2.6, 2.3), HouseWindow(9.0, 0.95, 10.5, 2.3, 3)]
+    back += [HouseWindow(a, 3.35, a + 1.2, 4.6, 2, blue) for a in (1.4, 5.3, 9.2)]
     add_wall(b, north, box, back, NORTH_PLASTER, 20)
     gable = [(0.0, 0.0), (width, 0.0), (width, EAVES), (width / 2, RIDGE), (0.0, EAVES)]
     west = Plane.make((-HALF_LENGTH, HALF_WIDTH, 0), (0, -1, 0), (0, 0, 1))
     side = [
-        Window(1.4, 0.95, 2.6, 2.3),
-        Window(5.9, 0.95, 7.6, 2.3, 3),
-        Window(1.5, 3.3, 2.6, 4.6),
-        Window(6.2, 3.3, 7.3, 4.6),
+        HouseWindow(1.4, 0.95, 2.6, 2.3),
+        HouseWindow(5.9, 0.95, 7.6, 2.3, 3),
+        HouseWindow(1.5, 3.3, 2.6, 4.6),
+        HouseWindow(6.2, 3.3, 7.3, 4.6),
     ]
     add_wall(b, west, gable, side, BRICK, 40)
     east = Plane.make((HALF_LENGTH, -HALF_WIDTH, 0), (0, 1, 0), (0, 0, 1))
-    add_wall(b, east, gable, [Window(1.6, 3.9, 2.7, 5.0), Window(6.2, 3.9, 7.3, 5.0)], CREAM, 60)
+    add_wall(b, east, gable, [HouseWindow(1.6, 3.9, 2.7, 5.0), HouseWindow(6.2, 3.9, 7.3, 5.0)], CREAM, 60)
     for plane, paint, seed in ((west, CLADDING, 50), (east, CLADDING, 70)):
         attic = plane.at(0, 0, 0.05)
         b.polygon(attic, [(1.0, EAVES + 0.8), (8.0, EAVES + 0.8), (4.5, RIDGE - 0.05)], paint)
@@ -191,7 +193,7 @@ def _dormer(b: Builder) -> None:
     face = Plane.make((x0, front, 0), (1, 0, 0), (0, 0, 1))
     outline = [(0.0, low), (2 * half, low), (2 * half, eaves), (half, ridge), (0.0, eaves)]
     add_wall(
-        b, face, outline, [Window(0.45, 6.25, 1.95, 7.1, 3)], planks(("c3b596", "b2a383", "d0c4a8"), 0.18, 1.6), 80
+        b, face, outline, [HouseWindow(0.45, 6.25, 1.95, 7.1, 3)], planks(("c3b596", "b2a383", "d0c4a8"), 0.18, 1.6), 80
     )
     for origin, u in (((x1, front, 0), (0, 1, 0)), ((x0, -0.5, 0), (0, -1, 0))):
         b.rect(Plane.make(origin, u, (0, 0, 1)), (0, low), (2.9, eaves), CLADDING)
@@ -224,14 +226,14 @@ def _annex(b: Builder) -> None:
     b.rect(front, (0, 0), (span, low), stone)
     b.polygon(front, [(0, low), (span, low), (0, high)], stone)
     back = Plane.make((x1, y1, 0), (-1, 0, 0), (0, 0, 1))
-    add_wall(b, back, [(0, 0), (span, 0), (span, low), (0, low)], [Window(1.2, 0.9, 2.6, 2.0)], stone, 90)
+    add_wall(b, back, [(0, 0), (span, 0), (span, low), (0, low)], [HouseWindow(1.2, 0.9, 2.6, 2.0)], stone, 90)
     b.polygon(back, [(0, low), (span, low), (span, high)], stone)
     side = Plane.make((x1, y0, 0), (0, 1, 0), (0, 0, 1))
     add_wall(
         b,
         side,
         [(0, 0), (y1 - y0, 0), (y1 - y0, low), (0, low)],
-        [Window(1.5, 1.1, 2.7, 2.0), Window(4.0, 1.1, 5.2, 2.0)],
+        [HouseWindow(1.5, 1.1, 2.7, 2.0), HouseWindow(4.0, 1.1, 5.2, 2.0)],
         stone,
         94,
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .textures import Image, Painter, Tile
+from .textures import Image, Painter, TextureTile
 
 Array = NDArray[np.float64]
 Numbers = Sequence[Any] | NDArray[Any] | float | int  # what np.asarray takes; ArrayLike is more than beartype can check
@@ -260,7 +260,7 @@ class Lump:
             yield Face(vertices, triangles, uv, self._painter(side, edge), self.texel_m, given_normals=normals)
 
     def _painter(self, side: int, edge: float) -> Painter:
-        def paint(tile: Tile) -> Image:
+        def paint(tile: TextureTile) -> Image:
             b, a = np.meshgrid(tile.v / edge * 2 - 1, tile.u / edge * 2 - 1, indexing="ij")
             xyz = self.surface(side, a, b)
             tone = sum(
@@ -354,5 +354,5 @@ def _join(page: Sequence[tuple[int, Face, int, int]], seed: int, gloss: bool) ->
 def _paint(face: Face, rng: np.random.Generator) -> NDArray[np.uint8]:
     width, height = np.ceil(face.uv_m.max(axis=0) / face.texel_m).astype(int) + 2 * MARGIN
     u, v = ((np.arange(n) - MARGIN + 0.5) * face.texel_m for n in (width, height))
-    image = face.paint(Tile(u.astype(np.float32), v.astype(np.float32), face.texel_m, rng))
+    image = face.paint(TextureTile(u.astype(np.float32), v.astype(np.float32), face.texel_m, rng))
     return np.asarray(np.clip(image, 0.02, 0.95) * 255 + 0.5, np.uint8)

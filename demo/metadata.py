@@ -23,7 +23,7 @@ DJI_ATTRIBUTE = re.compile(r'drone-dji:(\w+)="([^"]*)"')
 
 
 @dataclass(frozen=True)
-class Position:
+class GpsPosition:
     """What the receiver says: WGS84 degrees, altitude in metres (here: above the ellipsoid)."""
 
     latitude: float
@@ -38,7 +38,7 @@ def _sexagesimal(degrees: float) -> tuple[IFDRational, IFDRational, IFDRational]
     return IFDRational(minutes // 60), IFDRational(minutes % 60), IFDRational(seconds, 1_000_000)
 
 
-def gps_tags(position: Position) -> dict[int, object]:
+def gps_tags(position: GpsPosition) -> dict[int, object]:
     """The GPS directory of EXIF."""
     return {
         0: b"\x02\x03\x00\x00",
@@ -52,7 +52,7 @@ def gps_tags(position: Position) -> dict[int, object]:
     }
 
 
-def build_exif(size: tuple[int, int], taken: str, exposure_s: float, position: Position) -> bytes:
+def build_exif(size: tuple[int, int], taken: str, exposure_s: float, position: GpsPosition) -> bytes:
     """An EXIF block.
 
     Args:
@@ -96,7 +96,7 @@ def build_exif(size: tuple[int, int], taken: str, exposure_s: float, position: P
     return exif.tobytes()
 
 
-def position_attributes(position: Position) -> dict[str, str]:
+def position_attributes(position: GpsPosition) -> dict[str, str]:
     """The receiver's part of DJI's XMP."""
     return {
         "GpsLatitude": f"{position.latitude:+.9f}",
@@ -158,7 +158,7 @@ def write_rtk_variant(folder: Path) -> Path:
     rtk = json.loads((CAPTURE / "rtk.json").read_text("utf-8"))
     folder.mkdir(parents=True, exist_ok=True)
     for name, (latitude, longitude, altitude_m) in rtk["positions"].items():
-        position = Position(latitude, longitude, altitude_m)
+        position = GpsPosition(latitude, longitude, altitude_m)
         source = capture_path() / name
         jpeg = source.read_bytes()
         with Image.open(source) as photo:

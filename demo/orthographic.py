@@ -30,7 +30,7 @@ SEED = 20261123
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ParallelView:
     """A picture by parallel rays.
 
     Attributes:
@@ -66,17 +66,17 @@ class View:
         axes = np.stack([self.right * self.pixel_m, self.down * self.pixel_m, self.ahead])
         return np.asarray(places @ axes + self.origin)
 
-    def resampled(self, pixel_m: float) -> View:
+    def resampled(self, pixel_m: float) -> ParallelView:
         """The same picture with pixels of another size."""
         width, height = (round(count * self.pixel_m / pixel_m) for count in (self.width, self.height))
         return replace(self, pixel_m=pixel_m, width=width, height=height)
 
 
-def top_view(pixel_m: float = PIXEL_M) -> View:
+def top_view(pixel_m: float = PIXEL_M) -> ParallelView:
     """The plot from above, north up."""
     count = round(2.0 * TOP_HALF_M / pixel_m)
     origin = np.array([-TOP_HALF_M, TOP_HALF_M, TOP_HEIGHT_M])
-    return View("top", origin, np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0]), pixel_m, count, count)
+    return ParallelView("top", origin, np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0]), pixel_m, count, count)
 
 
 def wall_planes() -> dict[str, tuple[Plane, float, float]]:
@@ -98,15 +98,15 @@ def wall_planes() -> dict[str, tuple[Plane, float, float]]:
     }
 
 
-def facade_view(name: str, pixel_m: float = PIXEL_M) -> View:
+def facade_view(name: str, pixel_m: float = PIXEL_M) -> ParallelView:
     """A wall of the house from before it, with a margin around."""
     wall, span, high = wall_planes()[name]
     origin = wall.point(-MARGIN_M, high + MARGIN_M, AHEAD_M[name])
     size = (round(metres / pixel_m) for metres in (span + 2.0 * MARGIN_M, high + 2.0 * MARGIN_M))
-    return View(name, origin, wall.u, -wall.v, pixel_m, *size)
+    return ParallelView(name, origin, wall.u, -wall.v, pixel_m, *size)
 
 
-def views(pixel_m: float = PIXEL_M) -> list[View]:
+def views(pixel_m: float = PIXEL_M) -> list[ParallelView]:
     """All of them."""
     return [top_view(pixel_m), *(facade_view(name, pixel_m) for name in wall_planes())]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from splatpipe.demo.orthographic import View
+from splatpipe.demo.orthographic import ParallelView
 from splatpipe.demo.truth import Triangles
 
 Places = Float64[np.ndarray, "*n 3"]
@@ -88,7 +88,7 @@ def surface_model(
     return relief(to_grid(triangles.reshape(-1, 3)).reshape(-1, 3, 3), width, height, cell_m)
 
 
-def seen_in(view: View, triangles: Triangles) -> Relief:
+def relief_in(view: ParallelView, triangles: Triangles) -> Relief:
     """What an orthographic view sees; heights are metres towards the viewer from the plane where its rays start."""
     places = view.to_grid(triangles) * [1.0, 1.0, -1.0]
     ahead = (places[..., 2] <= 0.0).any(axis=1)  # what lies behind the viewer is not seen

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import Lens, Pose
+from .cameras import BrownLens, Pose
 from .mesh import Array
-from .orthographic import View
-from .scene import Scene
+from .orthographic import ParallelView
+from .scene import DemoScene
 
 SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG = 46.0, 222.0
 SUN_RADIUS_DEG = 0.2679
@@ -33,7 +33,7 @@ def load_mitsuba() -> Any:
 class Renderer:
     """The scene on Mitsuba's side."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: DemoScene) -> None:
         self.mi = load_mitsuba()
         up, azimuth = np.deg2rad(SUN_ELEVATION_DEG), np.deg2rad(SUN_AZIMUTH_DEG)
         self.sun = np.array([np.cos(up) * np.sin(azimuth), np.cos(up) * np.cos(azimuth), np.sin(up)])
@@ -78,7 +78,7 @@ class Renderer:
         parameters.update()
         return shape
 
-    def photo(self, pose: Pose, lens: Lens, spp: int, seed: int) -> NDArray[np.float32]:
+    def photo(self, pose: Pose, lens: BrownLens, spp: int, seed: int) -> NDArray[np.float32]:
         """Radiance of each pixel, (h, w, 3): ``spp`` paths a pixel through a Gaussian pixel filter.
 
         Args:
@@ -105,7 +105,7 @@ class Renderer:
 
         return self._picture(lens.width, lens.height, ray, spp, seed)
 
-    def orthographic(self, view: View, spp: int, seed: int) -> NDArray[np.float32]:
+    def orthographic(self, view: ParallelView, spp: int, seed: int) -> NDArray[np.float32]:
         """Radiance of each pixel, (h, w, 3), along parallel rays; as ``photo`` otherwise."""
         import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 

@@ -16,7 +16,7 @@ PLOT_YAW_DEG = 17.0  # the house is turned against north, as houses are
 
 
 @dataclass(frozen=True)
-class SurveyPoint:
+class SurveyTarget:
     """A target whose position was surveyed.
 
     Attributes:
@@ -33,11 +33,11 @@ class SurveyPoint:
 
 
 @dataclass(frozen=True)
-class Scene:
+class DemoScene:
     """Meshes with textures, ready to render, and the surveyed points. East, north, up in metres."""
 
     meshes: list[TexturedMesh]
-    points: list[SurveyPoint]
+    points: list[SurveyTarget]
 
 
 def _target_planes() -> list[tuple[str, Plane, float]]:
@@ -82,7 +82,7 @@ def turned(points: Array) -> Array:
     return np.asarray(points @ _turn(PLOT_YAW_DEG).T)
 
 
-def build_scene(seed: int = SEED) -> Scene:
+def build_scene(seed: int = SEED) -> DemoScene:
     """Build and paint the scene; some 20 s."""
     builder = Builder()
     add_house(builder)
@@ -91,12 +91,12 @@ def build_scene(seed: int = SEED) -> Scene:
     points = []
     for number, (where, plane, size) in enumerate(_target_planes(), 1):
         builder.rect(plane, (-size / 2, -size / 2), (size / 2, size / 2), target, texel_m=0.005)
-        points.append(SurveyPoint(f"P{number:02d}", where, turn @ plane.origin, turn @ plane.n))
+        points.append(SurveyTarget(f"P{number:02d}", where, turn @ plane.origin, turn @ plane.n))
     meshes = []
     for mesh in paint_faces(builder.faces, seed):
         vertices, normals = ((a.astype(np.float64) @ turn.T).astype(np.float32) for a in (mesh.vertices, mesh.normals))
         meshes.append(TexturedMesh(vertices, normals, mesh.triangles, mesh.uv, mesh.texture, mesh.gloss))
-    return Scene(meshes, points)
+    return DemoScene(meshes, points)
 
 
 def building_corners(paint: Painter | None = None) -> Array:
@@ -115,7 +115,7 @@ def building_corners(paint: Painter | None = None) -> Array:
     return np.asarray(turned.astype(np.float32), np.float64)
 
 
-def surface_of(scene: Scene) -> tuple[Array, np.ndarray[tuple[int, int], np.dtype[np.int64]]]:
+def surface_of(scene: DemoScene) -> tuple[Array, np.ndarray[tuple[int, int], np.dtype[np.int64]]]:
     """All triangles of the scene as one mesh: vertices (n, 3) and triangles (m, 3), equal vertices joined."""
     vertices, triangles, count = [], [], 0
     for mesh in scene.meshes:

@@ -9,7 +9,7 @@ from .mesh import WORLD, Array, Builder, Face, Lump, Plane
 from .textures import (
     Image,
     Painter,
-    Tile,
+    TextureTile,
     blobs,
     bricks,
     colour,
@@ -49,13 +49,13 @@ LEAVES = {
 
 
 def _blend(
-    base: Image, tile: Tile, area: tuple[float, float, float, float], paint: Painter, ragged: float = 0.0
+    base: Image, tile: TextureTile, area: tuple[float, float, float, float], paint: Painter, ragged: float = 0.0
 ) -> Image:
     """Paint a rectangle (x0, y0, x1, y1) of the ground; a ragged border wanders by that many metres."""
     x0, y0, x1, y1 = area
     cols = np.flatnonzero((tile.u - NEAR > x0 - 2 * ragged) & (tile.u - NEAR < x1 + 2 * ragged))
     rows = np.flatnonzero((tile.v - NEAR > y0 - 2 * ragged) & (tile.v - NEAR < y1 + 2 * ragged))
-    part = Tile(tile.u[cols[0] : cols[-1] + 1], tile.v[rows[0] : rows[-1] + 1], tile.texel_m, tile.rng)
+    part = TextureTile(tile.u[cols[0] : cols[-1] + 1], tile.v[rows[0] : rows[-1] + 1], tile.texel_m, tile.rng)
     u, v = part.u[None, :] - NEAR, part.v[:, None] - NEAR
     inside = np.minimum(np.minimum(u - x0, x1 - u), np.minimum(v - y0, y1 - v))
     if ragged:
@@ -68,7 +68,7 @@ def _blend(
 def _plot(far: Image) -> Painter:
     """The flat plot, which fades into the land around it (``far``: that texture) towards its border."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         base = LAWN(tile)
         base = mix(base, colour("4c5a2b"), 0.4 * smooth(noise(tile, 0.42), 0.9, 1.9))  # tufts
         base = mix(base, colour("a09a62"), 0.4 * smooth(noise(tile, 0.33), 1.2, 2.1))
@@ -116,7 +116,7 @@ def _land(seed: int) -> Image:
     """The far land's texture (rows grow with y): fields, a few ploughed strips, the street going on."""
     count = round(2 * FAR / FAR_TEXEL)
     axis = ((np.arange(count) + 0.5) * FAR_TEXEL).astype(np.float32)
-    tile = Tile(axis, axis, FAR_TEXEL, np.random.default_rng(seed))
+    tile = TextureTile(axis, axis, FAR_TEXEL, np.random.default_rng(seed))
     base = FIELD(tile)
     for code, share in (("8a7350", 0.12), ("b5a766", 0.14), ("4a6034", 0.15)):
         base = mix(base, colour(code), 0.8 * blobs(tile, 60.0, share))
@@ -154,7 +154,7 @@ def _ground(b: Builder, seed: int) -> None:
     b.add(Face(vertices, triangles, vertices[:, :2] + FAR, lambda tile: _pad(far, tile), FAR_TEXEL))
 
 
-def _pad(image: Image, tile: Tile) -> Image:
+def _pad(image: Image, tile: TextureTile) -> Image:
     rows, cols = tile.shape[0] - image.shape[0], tile.shape[1] - image.shape[1]
     return np.pad(image, ((rows // 2, rows - rows // 2), (cols // 2, cols - cols // 2), (0, 0)), mode="edge")
 

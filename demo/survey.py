@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .cameras import Lens, Pose
+from .cameras import BrownLens, Pose
 from .mesh import Array
-from .scene import SurveyPoint
+from .scene import SurveyTarget
 
 BORDER_PX = 12  # a target nearer to the photo's border is not marked
 MAX_INCIDENCE_DEG = 72
@@ -17,7 +17,7 @@ Sightings = dict[str, dict[str, Array]]  # point name -> photo name -> pixel (2,
 
 
 def sightings(
-    points: Sequence[SurveyPoint], poses: Sequence[Pose], lens: Lens, first_hit: Callable[[Array, Array], Array]
+    points: Sequence[SurveyTarget], poses: Sequence[Pose], lens: BrownLens, first_hit: Callable[[Array, Array], Array]
 ) -> Sightings:
     """Exact pixels of each point in each photo that sees it.
 

@@ -1,6 +1,7 @@
 """Procedural surface textures: every face gets its own, rich in blobs at all scales and nowhere repeating.
 
-A painter is a function of a `Tile` (a rectangle of wall, roof, lawn ...) that returns sRGB reflectances in [0, 1].
+A painter is a function of a `TextureTile` (a rectangle of wall, roof, lawn ...) that returns sRGB reflectances in
+[0, 1].
 Contrast lies mostly at wavelengths of 0.2 m and more, which stay well sampled in photos of half the size; what is finer
 is kept faint.
 """
@@ -20,7 +21,7 @@ Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Tile:
+class TextureTile:
     """A rectangle to paint.
 
     Attributes:
@@ -40,7 +41,7 @@ class Tile:
         return len(self.v), len(self.u)
 
 
-Painter = Callable[[Tile], Image]
+Painter = Callable[[TextureTile], Image]
 
 
 def colour(hex_code: str) -> Image:
@@ -59,7 +60,7 @@ def mix(a: NDArray[Any], b: NDArray[Any], t: NDArray[Any]) -> Image:
     return np.asarray(a + (b - a) * t[..., None], np.float32)
 
 
-def noise(tile: Tile, wavelength_m: float | tuple[float, float]) -> Image:
+def noise(tile: TextureTile, wavelength_m: float | tuple[float, float]) -> Image:
     """Smooth random field of about unit variance.
 
     Args:
@@ -77,7 +78,7 @@ def noise(tile: Tile, wavelength_m: float | tuple[float, float]) -> Image:
     return np.asarray(field[top : top + h, left : left + w] * 1.4, np.float32)
 
 
-def fractal(tile: Tile, longest_m: float, shortest_m: float, gain: float = 0.75) -> Image:
+def fractal(tile: TextureTile, longest_m: float, shortest_m: float, gain: float = 0.75) -> Image:
     """Sum of octaves of noise, about unit variance; each octave is ``gain`` times the one above it."""
     total = np.zeros(tile.shape, np.float32)
     power, amplitude, wavelength = 0.0, 1.0, longest_m
@@ -88,7 +89,7 @@ def fractal(tile: Tile, longest_m: float, shortest_m: float, gain: float = 0.75)
     return np.asarray(total / np.sqrt(power), np.float32)
 
 
-def blobs(tile: Tile, wavelength_m: float, share: float) -> Image:
+def blobs(tile: TextureTile, wavelength_m: float, share: float) -> Image:
     """Patches with soft edges that cover about ``share`` of the tile, as a map in [0, 1]."""
     field = fractal(tile, wavelength_m, wavelength_m / 3, 0.5)
     threshold = float(np.quantile(field[::4, ::4], 1 - share))
@@ -117,7 +118,7 @@ class Cells:
         return np.asarray(table[self.row, self.col], np.float32)
 
 
-def cells(tile: Tile, width_m: float, height_m: float, stagger: float = 0.5, jitter: float = 0.1) -> Cells:
+def cells(tile: TextureTile, width_m: float, height_m: float, stagger: float = 0.5, jitter: float = 0.1) -> Cells:
     """Rows of cells, each row shifted by ``stagger`` of a cell and a random ``jitter``."""
     v = tile.v[:, None] - tile.v[0] + 0.37 * height_m
     row = np.floor(v / height_m).astype(np.int64)
@@ -133,7 +134,7 @@ def cells(tile: Tile, width_m: float, height_m: float, stagger: float = 0.5, jit
 def plaster(base: str, stain: str, strength: float = 1.0) -> Painter:
     """Rendered wall: clouds, patched areas, rain streaks."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         body = colour(base) * (1 + 0.045 * strength * fractal(tile, 1.6, 0.08, 0.8))[..., None]
         body = mix(body, colour(stain), 0.5 * strength * blobs(tile, 1.1, 0.22))
         body = mix(body, colour(base) * 1.12, 0.7 * strength * blobs(tile, 0.6, 0.12))
@@ -148,7 +149,7 @@ def plaster(base: str, stain: str, strength: float = 1.0) -> Painter:
 def bricks(palette: Sequence[str], mortar: str, width_m: float = 0.3, height_m: float = 0.15) -> Painter:
     """Brick wall: each brick its own colour, areas of newer bricks, weathering."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         grid = cells(tile, width_m, height_m)
         which = np.clip((grid.values(tile.rng) * 0.30 + 0.5) * len(palette), 0, len(palette) - 1e-3)
         body = np.stack([colour(c) for c in palette])[which.astype(np.int64)]
@@ -163,7 +164,7 @@ def bricks(palette: Sequence[str], mortar: str, width_m: float = 0.3, height_m: 
 def roof_tiles(palette: Sequence[str], width_m: float = 0.34, height_m: float = 0.36) -> Painter:
     """Tiled roof: each tile its own tone, a shadow under each row, moss and lichen."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         grid = cells(tile, width_m, height_m, jitter=0.0)
         which = np.clip((grid.values(tile.rng) * 0.32 + 0.5) * len(palette), 0, len(palette) - 1e-3)
         body = np.stack([colour(c) for c in palette])[which.astype(np.int64)]
@@ -179,7 +180,7 @@ def roof_tiles(palette: Sequence[str], width_m: float = 0.34, height_m: float = 
 def planks(palette: Sequence[str], width_m: float = 0.2, length_m: float = 1.9) -> Painter:
     """Boards that run along u."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         grid = cells(tile, length_m, width_m, jitter=0.9)
         which = np.clip((grid.values(tile.rng) * 0.3 + 0.5) * len(palette), 0, len(palette) - 1e-3)
         body = np.stack([colour(c) for c in palette])[which.astype(np.int64)]
@@ -195,7 +196,7 @@ def planks(palette: Sequence[str], width_m: float = 0.2, length_m: float = 1.9) 
 def slabs(palette: Sequence[str], joint: str, width_m: float, height_m: float, dirt: float = 0.5) -> Painter:
     """Paving: each slab its own tone, dirty patches, joints."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         grid = cells(tile, width_m, height_m, jitter=0.3)
         which = np.clip((grid.values(tile.rng) * 0.32 + 0.5) * len(palette), 0, len(palette) - 1e-3)
         body = np.stack([colour(c) for c in palette])[which.astype(np.int64)]
@@ -210,7 +211,7 @@ def slabs(palette: Sequence[str], joint: str, width_m: float, height_m: float, d
 def mottled(palette: Sequence[str], longest_m: float, shortest_m: float, contrast: float = 0.08) -> Painter:
     """Soil, asphalt, lawn, leaves: patches of a few colours over each other and clouds of brightness."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         body = np.broadcast_to(colour(palette[0]), (*tile.shape, 3))
         wavelength = longest_m
         for code in palette[1:]:
@@ -224,7 +225,7 @@ def mottled(palette: Sequence[str], longest_m: float, shortest_m: float, contras
 def painted(base: str, strength: float = 0.6) -> Painter:
     """Painted metal or wood: nearly even, with scuffs and clouds."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         body = colour(base) * (1 + 0.05 * strength * fractal(tile, 0.6, 0.06, 0.8))[..., None]
         body = mix(body, body * 0.72, 0.7 * strength * blobs(tile, 0.45, 0.12))
         return mix(body, np.minimum(colour(base) * 1.2, 1), 0.7 * strength * blobs(tile, 0.3, 0.08))
@@ -232,7 +233,7 @@ def painted(base: str, strength: float = 0.6) -> Painter:
     return paint
 
 
-def target(tile: Tile) -> Image:
+def target(tile: TextureTile) -> Image:
     """Survey target: four quadrants in black and white that meet at the centre."""
     u, v = tile.u - tile.u.mean(), tile.v - tile.v.mean()
     width = 0.6 * tile.texel_m  # edges as soft as a texel, so that the centre is not biased by aliasing
@@ -243,7 +244,7 @@ def target(tile: Tile) -> Image:
 def interior(wall: str, curtain: str) -> Painter:
     """What is behind a window: a room in the dark, curtains at the sides, a lamp or plants on the sill, a blind."""
 
-    def paint(tile: Tile) -> Image:
+    def paint(tile: TextureTile) -> Image:
         width, height = float(tile.u.max()), float(tile.v.max())
         u, v = tile.u[None, :] / width, tile.v[:, None] / height
         rng = tile.rng

@@ -21,14 +21,14 @@ FEWEST = 3  # photos that tell a place's position with something to spare
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class TrueView:
     """A photo's camera and what it truly sees, metres along its axis; infinite where there is nothing."""
 
     camera: Camera
     depth: Float32[np.ndarray, "h w"]
 
 
-def true_sights(surface: Triangles, folder: Path | None = None) -> list[Sight]:
+def true_sights(surface: Triangles, folder: Path | None = None) -> list[TrueView]:
     """All photos of the capture.
 
     Args:
@@ -37,13 +37,13 @@ def true_sights(surface: Triangles, folder: Path | None = None) -> list[Sight]:
     """
     if folder is not None:
         held = [load(path) for path in sorted(folder.glob("*.npz"))]
-        return [Sight(camera, np.where(depth > 0.0, depth, np.float32(np.inf))) for camera, depth, _ in held]
+        return [TrueView(camera, np.where(depth > 0.0, depth, np.float32(np.inf))) for camera, depth, _ in held]
     halves = [camera.scaled(camera.width // HALF, camera.height // HALF) for camera in true_cameras()[1]]
-    return [Sight(camera, depth_map(camera, surface).astype(np.float32)) for camera in halves]
+    return [TrueView(camera, depth_map(camera, surface).astype(np.float32)) for camera in halves]
 
 
 def photos_that_see(
-    places: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"], sights: Iterable[Sight]
+    places: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"], sights: Iterable[TrueView]
 ) -> UInt8[np.ndarray, " n"]:
     """How many photos see each place of a surface.
 

@@ -14,7 +14,7 @@ from splatpipe.pipeline.train.blocks.needs import (
     round_pixels,
     work_bytes,
 )
-from splatpipe.pipeline.train.lengths import Footage, Length, growth_until, stretches
+from splatpipe.pipeline.train.lengths import Length, PhotoSizes, growth_until, stretches
 from splatpipe.pipeline.train.limits import PIXEL_BYTES, bytes_per_gaussian
 
 SEEN_BY = 35.0  # photos that show a place: some 12 of a flight straight down, 60 of the tiled demo, which has orbits
@@ -63,7 +63,7 @@ class BlockWork:
     """
 
     division: Division
-    footage: Footage
+    footage: PhotoSizes
     coarse: tuple[Length, ...]
     finer: tuple[Length, ...]
     grown: float

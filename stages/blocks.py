@@ -16,7 +16,7 @@ from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.splat.ply import read_splat_header
-from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
+from splatpipe.pipeline.train.blocks.coarse import TrainingLimits, train_coarse
 from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divided, memory_limit
 from splatpipe.pipeline.train.blocks.layout import COARSE, PROSPECTS, lay_out
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
@@ -24,7 +24,7 @@ from splatpipe.pipeline.train.blocks.site_plan import whole_json
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
 from splatpipe.pipeline.train.limits import LIBRARIES_BYTES
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import MEGA, CaptureSize, Work
@@ -60,7 +60,7 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     _tell(division, train, division.limit_bytes and division.limit_bytes - _beside(device), report)
     told = out / "coarse.json"
     if not told.is_file():
-        limits = Limits(division.coarse_cap, division.window_pixels)
+        limits = TrainingLimits(division.coarse_cap, division.window_pixels)
         summary = train_coarse(train, inputs, limits, coarse, report)
         sync_tree(coarse)  # what is told to be there is there, even after a power cut
         write_durably(told, json.dumps(dict(summary)))
@@ -90,14 +90,14 @@ def kept_division(path: Path, make: Callable[[], Division]) -> Division:
         return division
 
 
-def _whole_plan(train: TrainConfig, inputs: Inputs, device: Device) -> Plan:
+def _whole_plan(train: TrainConfig, inputs: Inputs, device: Device) -> TrainingPlan:
     """The training of the scene in one, without limits of memory."""
     views, split = load_views(inputs["undistort.dataset"]), load_split(inputs["split.views"])
     start = read_splat_header(inputs["initialize.splat"]).count
     return make_plan(train, views, split, start, WINDOW_PIXELS[device.name])
 
 
-def _division(config: BlocksConfig, train: TrainConfig, plan: Plan, device: Device) -> Division:
+def _division(config: BlocksConfig, train: TrainConfig, plan: TrainingPlan, device: Device) -> Division:
     if train.time_budget_s:  # which plans one training
         return divided(_scene(train, plan), 0)
     limit = memory_limit(train.max_memory_bytes, _memory_of(device))
@@ -128,7 +128,7 @@ def _memory_of(device: Device) -> int:
     return available_memory_bytes()
 
 
-def _scene(train: TrainConfig, plan: Plan) -> SceneSize:
+def _scene(train: TrainConfig, plan: TrainingPlan) -> SceneSize:
     window = max(plan.footage.largest(stretch.look) for stretch in plan.schedule.stretches)
     photos = sum(count for _width, _height, count in plan.sizes)
     pixels = sum(width * height * count for width, height, count in plan.sizes) / max(photos, 1)
@@ -138,7 +138,7 @@ def _scene(train: TrainConfig, plan: Plan) -> SceneSize:
     return SceneSize(train.max_gaussians, expected, window, train.sh_degree, photos)
 
 
-def _shape(plan: Plan) -> float:
+def _shape(plan: TrainingPlan) -> float:
     """The shorter side over the longer one of the commonest photos."""
     width, height, _count = max(plan.sizes, key=lambda size: size[2])
     return min(width, height) / max(width, height)

@@ -8,7 +8,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
 from splatpipe.pipeline.surface.options import DsmConfig
 from splatpipe.pipeline.surface.run_sources import open_run_surface
-from splatpipe.pipeline.surface.site import save_site, survey_site
+from splatpipe.pipeline.surface.site_extent import measure_extent, save_site
 
 CELL_GSD = 2.0  # of the photos: heights are known less finely than colours; and no more finely than depths
 
@@ -28,7 +28,7 @@ def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summa
         if config.enabled:
             report.note("There are no depths in metres, so there is no surface model, and nothing made from one.")
         return {"cells": 0}
-    site = survey_site(surface.depths, surface.finer, surface.area, inputs.machine.threads)
+    site = measure_extent(surface.depths, surface.finer, surface.area, inputs.machine.threads)
     if site is None:
         report.progress(1, 1, "nothing is made", "steps")
         report.warning("No place is seen well by three photos, so there is no surface model.")

@@ -27,7 +27,7 @@ from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.scene import Scene
 from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.georeference import scene_box, told_in_a_line
+from splatpipe.pipeline.survey.georeference import accuracy_line, scene_box
 from splatpipe.pipeline.survey.handover import (
     bounded_comments,
     cameras_json,
@@ -84,7 +84,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     placed = georef_facts(frame, box, inputs.parts.get("georef.boundary"))
     write_json(out / "georef.json", placed)
     if frame.origin is not None:
-        report.note(told_in_a_line(placed))
+        report.note(accuracy_line(placed))
     report.progress(2, 4, "collecting the figures", "files")
     figures = collect_metrics(inputs, points, len(cameras), len(gaussians))
     figures |= {} if within is None else {"gaussians_inside": within}

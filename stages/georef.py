@@ -16,19 +16,19 @@ from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
 from splatpipe.pipeline.sfm.sparse_model import write_model
-from splatpipe.pipeline.survey.accuracy import Placed, accuracy_json, control_json, no_control
+from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json, control_json, no_control
 from splatpipe.pipeline.survey.blunders import gsd_m
 from splatpipe.pipeline.survey.boundary import lay_boundary
-from splatpipe.pipeline.survey.control import ByControl, Capture, place_by_control
+from splatpipe.pipeline.survey.control import ControlResult, GeorefInput, place_by_control
 from splatpipe.pipeline.survey.crs import parse_vertical
 from splatpipe.pipeline.survey.fitting import NoPlaceError
 from splatpipe.pipeline.survey.frames import Frame, save_frame
 from splatpipe.pipeline.survey.gps import georeference, read_positions, tell
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
+from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of
 from splatpipe.pipeline.survey.model import SparseModel, copy_model, read_model
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.place import Site, Targets, stations_of
-from splatpipe.pipeline.survey.scale_bars import Scale
+from splatpipe.pipeline.survey.scale_bars import ModelScale
 from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
 from splatpipe.pipeline.survey.target_finds import load_finds, load_wanted
 from splatpipe.pipeline.survey.target_marks import TargetMarks
@@ -74,7 +74,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     survey, scale = _survey(targets, inputs, config, report)
     if survey is not None and any(point.sightings for point in survey.points):
         priors = _focal_priors(inputs["ingest.cameras"], model, photos)
-        capture = Capture(model, positions, photos, priors, inputs.settings.get("sparse.lens") == "held")
+        capture = GeorefInput(model, positions, photos, priors, inputs.settings.get("sparse.lens") == "held")
         try:
             controlled = place_by_control(survey, capture, None if isinstance(frame, str) else frame, config, report)
         except NoPlaceError as error:
@@ -110,7 +110,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 
 def _survey(
     targets: TargetSurvey, inputs: Inputs, config: GeorefConfig, report: Reporter
-) -> tuple[Survey | None, Scale | None]:
+) -> tuple[Survey | None, ModelScale | None]:
     """The survey with the marks that targets are, and what scale bars say; None where there is none."""
     control = inputs["source.control"]
     seen: list[TargetMarks] = []
@@ -137,7 +137,7 @@ def _by_positions(
     return frame
 
 
-def _declared(frame: Frame, config: GeorefConfig, controlled: ByControl | None) -> Frame:
+def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | None) -> Frame:
     """The frame with the CRS and the vertical datum that were declared."""
     stated = controlled.survey.crs.text if controlled is not None else ""
     if controlled is None and config.vertical != "auto":
@@ -163,7 +163,7 @@ def _focal_priors(path: Path, model: SparseModel, photos: Mapping[str, Photo]) -
 
 def _accuracy(
     config: GeorefConfig,
-    controlled: ByControl | None,
+    controlled: ControlResult | None,
     alone: tuple[SparseModel, Positions, Frame],
     photos: Mapping[str, Photo],
     report: Reporter,
@@ -191,12 +191,12 @@ def _tell_heights(tables: JSON, report: Reporter) -> None:
 
 
 def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Frame) -> JSON:
-    placed = Placed(model, frame.world_from_model, np.zeros((0, 3)))
+    placed = GeoreferencedModel(model, frame.world_from_model, np.zeros((0, 3)))
     if frame.kind != "enu" or frame.origin is None:
         return accuracy_json(None, None, placed, model.gsd(frame.world_from_model.scale) if frame.metres else None)
     stations = stations_of(model, positions, frame)
     nothing = Targets(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
-    site = Site(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))
+    site = LocalSurvey(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))
     placed = replace(placed, offsets=_stated_offsets(frame, stations.flights))
     gsd = model.gsd(frame.world_from_model.scale)
     return accuracy_json(None, site, placed, gsd, frame.residuals["uncertainty"])
@@ -208,7 +208,7 @@ def _stated_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:
     return np.array([found.get(flight, [0.0, 0.0, 0.0]) for flight in flights], dtype=np.float64).reshape(-1, 3)
 
 
-def _summary(frame: Frame, controlled: ByControl | None, accuracy: JSON) -> Summary:
+def _summary(frame: Frame, controlled: ControlResult | None, accuracy: JSON) -> Summary:
     residuals = {key: value for key, value in frame.residuals.items() if key.startswith("rmse")}
     summary: dict[str, JSON] = {
         "kind": frame.kind,

@@ -43,7 +43,7 @@ from splatpipe.pipeline.photos.preparation import (
     mask_path,
     prepare_masks,
 )
-from splatpipe.pipeline.photos.scan import LeftOut, Scan, scan_folder
+from splatpipe.pipeline.photos.scan import ExcludedPhoto, Scan, scan_folder
 from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.pipeline.survey.photo_positions import (
@@ -125,7 +125,9 @@ def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]
     )
 
 
-def _require_photos(folder: Path, scan: Scan, photos: Sequence[CheckedPhoto], left_out: Sequence[LeftOut]) -> None:
+def _require_photos(
+    folder: Path, scan: Scan, photos: Sequence[CheckedPhoto], left_out: Sequence[ExcludedPhoto]
+) -> None:
     if len(photos) >= MIN_PHOTOS:
         return
     listing = "".join(f"\n  {printable(entry.name)} {entry.reason}" for entry in left_out[:NAMES_SHOWN])
@@ -145,7 +147,7 @@ def _require_photos(folder: Path, scan: Scan, photos: Sequence[CheckedPhoto], le
     raise SplatpipeError(message + (f" Left out:{listing}{more}" if left_out else ""), hint=hint)
 
 
-def _tell_left_out(left_out: Sequence[LeftOut], report: Reporter) -> None:
+def _tell_left_out(left_out: Sequence[ExcludedPhoto], report: Reporter) -> None:
     """One warning a reason, naming the photos."""
     by_reason: dict[str, list[str]] = {}
     for entry in left_out:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area
-from splatpipe.pipeline.mvs.dense import Cover, DensePoints, dense_points
+from splatpipe.pipeline.mvs.dense import DensePoints, PointBudget, dense_points
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_split, load_views
 from splatpipe.pipeline.splat.backdrop import coarse_start
@@ -74,7 +74,7 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
 
 def _dense(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter) -> DensePoints:
     """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
-    cover = Cover(MOST_DENSE, None if area is None else area.contains)
+    cover = PointBudget(MOST_DENSE, None if area is None else area.contains)
     kept = set(load_split(inputs["split.views"]).train)
     used = [view for view in views if view.camera.name in kept]
     dataset, threads = inputs["undistort.dataset"], inputs.machine.threads

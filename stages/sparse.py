@@ -17,16 +17,16 @@ from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.names import some
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
-from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
+from splatpipe.pipeline.sfm.external_evidence import outside_reasons
 from splatpipe.pipeline.sfm.judging import judge
 from splatpipe.pipeline.sfm.ladder import climb
 from splatpipe.pipeline.sfm.lens_model import stated_lenses
 from splatpipe.pipeline.sfm.lenses import calibrate, tell_lenses
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.outside import outside_reasons
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.sparse_model import write_model
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 Model: TypeAlias = pycolmap.Reconstruction
 
@@ -57,11 +57,11 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     return {**summary, "unregistered": len(summary["unregistered"]), "other_models": len(summary["other_models"])}
 
 
-def _capture(inputs: Inputs, scratch: Path) -> Capture:
+def _capture(inputs: Inputs, scratch: Path) -> MappingInput:
     photos = load_photo_list(inputs["ingest.photos"])
     numbers = {photo.name: number for number, photo in enumerate(photos.photos, start=1)}
     pairs = json.loads(inputs["matches.pairs"].read_text(encoding="utf-8"))["pairs"]
-    return Capture(
+    return MappingInput(
         database=inputs["matches.database"],
         features=inputs["features.database"],
         colours=np.load(inputs["features.colours"]),
@@ -83,7 +83,7 @@ def _without_times(value: JSON) -> JSON:
     return [_without_times(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def _keypoint_counts(verified: Verified) -> npt.NDArray[np.int64]:
+def _keypoint_counts(verified: ViewGraph) -> npt.NDArray[np.int64]:
     return np.array([len(verified.keypoints[number]) for number in sorted(verified.keypoints)], np.int64)
 
 
@@ -117,7 +117,7 @@ def canonical(model: Model, colours: npt.NDArray[np.uint8], counts: npt.NDArray[
     return result
 
 
-def _summary(model: Model, found: Found, cameras: Sequence[JSON]) -> dict[str, JSON]:
+def _summary(model: Model, found: MappingResult, cameras: Sequence[JSON]) -> dict[str, JSON]:
     registered = set(model.reg_image_ids())
     names = found.verified.names
     return {

@@ -11,7 +11,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import MODEL
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.photos.undistortion import Placed, pinhole_model, place, read_flown, write_view
+from splatpipe.pipeline.photos.undistortion import RegisteredPhoto, pinhole_model, place, read_flown, write_view
 from splatpipe.pipeline.sfm.sparse_model import write_model
 
 
@@ -28,7 +28,7 @@ def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) ->
     placed = place(model, photos, config.max_megapixels, report)
     dataset = out / "dataset"
 
-    def work(view: Placed) -> None:
+    def work(view: RegisteredPhoto) -> None:
         write_view(view, inputs, dataset)
 
     threads_before = cv2.getNumThreads()

@@ -14,8 +14,8 @@ from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divide
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths, finer_lengths
 from splatpipe.pipeline.train.lengths import (
     WINDOW_PIXELS,
-    Footage,
     Length,
+    PhotoSizes,
     growth_until,
     lengths,
     lengths_of,
@@ -240,13 +240,13 @@ class Work:
         return min(self.size.megapixels, self.config.undistort.max_megapixels)
 
     @property
-    def footage(self) -> Footage:
+    def footage(self) -> PhotoSizes:
         """The photos as they are trained on, those for which memory has room windows included."""
         height = math.sqrt(MEGA * self.trained_at * self.size.shape)
         window, limit = WINDOW_PIXELS["cpu"], self.config.train.max_memory_bytes
         if limit:
             window = window_within(limit - LIBRARIES_BYTES - FIXED_BYTES, window)
-        return Footage(((max(1, round(height / self.size.shape)), max(1, round(height)), self.size.photos),), window)
+        return PhotoSizes(((max(1, round(height / self.size.shape)), max(1, round(height)), self.size.photos),), window)
 
     @property
     def window(self) -> float:
@@ -280,7 +280,7 @@ class Work:
         return self._training(self.blocks.footage, self.blocks.coarse, self.blocks.coarse_gaussians)
 
     @staticmethod
-    def _training(footage: Footage, lengths: Sequence[Length], gaussians: float, frozen: float = 0.0) -> float:
+    def _training(footage: PhotoSizes, lengths: Sequence[Length], gaussians: float, frozen: float = 0.0) -> float:
         done, total = 0, 0.0
         for stretch in stretches(footage, lengths):
             count, share = stretch.until - done, footage.share(stretch.look)

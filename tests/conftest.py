@@ -110,7 +110,7 @@ def browser() -> Iterator[Browser]:
 
 
 @dataclass
-class Watched:
+class WatchedPage:
     """A page, with all that it asked for and complained of since it was opened."""
 
     page: Page
@@ -131,15 +131,15 @@ class Watched:
 
 
 @pytest.fixture
-def open_page(browser: Browser) -> Iterator[Callable[..., Watched]]:
+def open_page(browser: Browser) -> Iterator[Callable[..., WatchedPage]]:
     """``open_page(address, width=1440, height=900, touch=False)``: a page of a fresh profile, watched throughout."""
     contexts = []
 
-    def open_page(address: str, width: int = 1440, height: int = 900, touch: bool = False) -> Watched:
+    def open_page(address: str, width: int = 1440, height: int = 900, touch: bool = False) -> WatchedPage:
         context = browser.new_context(viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch)
         context.set_default_timeout(1000.0 * PATIENCE_S)
         contexts.append(context)
-        watched = Watched(context.new_page())
+        watched = WatchedPage(context.new_page())
         watched.open(address)
         return watched
 

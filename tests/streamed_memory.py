@@ -13,8 +13,8 @@ import numpy as np
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.stream import PhotoStream
+from splatpipe.pipeline.train.windows import TrainingSize
 
 
 def main(picture: str, cache: str, few: str, many: str, epochs: str) -> None:
@@ -22,7 +22,7 @@ def main(picture: str, cache: str, few: str, many: str, epochs: str) -> None:
     camera = Camera("photo", width, height, width, width, width / 2, height / 2, np.eye(4))
     for count in (int(few), int(many)):
         views = [View(replace(camera, name=str(number)), Path(picture), None) for number in range(count)]
-        with PhotoStream.over(views, [Look()] * (count * int(epochs)), 0, 1, Path(cache)) as photos:
+        with PhotoStream.over(views, [TrainingSize()] * (count * int(epochs)), 0, 1, Path(cache)) as photos:
             assert sum(float(photo.colour[0, 0, 0]) >= 0.0 for photo in photos) == count * int(epochs)
         print(peak_memory_bytes())
 

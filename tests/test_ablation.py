@@ -16,8 +16,8 @@ import ablation
 import comparison
 import tiny_scene
 import variants
-from commands import Command, End, run_all, splatpipe
-from finished import Finished, figures, work_folder
+from commands import Command, CommandEnd, run_all, splatpipe
+from finished import ResultLog, figures, work_folder
 
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.train.options import TrainConfig
@@ -184,7 +184,7 @@ def test_every_figure_of_a_run_is_kept_whatever_its_measures(tmp_path: Path) -> 
     (tmp_path / "metrics.json").write_text(json.dumps(metrics))
     (tmp_path / "stages/train-1").mkdir(parents=True)
     (tmp_path / "stages/train-1/history.json").write_text('{"curve": [{"loss": 0.5}, {"loss": NaN}]}')
-    found = figures(tmp_path, End(Command("a", (), tmp_path / "log"), "", 2.0, 3.0), 4)
+    found = figures(tmp_path, CommandEnd(Command("a", (), tmp_path / "log"), "", 2.0, 3.0), 4)
     assert found == {
         "gaussians": 5,
         "megapixels": 0.2,
@@ -201,11 +201,11 @@ def test_every_figure_of_a_run_is_kept_whatever_its_measures(tmp_path: Path) -> 
 
 
 def test_results_survive_a_line_cut_off(tmp_path: Path) -> None:
-    Finished(tmp_path).add("one", {"psnr": 1.0})
+    ResultLog(tmp_path).add("one", {"psnr": 1.0})
     with (tmp_path / "results.jsonl").open("a") as file:
         file.write('{"key": "two", "ro')
-    Finished(tmp_path).add("three", {"psnr": 3.0})
-    assert Finished(tmp_path).rows == {"one": {"psnr": 1.0}, "three": {"psnr": 3.0}}
+    ResultLog(tmp_path).add("three", {"psnr": 3.0})
+    assert ResultLog(tmp_path).rows == {"one": {"psnr": 1.0}, "three": {"psnr": 3.0}}
 
 
 def test_a_work_folder_has_one_owner(tmp_path: Path) -> None:

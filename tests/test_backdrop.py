@@ -24,7 +24,7 @@ from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_sp
 from splatpipe.pipeline.train import schedule as scheduled
 from splatpipe.pipeline.train.backdrop import Backdrop
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.techniques import make_techniques
@@ -125,7 +125,7 @@ def test_outside_density_control_keeps_to_the_backdrops_share(monkeypatch: pytes
     views = tiny_scene.cameras()
     schedule = scheduled.resolve_schedule(config)
     start = tiny_scene.true_model()
-    plan = Plan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, len(start), 40)
+    plan = TrainingPlan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, len(start), 40)
     state = TrainState.begin(start, plan, make_techniques(plan, area=AREA))
     assert state.techniques.find(Backdrop) is not None
     for iteration in range(schedule.density.first, schedule.density.last + 1):
@@ -145,7 +145,7 @@ def test_without_a_boundary_nothing_ranks_or_removes() -> None:
     config = tiny_scene.plain(iterations=40)
     views = tiny_scene.cameras()
     schedule = scheduled.resolve_schedule(config)
-    plan = Plan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, 150, 40)
+    plan = TrainingPlan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, 150, 40)
     techniques, score = make_techniques(plan), torch.rand(150)
     assert techniques.find(Backdrop) is None
     assert techniques.ranked(score, tiny_scene.true_model(), schedule.density) is score

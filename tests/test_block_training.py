@@ -29,25 +29,25 @@ from splatpipe.pipeline.splat.free_space import free_space
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop, memory
-from splatpipe.pipeline.train.blocks.coarse import Limits, train_coarse
+from splatpipe.pipeline.train.blocks.coarse import TrainingLimits, train_coarse
+from splatpipe.pipeline.train.blocks.forecast import WindowScheme, block_outlooks, coarse_sights, footage_on
 from splatpipe.pipeline.train.blocks.needs import block_need
-from splatpipe.pipeline.train.blocks.outlook import Cut, block_outlooks, coarse_sights, footage_on
 from splatpipe.pipeline.train.blocks.partition import Cell, Partition
-from splatpipe.pipeline.train.blocks.prospect import Prospect, read_free_space, rows_of, write_free_space
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
+from splatpipe.pipeline.train.blocks.sample_mask import MARGINS, counted_samples
 from splatpipe.pipeline.train.blocks.schedules import block_schedule, share_at
-from splatpipe.pipeline.train.blocks.sight import Sight
-from splatpipe.pipeline.train.blocks.sighted import MARGINS, sighted
+from splatpipe.pipeline.train.blocks.scope import BlockScope, read_free_space, rows_of, write_free_space
 from splatpipe.pipeline.train.blocks.training import Block, BlockTask, SiteParts, train_block
 from splatpipe.pipeline.train.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.lengths import PART_VISITS, Footage
+from splatpipe.pipeline.train.lengths import PART_VISITS, PhotoSizes
 from splatpipe.pipeline.train.limits import FIXED_BYTES, PIXEL_BYTES
-from splatpipe.pipeline.train.looks import windows_of
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import resolve_schedule
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.windows import windows_of
 from splatpipe.stages import initialize
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
@@ -75,7 +75,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SiteParts:
     parts |= {"initialize.splat": folder / "init.ply", **tiny_scene.split_part(folder / "dataset", 4)}
     (folder / "coarse").mkdir()
     inputs = Inputs(parts, folder, machine=Machine("cpu", 1))
-    train_coarse(CONFIG, inputs, Limits(150, WINDOW), folder / "coarse", tiny_scene.Recorder())
+    train_coarse(CONFIG, inputs, TrainingLimits(150, WINDOW), folder / "coarse", tiny_scene.Recorder())
     return surveyed(
         SiteParts(folder / "dataset", parts["split.views"], folder / "coarse", folder / "prospects", PARTITION)
     )
@@ -88,11 +88,11 @@ def surveyed(site: SiteParts, config: TrainConfig = CONFIG, window: int = WINDOW
     points, tracks = load_points_and_tracks(site.dataset)
     cameras, seen = [view.camera for view in views], sights_of(site)
     outlooks = block_outlooks(config, views, seen, points.xyz, site.partition, window)
-    cut = Cut.of(config, *footage_on(config, cameras, window))
+    cut = WindowScheme.of(config, *footage_on(config, cameras, window))
     site.prospects.mkdir(exist_ok=True)
     for number, outlook in enumerate(outlooks):
         scene = (read_splat(site.coarse / "model.ply"), seen, points.xyz)
-        Prospect.of(site.partition, number, outlook.windows, cut, scene).write(site.prospects, number)
+        BlockScope.of(site.partition, number, outlook.windows, cut, scene).write(site.prospects, number)
     write_free_space(site.prospects, free_space(cameras, points.xyz, [tracks[each.name] for each in cameras]))
     return site
 
@@ -113,7 +113,7 @@ def digest(out: Path) -> str:
 
 
 def test_coarse_pass_trains_whole_photos_at_the_first_size(site: SiteParts) -> None:
-    plan = Plan.from_json((site.coarse / "plan.json").read_text())
+    plan = TrainingPlan.from_json((site.coarse / "plan.json").read_text())
     assert [(stretch.level, stretch.window_pixels) for stretch in plan.schedule.stretches] == [(1, 0)]
     assert len(read_splat(site.coarse / "model.ply")) <= 150 == plan.options.max_gaussians
     assert {path.name for path in site.coarse.iterdir()} - {loop.CHECKPOINT} == {
@@ -144,7 +144,7 @@ def test_outside_of_a_boundary_a_block_stays_coarse(site: SiteParts, undisturbed
     assert outside[0] > 1.25 * most >= outside[1] > 0  # a few wander out after the last step of density control
 
 
-class Killed(BaseException):
+class Kill(BaseException):
     """Stands for a kill."""
 
 
@@ -152,7 +152,7 @@ def step_with(patch: pytest.MonkeyPatch, look: Callable[[TrainState, TrainingPho
     """Let ``look`` see each iteration before it begins."""
     step = loop.iterate
 
-    def looking(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def looking(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         look(state, photo)
         step(state, plan, photo)
 
@@ -213,9 +213,9 @@ def test_killed_block_goes_on_with_other_threads_and_ends_with_the_same_bits(
 ) -> None:
     def look(state: TrainState, photo: TrainingPhoto) -> None:
         if state.iteration == 31:
-            raise Killed
+            raise Kill
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
         step_with(patch, look)
@@ -245,11 +245,11 @@ def test_what_a_block_looks_at_reads_back_and_a_missing_file_is_told(site: SiteP
     for ours, theirs in zip(read.photos, made.photos, strict=True):
         assert ours.camera is theirs.camera and ours.near == theirs.near
         assert np.array_equal(ours.depth, theirs.depth) and np.array_equal(ours.box, theirs.box)
-    read_back = Prospect.read(site.prospects, 0)
+    read_back = BlockScope.read(site.prospects, 0)
     read_back.write(tmp_path, 0)
     assert (tmp_path / "block_1.npz").read_bytes() == (site.prospects / "block_1.npz").read_bytes()
     assert sorted(read_back.counted) == rows_of(read_back.windows) and len(read_back.around.rows) > 0
-    for read_missing in (lambda: Prospect.read(tmp_path, 1), lambda: read_free_space(tmp_path, cameras)):
+    for read_missing in (lambda: BlockScope.read(tmp_path, 1), lambda: read_free_space(tmp_path, cameras)):
         with pytest.raises(StageError, match="cannot be read") as raised:
             read_missing()
         assert "blocks" in raised.value.hint
@@ -263,11 +263,11 @@ def test_interrupt_leaves_a_checkpoint(site: SiteParts, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         step_with(patch, look)
         trained(site, tmp_path)
-    plan = Plan.from_json((tmp_path / "plan.json").read_text())
+    plan = TrainingPlan.from_json((tmp_path / "plan.json").read_text())
     assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts["iteration"] == 10
 
 
-def sights_of(site: SiteParts) -> list[Sight]:
+def sights_of(site: SiteParts) -> list[PhotoCoverage]:
     """What the photos that are trained on see."""
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
@@ -292,13 +292,13 @@ def test_what_counts_lies_near_the_cell_or_has_no_depth(site: SiteParts) -> None
         depth[:4, :4] = 0.0
         distances[:4, :4] = 0.0
         blind = replace(sight, depth=depth, observed=np.zeros(0, np.int64))
-        found = sighted(PARTITION, 0, blind, points.xyz)
+        found = counted_samples(PARTITION, 0, blind, points.xyz)
         near = distances <= (MARGINS - 0.01) * PARTITION.margin
         far = distances > MARGINS * PARTITION.margin * 2**0.5
         assert found[near].all() and not found[cv2.erode(far.astype(np.uint8), beside) > 0].any()
         assert 0.1 < found.mean() < 1.0
         # Thin things that the depth has not: only what is beside a point counts.
-        lost = sighted(enclosed, 0, replace(sight, depth=np.full_like(depth, 500.0)), points.xyz)
+        lost = counted_samples(enclosed, 0, replace(sight, depth=np.full_like(depth, 500.0)), points.xyz)
         observed = sight.of_points(points.xyz)
         inside = CELLS[0].contains(PARTITION.plan.places(observed.places))
         across, down = observed.pixels[inside].astype(int).T
@@ -313,12 +313,12 @@ def test_photos_come_with_what_counts_and_their_part_of_the_whole(
     def look(state: TrainState, photo: TrainingPhoto) -> None:
         photos.append(photo)
         if len(photos) == 60:
-            raise Killed
+            raise Kill
 
     step_with(monkeypatch, look)
     for name in ("plan.json", "frozen.ply"):
         (tmp_path / name).write_bytes((undisturbed / name).read_bytes())
-    with pytest.raises(Killed):
+    with pytest.raises(Kill):
         trained(site, tmp_path)
     half = "flight 1/photo_5.png"  # its mask leaves windows without a pixel
     assert {photo.camera.name for photo in photos if photo.is_empty} <= {half}
@@ -336,9 +336,9 @@ def test_outlook_tells_what_a_block_does(site: SiteParts, undisturbed: Path) -> 
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     points, _ = load_points_and_tracks(site.dataset)
     outlook, _ = block_outlooks(CONFIG, views, sights_of(site), points.xyz, PARTITION, WINDOW)
-    plan = Plan.from_json((undisturbed / "plan.json").read_text())
+    plan = TrainingPlan.from_json((undisturbed / "plan.json").read_text())
     assert (outlook.photos, outlook.iterations) == (len(plan.train_views), plan.schedule.iterations)
-    assert outlook.parts == (len(Prospect.read(site.prospects, 0).windows[0]),)
+    assert outlook.parts == (len(BlockScope.read(site.prospects, 0).windows[0]),)
     density = plan.schedule.density
     assert outlook.steps == sum(map(density.is_step, range(1, plan.schedule.iterations + 1))) > 0
     assert outlook.pixels[0] <= WINDOW * outlook.parts[0]
@@ -346,7 +346,7 @@ def test_outlook_tells_what_a_block_does(site: SiteParts, undisturbed: Path) -> 
 
 def test_positions_move_as_fast_as_where_the_whole_has_as_many_gaussians() -> None:
     config = TrainConfig(iterations=1600, max_gaussians=60_000)
-    footage = Footage(((640, 420, 40),))
+    footage = PhotoSizes(((640, 420, 40),))
     whole = resolve_schedule(config, footage)
     # 800 of the iterations are the coarse pass's, and the whole has all of its Gaussians by then.
     assert share_at(config, footage, 1.0) == whole.density.last / 1600 == 0.5
@@ -371,7 +371,7 @@ def test_a_cell_that_nobody_sees_keeps_what_the_coarse_pass_has(site: SiteParts,
         tiny_scene.Recorder(),
     )
     assert summary["gaussians"] == summary["photos"] == 0 == len(read_splat(tmp_path / "model.ply"))
-    assert Plan.from_json((tmp_path / "plan.json").read_text()).schedule.iterations == 0
+    assert TrainingPlan.from_json((tmp_path / "plan.json").read_text()).schedule.iterations == 0
 
 
 def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
@@ -382,14 +382,14 @@ def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturb
             models.append(state.gaussians.detach().clone())
             around = state.drawn.detach().after(len(state.gaussians))
             assert all(torch.equal(getattr(around, name), getattr(frozen, name)) for name in PARAMETERS)
-            raise Killed
+            raise Kill
 
     for kernels in (kernels_on_cpu(), None):
         out = tmp_path / str(len(models))
         out.mkdir()
         for name in ("plan.json", "frozen.ply"):
             (out / name).write_bytes((undisturbed / name).read_bytes())
-        with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed), use_kernels(kernels):
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill), use_kernels(kernels):
             step_with(patch, look)
             trained(site, out)
     begun = Block.of(CONFIG, site, TASK, cpu()).start()

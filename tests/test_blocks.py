@@ -31,8 +31,8 @@ from splatpipe.pipeline.train.blocks.needs import (
     with_margin,
 )
 from splatpipe.pipeline.train.blocks.partition import NOBODY, Border, Cell, Partition
-from splatpipe.pipeline.train.blocks.sight import Sight, sights
-from splatpipe.pipeline.train.blocks.surroundings import seen_around
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, sights
+from splatpipe.pipeline.train.blocks.surroundings import visible_around
 from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.blocks.visibility import block_views, windows
 from splatpipe.pipeline.train.limits import FIXED_BYTES
@@ -61,11 +61,11 @@ def sparse(surface: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "p 3"]:
 
 
 @pytest.fixture(scope="module")
-def seen(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> list[Sight]:
+def seen(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> list[PhotoCoverage]:
     return building_site.site_sights(coarse, sparse)
 
 
-def divided(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"], cells: int) -> Partition:
+def divided(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"], cells: int) -> Partition:
     return cut(work_map(PLAN, site(PLAN, seen, sparse), seen, sparse), cells)
 
 
@@ -88,7 +88,9 @@ def test_line_of_a_plan_knows_its_sides() -> None:
 
 
 @pytest.mark.parametrize("cells", [1, 2, 3, 4, 7, 16])
-def test_cells_share_points_and_pixels(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"], cells: int) -> None:
+def test_cells_share_points_and_pixels(
+    seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"], cells: int
+) -> None:
     work = work_map(PLAN, site(PLAN, seen, sparse), seen, sparse)
     partition = cut(work, cells)
     assert len(partition.cells) == cells
@@ -99,7 +101,7 @@ def test_cells_share_points_and_pixels(seen: list[Sight], sparse: Float64[np.nda
     assert math.isclose(partition.margin, 0.1 * math.sqrt(sum(cell.area for cell in partition.cells) / cells))
 
 
-def test_every_place_of_the_site_has_one_owner(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
+def test_every_place_of_the_site_has_one_owner(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]) -> None:
     partition = divided(seen, sparse, 7)
     places = np.random.default_rng(2).uniform([-5.0, -5.0, -3.0], [53.0, 29.0, 9.0], (4000, 3))
     corners = np.array([corner for cell in partition.cells for corner in (cell.low, cell.high)])
@@ -115,7 +117,7 @@ def test_every_place_of_the_site_has_one_owner(seen: list[Sight], sparse: Float6
 
 
 def test_what_lies_beyond_the_site_belongs_to_the_nearest_cell(
-    seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]
+    seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     partition = divided(seen, sparse, 7)
     bounds = np.array([[*cell.low, *cell.high] for cell in partition.cells])
@@ -134,7 +136,7 @@ def test_what_lies_beyond_the_site_belongs_to_the_nearest_cell(
     assert not partition.trained_by(0, broken).any()
 
 
-def test_borders_are_where_owners_change(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
+def test_borders_are_where_owners_change(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]) -> None:
     partition = divided(seen, sparse, 7)
     borders = partition.borders()
     for border in borders:
@@ -154,7 +156,9 @@ def test_neighbours_along_one_edge_have_a_border_each() -> None:
     assert lines == along | {((1, 2), (1.0, 2.0), (2.0, 2.0))}
 
 
-def test_partition_is_the_same_again_and_reads_back(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
+def test_partition_is_the_same_again_and_reads_back(
+    seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
+) -> None:
     facts = json.dumps(divided(seen, sparse, 5).facts())
     assert json.dumps(divided(seen, sparse, 5).facts()) == facts
     assert json.dumps(divided(list(reversed(seen)), sparse, 5).facts()) == facts  # whatever the photos' order
@@ -165,7 +169,7 @@ def test_partition_is_the_same_again_and_reads_back(seen: list[Sight], sparse: F
 
 
 def test_background_and_wrong_depths_do_not_widen_the_site(
-    seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]
+    seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     extent = site(PLAN, seen, sparse)
     for low, high, size in zip(extent.low, extent.high, (building_site.LENGTH, building_site.WIDTH), strict=True):
@@ -175,7 +179,7 @@ def test_background_and_wrong_depths_do_not_widen_the_site(
         depth = sight.depth.copy()
         depth[:12] *= 40.0  # a seventh of each photo shows hills
         depth[40, ::29] *= 0.4  # and a few pixels something that is not there
-        changed.append(Sight(sight.camera, sight.grid, depth, None, sight.observed))
+        changed.append(PhotoCoverage(sight.camera, sight.grid, depth, None, sight.observed))
     assert np.allclose(site(PLAN, changed, sparse).low, extent.low, atol=1.5)
     assert np.allclose(site(PLAN, changed, sparse).high, extent.high, atol=1.5)
     ring = np.array([[10.0, 0.0], [20.0, 0.0], [20.0, 24.0], [10.0, 24.0]])
@@ -183,19 +187,19 @@ def test_background_and_wrong_depths_do_not_widen_the_site(
     assert drawn.low[0] >= 10.0 and drawn.high[0] <= 20.0
 
 
-def test_a_flat_cloud_of_points_alone_is_cut(seen: list[Sight]) -> None:
+def test_a_flat_cloud_of_points_alone_is_cut(seen: list[PhotoCoverage]) -> None:
     line = np.column_stack([np.linspace(0.0, 10.0, 400), np.full(400, 3.0), np.zeros(400)])
     rows = np.arange(400)
-    flat = [Sight(sight.camera, sight.grid, None, None, rows) for sight in seen]
+    flat = [PhotoCoverage(sight.camera, sight.grid, None, None, rows) for sight in seen]
     partition = divided(flat, line, 4)
     assert np.bincount(partition.owners(line) + 1, minlength=5)[1:].min() >= 60
     with pytest.raises(ValueError, match="sees"):
-        site(PLAN, [Sight(s.camera, s.grid, None, None, rows[:0]) for s in seen], line)
+        site(PLAN, [PhotoCoverage(s.camera, s.grid, None, None, rows[:0]) for s in seen], line)
     with pytest.raises(ValueError, match="bins"):
         cut(work_map(PLAN, site(PLAN, flat, line), flat, line), 2 * BINS)
 
 
-def test_block_sees_its_cell_whole_and_by_sight(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
+def test_block_sees_its_cell_whole_and_by_sight(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]) -> None:
     partition = divided(seen, sparse, 4)
     views = block_views(partition, seen, sparse, building_site.quarters)
     whole = sum(sight.camera.width * sight.camera.height for sight in seen)
@@ -212,7 +216,9 @@ def test_block_sees_its_cell_whole_and_by_sight(seen: list[Sight], sparse: Float
             assert shown <= 0.08 * seen[number].pixels
 
 
-def test_work_of_a_block_is_told_before_anything_is_cut(seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]) -> None:
+def test_work_of_a_block_is_told_before_anything_is_cut(
+    seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
+) -> None:
     pixels = sum(sight.pixels for sight in seen)
     window = math.sqrt(80 * 60) * building_site.HEIGHT / building_site.FOCAL
     area = building_site.LENGTH * building_site.WIDTH
@@ -224,7 +230,7 @@ def test_work_of_a_block_is_told_before_anything_is_cut(seen: list[Sight], spars
     assert round_pixels(pixels, 2, 100.0 * window, area) == pixels  # each block sees all, and no more than all
 
 
-def test_windows_are_those_of_training(seen: list[Sight]) -> None:
+def test_windows_are_those_of_training(seen: list[PhotoCoverage]) -> None:
     camera = seen[0].camera
     assert windows(camera, 0).tolist() == [[0, 0, camera.width, camera.height]]
     parts = windows(camera, 5000)
@@ -250,7 +256,7 @@ def test_a_building_hides_the_ground_behind_it(coarse: Gaussians, sparse: Float6
 
 
 def test_without_a_coarse_model_points_say_what_is_seen(
-    coarse: Gaussians, seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]
+    coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     by_points = building_site.site_sights(coarse, sparse, by_depth=False)
     assert math.isclose(sum(by_points[0].samples(sparse).weights), by_points[0].pixels)
@@ -279,7 +285,7 @@ def test_masked_pixels_are_no_work(coarse: Gaussians, sparse: Float64[np.ndarray
 
 
 def test_surroundings_leave_the_blocks_photos_as_they_are(
-    coarse: Gaussians, seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]
+    coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     """What a block draws, trained and frozen, looks in its photos like the whole; thinned, nearly so."""
     partition = divided(seen, sparse, 4)
@@ -287,7 +293,7 @@ def test_surroundings_leave_the_blocks_photos_as_they_are(
     cuts = [building_site.quarters(sight.camera) for sight in seen]
     for block in (0, 3):
         view, worst = (views[block], seen, cuts), []
-        found = seen_around(partition, block, coarse, view)
+        found = visible_around(partition, block, coarse, view)
         trained = partition.trained_by(block, coarse.means.double().numpy())
         whole = found.within(coarse, len(coarse))
         assert len(found.rows) == len(whole) < len(coarse) - trained.sum()
@@ -302,7 +308,7 @@ def test_surroundings_leave_the_blocks_photos_as_they_are(
         assert worst[0] > 45.0 and worst[1] > 24.0 and worst[1] > worst[2] + 3.0
 
 
-def _likeness(whole: Gaussians, drawn: Gaussians, sight: Sight, parts: np.ndarray) -> float:
+def _likeness(whole: Gaussians, drawn: Gaussians, sight: PhotoCoverage, parts: np.ndarray) -> float:
     pictures = [render(model, sight.camera, building_site.OPTIONS).colour for model in (whole, drawn)]
     square = np.square((pictures[0] - pictures[1]).numpy())
     shown = [square[top:bottom, left:right].ravel() for left, top, right, bottom in parts.tolist()]
@@ -351,7 +357,7 @@ def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:
     return whole
 
 
-class Read:
+class ModelSource:
     """Makes models when they are asked for, and notes whether one that was made before is alive then."""
 
     def __init__(self, models: Mapping[int, Gaussians]) -> None:
@@ -367,7 +373,7 @@ class Read:
 
 
 def test_merge_takes_each_gaussian_once_in_any_order(
-    coarse: Gaussians, seen: list[Sight], sparse: Float64[np.ndarray, "p 3"]
+    coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     partition = divided(seen, sparse, 4)
     means = coarse.means.double().numpy()
@@ -391,12 +397,12 @@ def test_merge_takes_each_gaussian_once_in_any_order(
 
 
 def test_blocks_are_merged_one_at_a_time_to_the_bytes_of_all_at_once(
-    coarse: Gaussians, seen: list[Sight], sparse: Float64[np.ndarray, "p 3"], tmp_path: Path
+    coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"], tmp_path: Path
 ) -> None:
     partition = divided(seen, sparse, 4)
     means = coarse.means.double().numpy()
     trained = {n: coarse.select(torch.from_numpy(partition.trained_by(n, means))) for n in range(4)}
-    read = Read(trained)
+    read = ModelSource(trained)
     count, degree = counted(partition, read)
     write_splat_parts(tmp_path / "merged.ply", own_pieces(partition, read), count, degree, ["a comment"])
     assert read.order == 2 * [0, 1, 2, 3] and read.alive == 0

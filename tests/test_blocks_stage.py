@@ -231,7 +231,7 @@ def test_any_order_any_threads_and_a_kill_in_a_block_give_the_same_bits(
     assert {name: found[name] for name in wanted} == wanted
 
 
-class Killed(BaseException):
+class Kill(BaseException):
     """Stands for a kill."""
 
 
@@ -241,9 +241,9 @@ def test_a_coarse_pass_that_is_done_is_not_made_again(
     config = TrainConfig(**QUICK)
 
     def killed(*_arguments: object) -> None:
-        raise Killed
+        raise Kill
 
-    with monkeypatch.context() as patch, pytest.raises(Killed):
+    with monkeypatch.context() as patch, pytest.raises(Kill):
         patch.setattr(blocks, "lay_out", killed)
         blocks.run(BlocksConfig(least=3), inputs(scene, config), tmp_path, tiny_scene.Recorder())
     monkeypatch.setattr(blocks, "train_coarse", killed)
@@ -275,12 +275,12 @@ def test_a_coarse_pass_is_told_to_be_done_once_its_files_are_on_the_disk(
         tell(path, content)
 
     def killed(*_arguments: object) -> None:
-        raise Killed
+        raise Kill
 
     for name, stand_in in (("train_coarse", coarse), ("write_durably", told), ("lay_out", killed)):
         monkeypatch.setattr(blocks, name, stand_in)
     monkeypatch.setattr(os, "fsync", noted)
-    with pytest.raises(Killed):
+    with pytest.raises(Kill):
         blocks.run(BlocksConfig(least=3), inputs(scene, TrainConfig(**QUICK)), tmp_path, tiny_scene.Recorder())
     assert json.loads((tmp_path / "coarse.json").read_text()) == {"iterations": 1}
 

@@ -15,7 +15,7 @@ from splatpipe.pipeline.app.preflight.boundary import boundary_findings
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.photos.scan import Candidate
 from splatpipe.pipeline.survey import boundary_file
 from splatpipe.pipeline.survey.boundary import lay_boundary
@@ -308,7 +308,7 @@ def test_the_command_lines_file_is_the_option_and_set_has_the_last_word() -> Non
 def stated() -> tuple[Position, ...]:
     """What some photos of the demo state of their places."""
     names = [f"DJI_00{number:02d}.JPG" for number in (1, 8, 16, 24)]
-    checked = [check_photo(Candidate(name, capture_path() / name), Limits(320, 10**8)) for name in names]
+    checked = [check_photo(Candidate(name, capture_path() / name), PictureLimits(320, 10**8)) for name in names]
     return read_positions([photo for photo in checked if isinstance(photo, CheckedPhoto)]).positions
 
 

@@ -26,16 +26,16 @@ from splatpipe.pipeline.train.budget import (
     FEWEST_GAUSSIANS,
     SCHEDULE_SHARE,
     SMALLEST_MEGAPIXELS,
-    Choice,
+    BudgetChoice,
+    BudgetTask,
     Speed,
-    Task,
     Timing,
     choose,
     fit_speed,
     forecast,
 )
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, Footage, lengths_of
+from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, PhotoSizes, lengths_of
 from splatpipe.pipeline.train.limits import (
     FEWEST,
     FIXED_BYTES,
@@ -44,12 +44,12 @@ from splatpipe.pipeline.train.limits import (
     SMALLEST_WINDOW,
     bytes_per_gaussian,
 )
-from splatpipe.pipeline.train.measure import Measured, middle_of
+from splatpipe.pipeline.train.measure import MachineSpeed, middle_of
 from splatpipe.pipeline.train.memory import resident_bytes
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan import Plan, duration, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, duration, make_plan
 from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.start import Start
+from splatpipe.pipeline.train.start import InitialGaussians
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import evaluate, initialize, train
@@ -141,7 +141,7 @@ def test_a_speed_tells_apart_what_windows_leave_out() -> None:
 
 
 def test_a_forecast_counts_windows_as_they_are_cut() -> None:
-    footage = Footage(((2304, 1728, 50),), 500_000)
+    footage = PhotoSizes(((2304, 1728, 50),), 500_000)
     schedule = resolve_schedule(TrainConfig(least_iterations=1000, max_gaussians=50_000), footage)
     speed, looks = replace(SPEED, seen_s=5e-7), schedule.looks_to(schedule.iterations)
     assert len(set(looks)) == 3
@@ -163,7 +163,9 @@ def test_the_window_that_is_timed_is_the_middle_of_its_photo() -> None:
 
 def test_a_size_whose_parts_would_be_seen_too_seldom_loses_to_the_one_before() -> None:
     sizes = ((2304, 1728, 50),)
-    tasks = [Task(tiny_scene.plain(), 8_000, 0, sizes, 500_000, SPEED, 0.0, s) for s in (15.0, 60.0, 240.0, 3600.0)]
+    tasks = [
+        BudgetTask(tiny_scene.plain(), 8_000, 0, sizes, 500_000, SPEED, 0.0, s) for s in (15.0, 60.0, 240.0, 3600.0)
+    ]
     chosen = [choose(task) for task in tasks]
     found = [choice.options.max_megapixels or tasks[0].megapixels for choice in chosen]
     assert found == sorted(found) and found[0] < 1.0 < found[-1] == tasks[0].megapixels
@@ -187,16 +189,16 @@ def test_forecast_is_the_sum_over_the_iterations() -> None:
     schedule = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
     levels = [look.level for look in schedule.looks_to(2400)]
     each = [SPEED.seconds(room_at(schedule.density, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
-    assert forecast(SPEED, schedule, 8_000, Footage(((800, 500, 32),))) == pytest.approx(math.fsum(each), rel=0.01)
+    assert forecast(SPEED, schedule, 8_000, PhotoSizes(((800, 500, 32),))) == pytest.approx(math.fsum(each), rel=0.01)
 
 
-def task_of(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Task:
+def task_of(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> BudgetTask:
     """8,000 sparse points."""
     config = tiny_scene.plain(time_budget_s=seconds, max_gaussians=cap)
-    return Task(config, 8_000, 0, ((1000, round(1000 * size), photos),), 0, SPEED, 0.0, seconds)
+    return BudgetTask(config, 8_000, 0, ((1000, round(1000 * size), photos),), 0, SPEED, 0.0, seconds)
 
 
-def plan_for(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> Choice:
+def plan_for(seconds: float, photos: int = 30, size: float = 0.5, cap: int = 1_000_000) -> BudgetChoice:
     return choose(task_of(seconds, photos, size, cap))
 
 
@@ -259,8 +261,8 @@ def make_inputs(scene: Path, began_s: float = 0.0) -> Inputs:
     return Inputs(parts, scene, machine=Machine("cpu", 1, began_s))
 
 
-def read_plan(out: Path) -> Plan:
-    return Plan.from_json((out / "plan.json").read_text())
+def read_plan(out: Path) -> TrainingPlan:
+    return TrainingPlan.from_json((out / "plan.json").read_text())
 
 
 def digest(out: Path) -> str:
@@ -289,7 +291,7 @@ def test_time_that_is_gone_before_training_leaves_a_look_and_one_warning(scene: 
     assert summary["iterations"] >= 1
 
 
-def trained(scene: Path, out: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch) -> tiny_scene.Recorder:
+def trained(scene: Path, out: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch) -> tiny_scene.Recorder:
     """Train by a plan that was made before: measuring again would fail the test."""
     out.mkdir(exist_ok=True)
     if not (out / "plan.json").exists():
@@ -301,31 +303,31 @@ def trained(scene: Path, out: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture
-def plan(scene: Path, tmp_path: Path) -> Plan:
+def plan(scene: Path, tmp_path: Path) -> TrainingPlan:
     """One of a budget, with fewer iterations than it has time for."""
     (tmp_path / "first").mkdir()
     train.run(TrainConfig(iterations=60), make_inputs(scene), tmp_path / "first", tiny_scene.Recorder())
     made = read_plan(tmp_path / "first")
     budgeted = made.options.model_copy(update={"time_budget_s": 600.0})
-    return Plan(**{**vars(made), "options": budgeted, "megapixels": 0.002, "train_seconds": 500.0})
+    return TrainingPlan(**{**vars(made), "options": budgeted, "megapixels": 0.002, "train_seconds": 500.0})
 
 
-class Killed(BaseException):
+class Kill(BaseException):
     """Stands for a kill."""
 
 
 def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
-    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+    scene: Path, tmp_path: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained(scene, tmp_path / "whole", plan, monkeypatch)
     step = loop.iterate
 
-    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == 31:
-            raise Killed
+            raise Kill
         step(state, plan, photo)
 
-    with monkeypatch.context() as patch, pytest.raises(Killed):
+    with monkeypatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
         patch.setattr(loop, "iterate", dying)
@@ -338,10 +340,10 @@ def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
 
 
 def test_the_deadline_ends_after_a_whole_iteration_that_is_as_without_it(
-    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+    scene: Path, tmp_path: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained(scene, tmp_path / "whole", plan, monkeypatch)
-    short = Plan(**{**vars(plan), "train_seconds": 1e-9})
+    short = TrainingPlan(**{**vars(plan), "train_seconds": 1e-9})
     recorder = trained(scene, tmp_path / "short", short, monkeypatch)
     assert "its time is up after 1 of 60 planned iterations" in recorder.notes[-1]
     curve = json.loads((tmp_path / "short/history.json").read_text())["curve"]
@@ -350,10 +352,10 @@ def test_the_deadline_ends_after_a_whole_iteration_that_is_as_without_it(
 
 
 def test_iterations_beyond_the_schedule_fill_the_time_and_change_none_before(
-    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+    scene: Path, tmp_path: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained(scene, tmp_path / "schedule", plan, monkeypatch)
-    recorder = trained(scene, tmp_path / "longer", Plan(**{**vars(plan), "last_iteration": 80}), monkeypatch)
+    recorder = trained(scene, tmp_path / "longer", TrainingPlan(**{**vars(plan), "last_iteration": 80}), monkeypatch)
     assert recorder.steps[-1] == (80, 80) and recorder.notes == [plan.described()]
     longer, schedule = (json.loads((tmp_path / name / "history.json").read_text()) for name in ("longer", "schedule"))
     assert longer["density"] == schedule["density"]
@@ -364,7 +366,7 @@ def test_iterations_beyond_the_schedule_fill_the_time_and_change_none_before(
 
 
 def test_photos_are_trained_on_at_the_planned_size_and_measured_at_the_datasets(
-    scene: Path, tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+    scene: Path, tmp_path: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     trained(scene, out, plan, monkeypatch)
@@ -389,7 +391,7 @@ def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused
 
 
 def test_memory_that_holds_the_sparse_points_takes_dense_ones_without_a_warning(
-    plan: Plan, monkeypatch: pytest.MonkeyPatch
+    plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "resident_bytes", lambda: 0)
     pixels = tiny_scene.WIDTH * tiny_scene.HEIGHT
@@ -491,12 +493,12 @@ def test_growth_ends_where_memory_runs_out_all_the_same_and_pruning_goes_on(
 def test_a_budget_long_enough_for_a_film_keeps_time_for_it() -> None:
     """Ten seconds of film take as long as measuring forty photos; shorter budgets have no film."""
     views = [View(camera, Path("photo.jpg"), None) for camera in tiny_scene.cameras()]
-    measured = Measured(SPEED, 0.0, 2.0)
+    measured = MachineSpeed(SPEED, 0.0, 2.0)
     left = []
     for budget in (FILM_FROM_BUDGET_S - 1.0, FILM_FROM_BUDGET_S):
         config = TrainConfig(time_budget_s=budget)
         plan = make_plan(config, views, tiny_scene.split_of(views, 4), 100)
-        scene = planning.Scene(config, Start(tiny_scene.true_model(), 100), views, 3, Machine())
+        scene = planning.PlanningInput(config, InitialGaussians(tiny_scene.true_model(), 100), views, 3, Machine())
         left.append(planning._task(plan, scene, measured, 500.0).seconds)
     size = 1e-6 * tiny_scene.WIDTH * tiny_scene.HEIGHT
     assert left[0] - left[1] == pytest.approx(planning.FILM_VIEWS * 2.0 * size)

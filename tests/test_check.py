@@ -23,7 +23,7 @@ from splatpipe.pipeline.engine.events import EventReporter
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.photos.detail import detail_at, levels_at
 from splatpipe.pipeline.survey.flight_gaps import find_missing
-from splatpipe.pipeline.survey.swapped_positions import Flight, find_swapped
+from splatpipe.pipeline.survey.swapped_positions import PositionEvidence, find_swapped
 from splatpipe.stages.line import LINE
 
 RING = range(1, 17)  # photos of the demo's lower orbit
@@ -151,24 +151,24 @@ def test_swapped_positions_are_told_by_matches_and_the_way_and_right_ones_are_no
     places, times = lines(4, 10)
     matches = seen_together(places)
     noisy = places + np.random.default_rng(0).normal(0.0, 1.0, places.shape)
-    assert find_swapped(Flight(noisy, times, matches)) == []
+    assert find_swapped(PositionEvidence(noisy, times, matches)) == []
     for pair in ((3, 4), (5, 27), (0, 39), (12, 15)):
         wrong = noisy.copy()
         wrong[list(pair)] = wrong[list(pair)[::-1]]
-        assert find_swapped(Flight(wrong, times, matches)) == [pair]
+        assert find_swapped(PositionEvidence(wrong, times, matches)) == [pair]
         unknown = np.full(len(times), np.nan)
         if np.linalg.norm(places[pair[0]] - places[pair[1]]) > 50.0:
-            assert find_swapped(Flight(wrong, unknown, matches)) == [pair]
+            assert find_swapped(PositionEvidence(wrong, unknown, matches)) == [pair]
 
 
 def test_turns_between_lines_are_no_gaps_and_missing_photos_are() -> None:
     places, times = lines(4, 10)
     names = [f"IMG_{number:04d}.JPG" for number in range(40)]
-    assert find_missing(names, Flight(places, times, {})) == []
+    assert find_missing(names, PositionEvidence(places, times, {})) == []
     kept = [number for number in range(40) if number not in (14, 15, 16)]
     renamed = [f"photo {number}.JPG" for number in range(37)]
     for called in ([names[number] for number in kept], renamed):
-        strips = find_missing(called, Flight(places[kept], times[kept], {}))
+        strips = find_missing(called, PositionEvidence(places[kept], times[kept], {}))
         assert [(strip.before, strip.after, strip.missing) for strip in strips] == [(13, 14, 3)]
 
 

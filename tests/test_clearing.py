@@ -12,7 +12,7 @@ import torch
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.splat.free_space import FreeSpace, near_or_free
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.clearing import STEPS_BETWEEN, Clearing, free_space_of
+from splatpipe.pipeline.train.floater_pruning import STEPS_BETWEEN, FloaterPruning, free_space_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.pipeline.train.schedule import resolve_schedule
@@ -57,7 +57,7 @@ def space(dataset: Path) -> FreeSpace:
 
 
 def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: FreeSpace) -> None:
-    gaussians, clearing = haze_and_wall(), Clearing(space, SCHEDULE)
+    gaussians, clearing = haze_and_wall(), FloaterPruning(space, SCHEDULE)
     found = clearing.unwanted(gaussians, LOOKS)
     assert found is not None and found.tolist() == [True] * 4 + [False] * 4
     assert torch.equal(found, near_or_free(gaussians, space, 2))
@@ -68,7 +68,7 @@ def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: Free
 def test_density_control_takes_it_away(dataset: Path, space: FreeSpace, density: str) -> None:
     config = TrainConfig.model_validate({"prune_free_space": 2, "density": density})
     plan = make_plan(config, load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
-    state = TrainState.begin(haze_and_wall(), plan, Techniques((Clearing(space, plan.schedule),)))
+    state = TrainState.begin(haze_and_wall(), plan, Techniques((FloaterPruning(space, plan.schedule),)))
     state.control_density(plan, LOOKS)
     assert len(state.gaussians) >= 4
     assert not near_or_free(state.gaussians.detach(), space, 2).any()
@@ -78,10 +78,10 @@ def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: 
     plan = make_plan(TrainConfig(prune_free_space=2), load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     step = STEPS_BETWEEN * plan.schedule.density.every
     after = (plan.schedule.density.last // step + 1) * step
-    clearing = Clearing(space, plan.schedule)
+    clearing = FloaterPruning(space, plan.schedule)
     assert clearing.is_due(after) and not clearing.is_due(after + 1)
     assert not clearing.is_due(plan.schedule.iterations)
-    state = TrainState.begin(haze_and_wall(), plan, Techniques((Clearing(space, plan.schedule),)))
+    state = TrainState.begin(haze_and_wall(), plan, Techniques((FloaterPruning(space, plan.schedule),)))
     before = state.gaussians.detach().select(torch.arange(4, 8))
     state.control_density(plan, after)
     for name, tensor in before.tensors().items():
@@ -95,4 +95,4 @@ def test_nobody_asks_nothing_is_looked_at(dataset: Path) -> None:
     views = load_views(dataset)
     for times, found in ((0, False), (1, True)):
         plan = make_plan(TrainConfig(prune_free_space=times), views, tiny_scene.split_of(views), 8)
-        assert (make_techniques(plan, None, views, dataset).find(Clearing) is not None) == found
+        assert (make_techniques(plan, None, views, dataset).find(FloaterPruning) is not None) == found

@@ -20,12 +20,12 @@ from splatpipe.pipeline.raster.rasterizer import render
 from splatpipe.pipeline.splat.formats import compressed_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from some_splats import some_gaussians
 
-FACTS = SceneFacts("y down", True, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
+FACTS = SceneFacts("y down", True, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
 SH_C0 = 0.28209479177387814
 
 

@@ -18,10 +18,10 @@ from splatpipe.pipeline.train.draws import SPLIT_POSITION, uniform
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from checking import Truth
+from checking import ReferenceResult
 from exact import case_of, exact_outcome
 from faults import FAULTS, planted
-from frames import Case
+from frames import RenderCase
 from random_scene import random_camera, random_scene
 from training import KEY, Draws, Loss
 
@@ -30,7 +30,7 @@ MORTON_BITS = 21  # an axis
 assert KEY[2] == SPLIT_POSITION
 
 
-def ending() -> Case:
+def ending() -> RenderCase:
     """Pixels end behind a few of many; equal depths; a grid of 3 x 2 tiles with parts of tiles."""
     scene = random_scene(3, 220, 1, size=-0.8)
     scene.opacity_logits += 2.5
@@ -40,14 +40,14 @@ def ending() -> Case:
     return case_of(scene, camera, background=(0.9, 0.5, 0.1))
 
 
-def long() -> Case:
+def long() -> RenderCase:
     """Over more tile rows than a thread takes on by itself; a part of a picture, at the limits of the whole."""
     scene = random_scene(13, 120, 0, size=-1.5)
     scene.log_scales[:, 0] += 2.0
     return case_of(scene, random_camera(13, 60, 180).cut(15, 10, 20, 150), depths=False, magnitudes=True)
 
 
-def many() -> Case:
+def many() -> RenderCase:
     """More than the blocks of a device of one multiprocessor take in a turn, most of them out of sight."""
     scene = random_scene(8, 7000, 0, size=-3.2)
     scene.means[:, 0] = scene.means[:, 0].abs() * 0.6 + 0.1
@@ -57,7 +57,7 @@ def many() -> Case:
     return case_of(scene, camera)
 
 
-def many_tiles() -> Case:
+def many_tiles() -> RenderCase:
     """More tiles than a digit of their sort tells apart."""
     scene = random_scene(6, 60, 0, size=-2.0)
     scene.means[:, :2] *= 4.0
@@ -99,7 +99,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """What was found with no fault alive, and with each."""
     frames = [(case, exact_outcome(case)) for case in (ending(), long(), many())]
     large = many_tiles()
-    truth = Truth(frames, loss(), draws(), (large, exact_outcome(large, gradients=False)))
+    truth = ReferenceResult(frames, loss(), draws(), (large, exact_outcome(large, gradients=False)))
     path = tmp_path_factory.mktemp("faults") / "truth.pickle"
     path.write_bytes(pickle.dumps(truth))
     command = [sys.executable, str(HARNESS / "checking.py"), str(planted()), str(path), str(len(FAULTS))]

@@ -33,7 +33,7 @@ STEP_SHARE = 0.02
 
 
 @dataclass(frozen=True)
-class Place:
+class DeviceSetup:
     """Where the kernels run, and how much of a scene they are given there.
 
     Attributes:
@@ -61,17 +61,19 @@ class Place:
 
 
 @pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
-def place(request: pytest.FixtureRequest) -> Iterator[Place]:
+def place(request: pytest.FixtureRequest) -> Iterator[DeviceSetup]:
     if request.param == "cuda":
         if not torch.cuda.is_available():
             pytest.skip("no CUDA device")
         reason = why_not()
         assert reason is None, reason
         scene = random_scene(1, n=50_000, size=-4.0)
-        yield Place(None, torch.device("cuda", 0), scene, random_camera(1, 801, 499))
+        yield DeviceSetup(None, torch.device("cuda", 0), scene, random_camera(1, 801, 499))
     else:
         with use_kernels(None):  # what a test puts there is gone after it
-            yield Place(kernels_on_cpu(), torch.device("cpu"), random_scene(1, n=200, size=-2.0), random_camera(1))
+            yield DeviceSetup(
+                kernels_on_cpu(), torch.device("cpu"), random_scene(1, n=200, size=-2.0), random_camera(1)
+            )
 
 
 def photo_of(camera: Camera) -> Tensor:
@@ -79,7 +81,9 @@ def photo_of(camera: Camera) -> Tensor:
     return torch.rand(camera.height, camera.width, 3, generator=generator)
 
 
-def backward_at(place: Place | None, given: Place, options: RenderOptions) -> tuple[Tensor, dict[str, Tensor]]:
+def backward_at(
+    place: DeviceSetup | None, given: DeviceSetup, options: RenderOptions
+) -> tuple[Tensor, dict[str, Tensor]]:
     """The picture and every gradient, at a place or on the CPU."""
     device = torch.device("cpu") if place is None else place.device
     with use_kernels(None if place is None else place.kernels):
@@ -101,7 +105,7 @@ def test_renders_and_gradients_agree_with_the_cpus(place, options):
         assert (ours[name] - gradient).norm() <= GRADIENT_RTOL * gradient.norm(), name
 
 
-def train(place: Place | None, given: Place) -> list[Tensor]:
+def train(place: DeviceSetup | None, given: DeviceSetup) -> list[Tensor]:
     """A few iterations; everything that they changed, with the gradients on the screen."""
     device = torch.device("cpu") if place is None else place.device
     photo = photo_of(given.camera).to(device)

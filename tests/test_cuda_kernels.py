@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from agreement import flipped, gradient_complaints, picture_complaints, without_flips
 from building import FORWARD, HARNESS, REVERSE, SHUFFLED, build_on_cpu, kernel_sources
 from exact import case_of, exact_outcome
-from frames import Case, Frame, Outcome, controls, run
+from frames import DeviceFrame, RenderCase, RenderOutcome, controls, run
 from random_scene import random_camera, random_scene
 
 TILE = 16
@@ -50,7 +50,7 @@ def crowd(count: int, seed: int, size: float = -2.0, sh_degree: int = 1) -> Gaus
     return scene
 
 
-def in_one_tile() -> Case:
+def in_one_tile() -> RenderCase:
     """Everything small, in the tile with pixels 32..47 x 16..31; all others are empty."""
     camera = replace(random_camera(5, 50, 37), cam_from_world=np.eye(4))  # so that equal depths stay equal
     scene = crowd(1100, 5)
@@ -64,27 +64,27 @@ def in_one_tile() -> Case:
     return case_of(scene, camera)
 
 
-def opaque() -> Case:
+def opaque() -> RenderCase:
     """Pixels end early, behind a few of many."""
     scene = random_scene(3, 500, 0, size=-0.8)
     scene.opacity_logits += 3.0
     return case_of(scene, random_camera(3, 40, 33), background=(1.0, 1.0, 1.0))
 
 
-def left_half_empty() -> Case:
+def left_half_empty() -> RenderCase:
     scene = random_scene(7, 300, 3, size=-2.5)
     scene.means[:, 0] = scene.means[:, 0].abs() * 0.5 + 0.4
     return case_of(scene, random_camera(7, 200, 19), antialias=True, background=(0.1, 0.5, 0.9))
 
 
-def far_too_long() -> Case:
+def far_too_long() -> RenderCase:
     """Across more tile rows than a thread counts by itself, and hundreds of pairs each."""
     scene = random_scene(13, 40, 0, size=-1.0)
     scene.log_scales[:, 0] += 2.5
     return case_of(scene, random_camera(13, 50, 260))
 
 
-CASES: dict[str, Callable[[], Case]] = {
+CASES: dict[str, Callable[[], RenderCase]] = {
     "thousands": lambda: case_of(crowd(2500, 1, size=-1.3), random_camera(1, 45, 35), background=(0.2, 0.4, 0.6)),
     "one tile with everything": in_one_tile,
     "pixels that end": opaque,
@@ -100,7 +100,7 @@ CASES: dict[str, Callable[[], Case]] = {
 
 
 @functools.cache
-def settled(library: CudaLibrary, name: str) -> tuple[Case, Outcome, Outcome]:
+def settled(library: CudaLibrary, name: str) -> tuple[RenderCase, RenderOutcome, RenderOutcome]:
     """A case, what the harness makes of it, and the definition; nothing comes back where a rounding decides."""
     case = CASES[name]()
     ours, exact = run(library, case), exact_outcome(case)
@@ -156,7 +156,7 @@ def test_chunks_and_passes_leave_the_same_bits(library: CudaLibrary, name: str) 
     assert len(chunks) > 1 or pairs <= least
 
 
-def peeked(frame: Frame, what: int, kind: type, count: int) -> np.ndarray:
+def peeked(frame: DeviceFrame, what: int, kind: type, count: int) -> np.ndarray:
     """A copy of a piece of the frame's memory."""
     harness = controls(frame.library)
     harness.peek.restype = ctypes.c_void_p
@@ -166,11 +166,11 @@ def peeked(frame: Frame, what: int, kind: type, count: int) -> np.ndarray:
     return np.frombuffer(ctypes.string_at(place, size), kind)
 
 
-def tile_count(case: Case) -> int:
+def tile_count(case: RenderCase) -> int:
     return math.ceil(case.size[0] / TILE) * math.ceil(case.size[1] / TILE)
 
 
-def tile_lists(frame: Frame) -> list[np.ndarray]:
+def tile_lists(frame: DeviceFrame) -> list[np.ndarray]:
     """Each tile's Gaussians, of a frame in one chunk."""
     begin = peeked(frame, 1, np.int64, tile_count(frame.case) + 1)
     slots = peeked(frame, 3, np.uint32, int(begin[-1]))
@@ -195,7 +195,7 @@ def least_distance2(record: np.ndarray, xs: tuple[float, float], ys: tuple[float
 @pytest.mark.parametrize("name", CASES)
 def test_each_tile_lists_what_touches_it_from_near_to_far(library: CudaLibrary, name: str) -> None:
     case = CASES[name]()
-    frame = Frame(library, case)
+    frame = DeviceFrame(library, case)
     visible = np.flatnonzero(frame.forward()["visible"])
     records = peeked(frame, 5, np.float32, 12 * case.count).reshape(-1, 12)[visible].astype(np.float64)
     order = np.argsort(records[:, 9], kind="stable")
@@ -217,7 +217,7 @@ def test_each_tile_lists_what_touches_it_from_near_to_far(library: CudaLibrary, 
         assert (least <= reach[listed] + 1e-4).all()  # none that stays outside
 
 
-def pixel_centres(case: Case, tile: int) -> tuple[np.ndarray, np.ndarray]:
+def pixel_centres(case: RenderCase, tile: int) -> tuple[np.ndarray, np.ndarray]:
     """x and y of a tile's pixels, those in the picture."""
     width, height = case.size
     columns = math.ceil(width / TILE)
@@ -275,11 +275,11 @@ def test_what_makes_no_sense_is_refused(library: CudaLibrary) -> None:
         with pytest.raises(ValueError, match="splat_"):
             run(library, case.changed(**change))
     for field, value in (("bytes", -1), ("count", -1), ("capacity", 19), ("passes", 0), ("memory", None)):
-        frame = Frame(library, case)
+        frame = DeviceFrame(library, case)
         setattr(frame.frame, field, value)
         with pytest.raises(ValueError, match="splat_forward"):
             frame.forward()
-    frame = Frame(library, case)
+    frame = DeviceFrame(library, case)
     frame.forward()
     frame.frame.back_bytes -= 256
     with pytest.raises(ValueError, match="splat_blend_backward"):

@@ -28,7 +28,7 @@ NEAREST = 250
 
 
 @dataclass(frozen=True)
-class Place:
+class DeviceSetup:
     """Where the kernels run, and how much they are given there.
 
     Attributes:
@@ -50,16 +50,16 @@ class Place:
 
 
 @pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
-def place(request: pytest.FixtureRequest) -> Place:
+def place(request: pytest.FixtureRequest) -> DeviceSetup:
     if request.param == "harness":
-        return Place(kernels_on_cpu(), (60, 40), 500, 1100)
+        return DeviceSetup(kernels_on_cpu(), (60, 40), 500, 1100)
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     reason = why_not()
     assert reason is None, reason
     kernels = kernels_of(torch.device("cuda", 0))
     assert kernels is not None
-    return Place(kernels, (3840, 2160), 67_000, 1 << 25)
+    return DeviceSetup(kernels, (3840, 2160), 67_000, 1 << 25)
 
 
 def sheets(count: int) -> tuple[Tensor, ...]:
@@ -75,14 +75,14 @@ def sheets(count: int) -> tuple[Tensor, ...]:
 
 
 @dataclass(frozen=True)
-class Rendered:
+class PairsResult:
     picture: Tensor
     gradients: tuple[Tensor, ...]
     pairs: int
     chunks: int
 
 
-def rendered(place: Place, parameters: tuple[Tensor, ...]) -> Rendered:
+def rendered(place: DeviceSetup, parameters: tuple[Tensor, ...]) -> PairsResult:
     kernels, (width, height), count = place.kernels, place.size, len(parameters[0])
     camera = Camera("view", width, height, float(width), float(width), width / 2, height / 2, np.eye(4))
     device = kernels.device
@@ -101,7 +101,7 @@ def rendered(place: Place, parameters: tuple[Tensor, ...]) -> Rendered:
     finally:
         kernels.forecast = before
     facts = frame.memory[:24].view(torch.int64).tolist()
-    return Rendered(colour.cpu(), tuple(gradient.cpu() for gradient in gradients), facts[0], facts[2])
+    return PairsResult(colour.cpu(), tuple(gradient.cpu() for gradient in gradients), facts[0], facts[2])
 
 
 def test_a_view_of_very_many_pairs_is_that_of_its_nearest_gaussians(place):

@@ -29,7 +29,7 @@ from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, Render
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import _split_offsets
 from splatpipe.pipeline.train.draws import SPLIT_POSITION, uniform
-from splatpipe.pipeline.train.dropout import _Dropped
+from splatpipe.pipeline.train.dropout import _DropoutLogits
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -106,7 +106,7 @@ def trained(kernels: CudaKernels | None, sparse: bool, dropout: bool, penalty: f
         for _ in range(steps):
             model, probe = scene, torch.zeros(60, 2, requires_grad=True)
             if dropout:
-                model = replace(scene, opacity_logits=_Dropped.apply(scene.opacity_logits, kept, 0.25))
+                model = replace(scene, opacity_logits=_DropoutLogits.apply(scene.opacity_logits, kept, 0.25))
             rendered = render(model, CAMERA, OPTIONS, means2d_probe=probe, buffers=buffers)
             loss = weighted(rendered)
             if penalty:

@@ -16,7 +16,7 @@ from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
 from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.seen_sky import SeenSky
+from splatpipe.pipeline.train.photo_sky import PhotoSky
 from splatpipe.pipeline.train.sky import SkyModel
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
@@ -65,7 +65,7 @@ def composed(camera: Camera, mask: Tensor | None, device: torch.device = CPU) ->
     if device.type == "cuda":
         torch.cuda.set_sync_debug_mode("error")
     rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
-    seen = None if mask is None else SeenSky(mask, mask | mask.roll(1, 0))
+    seen = None if mask is None else PhotoSky(mask, mask | mask.roll(1, 0))
     picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
     (weight * picture).sum().backward()
     if device.type == "cuda":

@@ -13,7 +13,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 from building import FORWARD, HARNESS, build_on_cpu, kernel_sources
-from frames import ORDERS, Case, Frame, Memory, controls, pointer, run
+from frames import ORDERS, DeviceFrame, Memory, RenderCase, controls, pointer, run
 
 from splatpipe.pipeline.raster.cuda_api import SplatPictures
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
@@ -156,7 +156,7 @@ def test_plan_of_more_pairs_than_32_bits_count(library):
     assert plan.chunk_begin.tolist() == chunks_of(counts, 1 << 28)
 
 
-def scene(count: int, size: tuple[int, int], scales: tuple[float, float], seed: int = 0) -> Case:
+def scene(count: int, size: tuple[int, int], scales: tuple[float, float], seed: int = 0) -> RenderCase:
     """Gaussians in front of a camera at the origin, with scales drawn between two, some of them behind it."""
     rng = np.random.default_rng(seed)
     width, height = size
@@ -172,7 +172,7 @@ def scene(count: int, size: tuple[int, int], scales: tuple[float, float], seed: 
         "sh": rng.normal(size=(count, 1, 3)) * 0.5,
     }
     upstream = {"colour": rng.normal(size=(height, width, 3)), "alpha": rng.normal(size=(height, width))}
-    return Case(
+    return RenderCase(
         {name: values.astype(np.float32) for name, values in rows.items()},
         np.eye(3, 4),
         (focal, focal, width / 2 + 0.3, height / 2 - 0.2),
@@ -194,8 +194,8 @@ class Lists:
     owners: np.ndarray  # (pairs)
 
 
-def lists_of(library: CudaLibrary, case: Case, capacity: int = 1 << 14) -> Lists:
-    frame = Frame(library, case, capacity)
+def lists_of(library: CudaLibrary, case: RenderCase, capacity: int = 1 << 14) -> Lists:
+    frame = DeviceFrame(library, case, capacity)
     frame.forward()
     assert not frame.at.overrun()
     pairs, visible, chunks = frame.facts()
@@ -327,7 +327,7 @@ def test_what_makes_no_sense_is_refused(library):
     case = SCENES["one"]
 
     def code(**changes: int) -> int:
-        frame = Frame(library, case)
+        frame = DeviceFrame(library, case)
         for name, value in changes.items():
             setattr(frame.frame if hasattr(frame.frame, name) else frame.shot, name, value)
         pictures = frame.at.empty("pictures", (4 * 33 * 31,))
@@ -347,5 +347,5 @@ def test_what_makes_no_sense_is_refused(library):
     assert code(width=0) == BAD
     assert code(sh_degree=4) == BAD
     assert code(depths=1) == BAD
-    assert code(memory=Frame(library, case).frame.memory + 16) == BAD
+    assert code(memory=DeviceFrame(library, case).frame.memory + 16) == BAD
     assert code(bytes=1000) == TOO_LITTLE

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from agreement import gradient_complaints
 from building import FORWARD, build_on_cpu
 from exact import case_of, exact_outcome
-from frames import ORDERS, PARAMETERS, Case, Frame, Memory, controls, pointer, rows_of, run
+from frames import ORDERS, PARAMETERS, DeviceFrame, Memory, RenderCase, controls, pointer, rows_of, run
 from random_scene import random_camera, random_scene
 
 STEP = 2e-6
@@ -45,7 +45,7 @@ def forward_again(library: CudaLibrary) -> Iterator[None]:
     controls(library).harness_multiprocessors(MULTIPROCESSORS)
 
 
-def small_case(seed: int = 3, count: int = 300, sh_degree: int = 3, **settings: object) -> Case:
+def small_case(seed: int = 3, count: int = 300, sh_degree: int = 3, **settings: object) -> RenderCase:
     """More than a block of Gaussians, not a whole number of blocks, some of them not visible, before few pixels."""
     return case_of(random_scene(seed, count, sh_degree), random_camera(seed, 37, 30), **settings)
 
@@ -59,14 +59,14 @@ def rates_of(coefficients: int) -> list[torch.Tensor]:
 
 
 @dataclass(frozen=True)
-class Stepping:
+class StepSettings:
     """How to step, and from which moments."""
 
     sparse: bool = True
     gain: np.ndarray | None = None
     unaligned: bool = False
 
-    def moments(self, case: Case) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    def moments(self, case: RenderCase) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         rng = np.random.default_rng(8)
         means = {name: (1e-2 * rng.normal(size=rows.shape)).astype(np.float32) for name, rows in case.rows.items()}
         squares = {name: (1e-4 * rng.random(rows.shape)).astype(np.float32) for name, rows in case.rows.items()}
@@ -74,7 +74,7 @@ class Stepping:
 
 
 @dataclass(frozen=True)
-class Stepped:
+class StepResult:
     """Values and moments by name after a step, how many rows were left out, and dL/d(centre on screen)."""
 
     arrays: dict[str, np.ndarray]
@@ -90,9 +90,9 @@ def put(memory: Memory, name: str, values: np.ndarray, unaligned: bool) -> np.nd
     return copy
 
 
-def fused_step(library: CudaLibrary, case: Case, how: Stepping) -> Stepped:
+def fused_step(library: CudaLibrary, case: RenderCase, how: StepSettings) -> StepResult:
     """A frame's step on the device."""
-    frame = Frame(library, case)
+    frame = DeviceFrame(library, case)
     frame.forward()
     frame.blend_backward()
     means, squares = how.moments(case)
@@ -113,10 +113,10 @@ def fused_step(library: CudaLibrary, case: Case, how: Stepping) -> Stepped:
     assert not frame.at.overrun()
     groups = {"value": values, "mean": means, "square": squares}
     arrays = {f"{kind} {name}": array for kind, group in groups.items() for name, array in group.items()}
-    return Stepped(arrays, int(skipped[0]) - 5, means2d)
+    return StepResult(arrays, int(skipped[0]) - 5, means2d)
 
 
-def separate_step(library: CudaLibrary, case: Case, how: Stepping) -> Stepped:
+def separate_step(library: CudaLibrary, case: RenderCase, how: StepSettings) -> StepResult:
     """The same by the device's gradients and the CPU's Adam."""
     made = run(library, case)
     gradients = {name: made.gradients[name].copy() for name in PARAMETERS}
@@ -136,10 +136,10 @@ def separate_step(library: CudaLibrary, case: Case, how: Stepping) -> Stepped:
         for kind, group in named.items()
         for name, tensor in zip(PARAMETERS, group, strict=True)
     }
-    return Stepped(arrays, skipped, made.gradients["means2d"])
+    return StepResult(arrays, skipped, made.gradients["means2d"])
 
 
-def assert_same(ours: Stepped, expected: Stepped) -> None:
+def assert_same(ours: StepResult, expected: StepResult) -> None:
     assert ours.skipped == expected.skipped
     assert ours.means2d.tobytes() == expected.means2d.tobytes()
     for name, array in expected.arrays.items():
@@ -196,7 +196,7 @@ def test_fused_step_is_that_of_the_gradients(library: CudaLibrary, sh_degree: in
     case = small_case(sh_degree + 4, sh_degree=sh_degree).changed(
         sh_degree=sh_degree, depths=sparse, antialias=not sparse, magnitudes=sh_degree == 1
     )
-    how = Stepping(sparse)
+    how = StepSettings(sparse)
     expected, ours = separate_step(library, case, how), fused_step(library, case, how)
     assert_same(ours, expected)
     means, visible = how.moments(case)[0], run(library, case.changed(upstream={})).pictures["visible"] == 1
@@ -211,12 +211,12 @@ def test_fused_step_is_that_of_the_gradients(library: CudaLibrary, sh_degree: in
 
 def test_fused_step_with_bands_that_do_not_count_yet(library: CudaLibrary) -> None:
     case = small_case(9).changed(sh_degree=1)
-    assert_same(fused_step(library, case, Stepping()), separate_step(library, case, Stepping()))
+    assert_same(fused_step(library, case, StepSettings()), separate_step(library, case, StepSettings()))
 
 
 def test_fused_step_of_unaligned_rows(library: CudaLibrary) -> None:
     case = small_case(10)
-    aligned, unaligned = (fused_step(library, case, Stepping(unaligned=shifted)) for shifted in (False, True))
+    aligned, unaligned = (fused_step(library, case, StepSettings(unaligned=shifted)) for shifted in (False, True))
     for name, array in aligned.arrays.items():
         assert array.tobytes() == unaligned.arrays[name].tobytes(), name
 
@@ -225,7 +225,7 @@ def test_fused_step_through_other_logits_than_the_trained(library: CudaLibrary) 
     case = small_case(11)
     gain = np.random.default_rng(2).random(case.count).astype(np.float32)
     gain[::3] = 0.0
-    how = Stepping(gain=gain)
+    how = StepSettings(gain=gain)
     assert_same(fused_step(library, case, how), separate_step(library, case, how))
 
 
@@ -233,7 +233,7 @@ def test_fused_step_through_other_logits_than_the_trained(library: CudaLibrary) 
 def test_rows_with_gradients_that_are_not_finite_are_left_out_and_counted(library: CudaLibrary, sparse: bool) -> None:
     case = small_case(12)
     case.upstream["colour"][15, 18] = np.inf
-    how = Stepping(sparse)
+    how = StepSettings(sparse)
     ours = fused_step(library, case, how)
     assert 5 < ours.skipped < case.count / 2
     assert_same(ours, separate_step(library, case, how))
@@ -241,12 +241,12 @@ def test_rows_with_gradients_that_are_not_finite_are_left_out_and_counted(librar
 
 def test_step_gives_the_same_bits_in_every_order_of_threads(library: CudaLibrary) -> None:
     case = case_of(random_scene(13, TURNS), random_camera(13, 20, 16), depths=False)
-    expected = separate_step(library, case, Stepping())
+    expected = separate_step(library, case, StepSettings())
     controls(library).harness_multiprocessors(1)
     made = []
     for order in ORDERS:
         controls(library).harness_order(*order)
-        made.append(fused_step(library, case, Stepping()))
+        made.append(fused_step(library, case, StepSettings()))
     assert_same(made[0], expected)
     for other in made[1:]:
         for name, array in made[0].arrays.items():

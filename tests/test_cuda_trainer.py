@@ -14,7 +14,7 @@ from splatpipe.pipeline.raster import cuda, cuda_library
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, free_bytes, take_rows
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.shortage import iterate_within_memory
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
@@ -62,7 +62,7 @@ def views() -> list[View]:
     return [View(replace(random_camera(number), name=f"{number}.png"), Path(), None) for number in range(4)]
 
 
-def make_training(options: TrainConfig, device: Device, count: int = 2000) -> tuple[TrainState, Plan]:
+def make_training(options: TrainConfig, device: Device, count: int = 2000) -> tuple[TrainState, TrainingPlan]:
     seen = views()
     names = tuple(view.camera.name for view in seen)
     plan = make_plan(options, seen, Split(names, ()), count)

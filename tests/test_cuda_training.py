@@ -29,8 +29,8 @@ from splatpipe.pipeline.train.checkpoint import load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
-from splatpipe.pipeline.train.planning import Scene
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.planning import PlanningInput
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques, make_techniques
@@ -134,7 +134,7 @@ def test_it_has_the_same_bits_in_any_order_of_threads(scene: Path, whole: Path, 
     assert parts_of(tmp_path) == parts_of(whole)
 
 
-class Killed(BaseException):
+class Kill(BaseException):
     """Stands for a kill: nothing of the trainer catches it."""
 
 
@@ -142,12 +142,12 @@ class Killed(BaseException):
 def killed_at(when: int) -> Iterator[None]:
     """Die before an iteration, with a checkpoint after each one before."""
 
-    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == when:
-            raise Killed
+            raise Kill
         iterate(state, plan, photo)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
         patch.setattr(loop, "iterate", dying)
@@ -157,7 +157,7 @@ def killed_at(when: int) -> Iterator[None]:
 def test_a_checkpoint_moves_between_devices_and_loses_no_bit(scene: Path, whole: Path, tmp_path: Path) -> None:
     with killed_at(LATE):
         trained(scene, tmp_path, ALL)
-    path, plan = tmp_path / loop.CHECKPOINT, Plan.from_json((tmp_path / "plan.json").read_text())
+    path, plan = tmp_path / loop.CHECKPOINT, TrainingPlan.from_json((tmp_path / "plan.json").read_text())
     read = load_checkpoint(path, plan.digest())
     moved = TrainState.restore(read, plan, make_techniques(plan)).checkpoint(read.facts["instruction_set"])
     assert moved.facts == read.facts and moved.arrays.keys() == read.arrays.keys()
@@ -228,7 +228,7 @@ def test_an_iteration_asks_the_device_for_nothing(monkeypatch: pytest.MonkeyPatc
     assert waits
 
 
-def make_small_plan(config: TrainConfig) -> Plan:
+def make_small_plan(config: TrainConfig) -> TrainingPlan:
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras(4)]
     return make_plan(config, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
 
@@ -276,7 +276,7 @@ def test_a_trial_for_a_budget_has_smaller_chunks_where_memory_is_short_too(
     kernels.most_frame_bytes = kernels.frame_bytes(shot, len(begun), 2 * len(begun))
     photo = TrainingPhoto(tiny_scene.cameras(4)[0], torch.full((tiny_scene.HEIGHT, tiny_scene.WIDTH, 3), 0.5), None)
 
-    def tried(plan: Plan, given: Scene, step: Step, report: tiny_scene.Recorder) -> Plan:
+    def tried(plan: TrainingPlan, given: PlanningInput, step: Step, report: tiny_scene.Recorder) -> TrainingPlan:
         pilot = make_small_plan(ALL)  # without density control so early
         trial = TrainState.begin(begun, pilot, Techniques())
         step(trial, pilot, photo)
@@ -306,7 +306,7 @@ def test_memory_that_ends_while_the_model_changes_ends_the_training_at_the_check
         with pytest.raises(MachineError, match="does not hold"):
             trained(scene, tmp_path, ALL, kernels=kernels)
         assert len(begun) == 1  # and not again
-        plan = Plan.from_json((tmp_path / "plan.json").read_text())
+        plan = TrainingPlan.from_json((tmp_path / "plan.json").read_text())
         left = load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest())
         assert left.facts["iteration"] == plan.schedule.density.first - 1
         patch.setattr(shortage, "FEWEST_GAUSSIANS", 10)
@@ -323,7 +323,7 @@ def test_a_memory_limit_is_the_trainings_alone(scene: Path, tmp_path: Path, monk
     kernels, seen = kernels_on_cpu(), []
     kernels.forecast.most_pairs = most_pairs_of(24 << 30)
 
-    def watched(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def watched(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         seen.append(kernels.forecast.most_pairs)
         if len(seen) == 3:
             raise MachineError("It fails.")

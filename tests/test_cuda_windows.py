@@ -13,11 +13,11 @@ from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.windows import TrainingSize
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -28,7 +28,7 @@ from on_cpu import kernels_on_cpu
 OPTIONS = tiny_scene.plain(
     iterations=400, exposure="affine", antialias=True, robust=0.1, distortion_weight=0.05, dropout=0.2
 )
-LOOKS = [Look(1)] * 3 + [Look(0, 800)] * 9
+LOOKS = [TrainingSize(1)] * 3 + [TrainingSize(0, 800)] * 9
 """Whole photos, then windows: six of a photo, some of a masked one."""
 STEP_SHARE = 1e-3  # L2 of how far parameters move: 5e-6 here; a first step of Adam goes by a sign
 SCORE_RTOL = 1e-4  # L2 of the gradients on the screen, after as many steps

@@ -22,7 +22,7 @@ from PIL import Image
 from pyproj import Transformer
 
 from splatpipe.demo import CAPTURE, capture_path
-from splatpipe.demo.cameras import Lens, brown_lens, flight
+from splatpipe.demo.cameras import BrownLens, brown_lens, flight
 from splatpipe.demo.metadata import read_dji, write_rtk_variant
 from splatpipe.pipeline.sfm.lens_model import apart_px, simplest
 
@@ -181,7 +181,7 @@ def test_rtk_variant_has_the_same_pixels_and_centimetre_positions(tmp_path: Path
 
 
 def test_truth_is_the_generators_flight() -> None:
-    lens = Lens()
+    lens = BrownLens()
     assert truth()["camera"]["params"] == [lens.f, lens.cx, lens.cy, lens.k]
     rng = np.random.default_rng(0)
     for pose in flight():
@@ -190,8 +190,8 @@ def test_truth_is_the_generators_flight() -> None:
         assert np.allclose(lens.project(pose.to_camera(points)), project(pose.name, points), atol=1e-6)
 
 
-@pytest.mark.parametrize("lens", [Lens(), brown_lens(), brown_lens().scaled(0.25)])
-def test_the_generators_lenses_are_colmaps_and_undone(lens: Lens) -> None:
+@pytest.mark.parametrize("lens", [BrownLens(), brown_lens(), brown_lens().scaled(0.25)])
+def test_the_generators_lenses_are_colmaps_and_undone(lens: BrownLens) -> None:
     """What a pixel's ray is rendered by is the inverse of what COLMAP sees it at; truth.json names COLMAP's model."""
     camera = pycolmap.Camera(**lens.colmap())
     x, y = np.meshgrid(np.linspace(0.0, lens.width, 13), np.linspace(0.0, lens.height, 10))

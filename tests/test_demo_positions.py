@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.photos.exif import Gps
 from splatpipe.pipeline.photos.scan import Candidate
 from splatpipe.pipeline.survey.frames import Frame
@@ -32,7 +32,7 @@ CAMERA_NOISE_M = 0.005  # of SfM's cameras
 
 @pytest.fixture(scope="module")
 def photos() -> list[CheckedPhoto]:
-    results = [check_photo(Candidate(name, capture_path() / name), Limits(320, 10**8)) for name in NAMES]
+    results = [check_photo(Candidate(name, capture_path() / name), PictureLimits(320, 10**8)) for name in NAMES]
     return [result for result in results if isinstance(result, CheckedPhoto)]
 
 

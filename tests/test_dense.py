@@ -11,9 +11,9 @@ import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.dense import WIDER, Cover, DensePoints, dense_points, thinned
+from splatpipe.pipeline.mvs.dense import WIDER, DensePoints, PointBudget, dense_points, thinned
 from splatpipe.pipeline.mvs.depth_search import confirm
-from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, neighbours
+from splatpipe.pipeline.mvs.neighbours import SparseVisibility, inverse_depths, neighbours
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.mvs.patch_match import find_depths
 from splatpipe.pipeline.mvs.picture import Picture
@@ -105,7 +105,7 @@ def initialized(
 
 
 def dense(dataset: Path, out: Path) -> DensePoints:
-    return dense_points(dataset, load_views(dataset), Cover(50_000), out, 1, Recorder())
+    return dense_points(dataset, load_views(dataset), PointBudget(50_000), out, 1, Recorder())
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +240,7 @@ def test_neighbours_prefer_ten_degrees_and_skip_views_that_share_nothing() -> No
         pose[:3, 3] = [-10.0 * np.sin(angle), 0.0, 10.0 * np.cos(angle)]
         cameras.append(Camera(str(number), 64, 48, 50.0, 50.0, 32.0, 24.0, pose))
     rows = np.arange(40)
-    tracks = Tracks(points, (rows, rows, rows, rows, rows[:0]))
+    tracks = SparseVisibility(points, (rows, rows, rows, rows, rows[:0]))
     near = neighbours(tracks, cameras, 8)
     assert near[0] == [2, 1, 3]
     assert near[4] == []

@@ -14,10 +14,10 @@ from splatpipe.pipeline.surface import dense_cloud
 from splatpipe.pipeline.surface.dense_cloud import CloudTask, make_cloud, tile_cloud
 from splatpipe.pipeline.surface.fusion import FusedPoints
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.levels import Levels
-from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet
+from splatpipe.pipeline.surface.photo_gains import PhotoGains
+from splatpipe.pipeline.surface.photo_set import PhotoSet, SurfacePieces
 from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
-from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
+from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.survey.frames import Frame
 
@@ -27,7 +27,7 @@ from house_photos import GSD_M, Recorder, house_site, photos, run_surface, surfa
 
 FRAME = Frame("arbitrary", Similarity.identity(), metres=True)
 LATTICE = Lattice(-5.0, 5.0, GSD_M, 100, 100)
-RELIEF = Relief(-1.0, 7.0)
+RELIEF = HeightRange(-1.0, 7.0)
 WHOLE = Tile(0, 0, 100, 100)
 
 
@@ -121,7 +121,7 @@ def test_photos_without_depths_and_places_without_photos_give_no_points() -> Non
     blind = [type(each)(each.camera, each.load, None) for each in photos()[:3]]
     assert len(tile_cloud(photo_set(blind, GSD_M, 1), LATTICE, RELIEF, WHOLE)) == 0
     assert len(tile_cloud(noisy_photos(), Lattice(500.0, 500.0, 0.1, 9, 9), RELIEF, Tile(0, 0, 9, 9))) == 0
-    nowhere = Facing(np.full((3, 2), 500.0), np.ones((3, 2)))
+    nowhere = SurfacePieces(np.full((3, 2), 500.0), np.ones((3, 2)))
     assert not point_colours(noisy_photos(), nowhere, GSD_M, 1)[1].any()
 
 
@@ -132,6 +132,6 @@ def test_depths_that_do_not_fit_their_camera_are_refused() -> None:
         source.camera,
         lambda: type(source.depths.load())(source.camera, np.ones((3, 3), np.float32), np.ones((3, 3), np.uint8)),
     )
-    broken = PhotoSet([type(source)(source.camera, source.load, other)], Levels.plain(1), Shelf(1 << 20))
+    broken = PhotoSet([type(source)(source.camera, source.load, other)], PhotoGains.plain(1), LruCache(1 << 20))
     with pytest.raises(ValueError, match="depths of"):
         broken.depth_map(0)

@@ -8,7 +8,7 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import DepthMap, KeptMap, keep_depth_maps
+from splatpipe.pipeline.mvs.depth_maps import DepthMap, DepthMapFile, keep_depth_maps
 
 CAMERA = Camera("a.png", 4, 3, 5.0, 5.0, 2.0, 1.5, np.eye(4))
 
@@ -29,7 +29,7 @@ def test_a_map_is_read_as_it_was_kept(tmp_path: Path) -> None:
     kept = DepthMap(np.full((3, 4), 2.5, np.float32), np.full((3, 4), 3, np.uint8))
     told = keep_depth_maps(tmp_path / "maps", [(CAMERA, kept)])
     assert told == {"maps": 1, "megapixels": 12e-6, "found": 1.0}
-    read = KeptMap(CAMERA, tmp_path / "maps/00000.npz").load()
+    read = DepthMapFile(CAMERA, tmp_path / "maps/00000.npz").load()
     np.testing.assert_array_equal(read.depth, kept.depth)
     np.testing.assert_array_equal(read.confidence, kept.confidence)
 
@@ -49,4 +49,4 @@ def test_a_map_is_read_as_it_was_kept(tmp_path: Path) -> None:
 def test_what_is_no_map_is_refused_by_its_name(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "00000.npz").write_bytes(content)
     with pytest.raises(StageError, match=r"00000\.npz"):
-        KeptMap(CAMERA, tmp_path / "00000.npz").load()
+        DepthMapFile(CAMERA, tmp_path / "00000.npz").load()

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Look, gathered_look, multiplied_look
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, PanoramaView, gather_view, matrix_view
 from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.seen_sky import PhotoSkies, seen_by_cpu, seen_by_device
+from splatpipe.pipeline.train.photo_sky import PhotoSkies, photo_sky_on_cpu, photo_sky_on_device
 from splatpipe.pipeline.train.sky import SkyModel
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -29,7 +29,7 @@ def cells(dtype: torch.dtype) -> Tensor:
     return torch.rand(ROWS * COLUMNS, 3, generator=generator, dtype=dtype).requires_grad_()
 
 
-def seen_and_gradient(look: Look, colours: Tensor) -> tuple[Tensor, Tensor]:
+def seen_and_gradient(look: PanoramaView, colours: Tensor) -> tuple[Tensor, Tensor]:
     seen = look.behind(colours, BACKGROUND)
     weight = torch.rand(seen.shape, generator=torch.Generator().manual_seed(2), dtype=seen.dtype)
     (gradient,) = torch.autograd.grad((weight * seen).sum(), colours)
@@ -48,14 +48,14 @@ VIEWS = [
 def test_panorama_and_its_gradient_are_those_of_the_cpu(camera: Camera, up: np.ndarray) -> None:
     for dtype, picture_atol in ((torch.float32, PICTURE_ATOL), (torch.float64, WEIGHTS_ATOL)):
         colours = cells(dtype)
-        expected, gradient = seen_and_gradient(gathered_look(camera, up, colours), colours)
-        seen, own = seen_and_gradient(multiplied_look(camera, up, colours), colours)
+        expected, gradient = seen_and_gradient(gather_view(camera, up, colours), colours)
+        seen, own = seen_and_gradient(matrix_view(camera, up, colours), colours)
         torch.testing.assert_close(seen, expected, rtol=0, atol=picture_atol)
         assert torch.linalg.vector_norm(own - gradient) < picture_atol * torch.linalg.vector_norm(gradient)
 
 
 def test_weights_of_a_direction_sum_to_one() -> None:
-    look = multiplied_look(VIEWS[2], TILTED, torch.zeros(0, dtype=torch.float64))
+    look = matrix_view(VIEWS[2], TILTED, torch.zeros(0, dtype=torch.float64))
     ones = look.cells.mixed(torch.ones(ROWS * COLUMNS, 3, dtype=torch.float64))
     torch.testing.assert_close(ones, torch.ones_like(ones), rtol=0, atol=EXACT_ATOL)
 
@@ -69,7 +69,10 @@ def test_masks_are_those_of_the_cpu_at_every_size(size: tuple[int, int]) -> None
     mask[rng.integers(0, 90, 30), rng.integers(0, 320, 30)] = False
     found = SkyMask.packed(mask)
     camera = skies.look().scaled(*size)
-    cpu, device = seen_by_cpu(found, camera), seen_by_device(torch.from_numpy(found.bits), found.shape, camera)
+    cpu, device = (
+        photo_sky_on_cpu(found, camera),
+        photo_sky_on_device(torch.from_numpy(found.bits), found.shape, camera),
+    )
     for ours, expected in ((device.mask, cpu.mask), (device.around, cpu.around)):
         assert ours.shape == (size[1], size[0])
         assert (ours != expected).float().mean() < 1e-3  # pixels whose share is SURE but for rounding

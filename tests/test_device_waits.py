@@ -17,14 +17,14 @@ from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
 from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.distortion import CENTRE_EVERY, Distortion
+from splatpipe.pipeline.train.distortion_loss import CENTRE_EVERY, DistortionLoss
 from splatpipe.pipeline.train.draws import ELSEWHERE
 from splatpipe.pipeline.train.dropout import Dropout
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.robust import Robust
-from splatpipe.pipeline.train.schedule import Moment, resolve_schedule
+from splatpipe.pipeline.train.robust import RobustMask
+from splatpipe.pipeline.train.schedule import ScheduleStep, resolve_schedule
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
@@ -36,7 +36,7 @@ CAMERAS = [replace(skies.look(heading_deg=10.0 * number).scaled(160, 120), name=
 NAMES = [camera.name for camera in CAMERAS]
 
 
-def a_moment(iteration: int = CENTRE_EVERY - 1) -> Moment:
+def a_moment(iteration: int = CENTRE_EVERY - 1) -> ScheduleStep:
     return resolve_schedule(TrainConfig(iterations=2 * CENTRE_EVERY, dropout=0.3)).at(iteration, 0)
 
 
@@ -58,13 +58,13 @@ def sky() -> Technique:
 
 
 def robust() -> Technique:
-    made = Robust(NAMES, 0.1, 5)
+    made = RobustMask(NAMES, 0.1, 5)
     made.watch(CAMERAS)
     return made
 
 
 def distortion() -> Technique:
-    made, model = Distortion(0.1, after=0), Gaussians.empty(5, 0)
+    made, model = DistortionLoss(0.1, after=0), Gaussians.empty(5, 0)
     made.settings(RenderOptions(0), model, CAMERAS[0], a_moment(1))  # its first look is allowed to wait
     return made
 

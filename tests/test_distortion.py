@@ -15,7 +15,14 @@ from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train.distortion import CENTRE_EVERY, FREE_PX, HALF_PX, Distortion, depth_origin, spread_loss
+from splatpipe.pipeline.train.distortion_loss import (
+    CENTRE_EVERY,
+    FREE_PX,
+    HALF_PX,
+    DistortionLoss,
+    depth_origin,
+    spread_loss,
+)
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
@@ -87,18 +94,18 @@ def test_gradient_agrees_with_finite_differences() -> None:
 
 
 def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> None:
-    distortion = Distortion(0.1, after=20)
+    distortion = DistortionLoss(0.1, after=20)
     assert not distortion.is_counted(20) and distortion.is_counted(21)
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras()]
     for weight in (0.0, 0.1):
         plan = make_plan(tiny_scene.plain(distortion_weight=weight), views, tiny_scene.split_of(views), 9)
-        assert (make_techniques(plan).find(Distortion) is not None) == (weight > 0.0)
+        assert (make_techniques(plan).find(DistortionLoss) is not None) == (weight > 0.0)
 
 
 def test_on_a_device_the_centre_is_looked_for_seldom_and_goes_on_through_a_checkpoint() -> None:
     model, camera, options = layers((4.0, 6.0), 0.6), FRONT, rasterizer.RenderOptions(0)
     for device, moves in (("cpu", True), ("meta", False)):
-        distortion = Distortion(0.1, after=0)
+        distortion = DistortionLoss(0.1, after=0)
         moment = make_schedule().at(CENTRE_EVERY, 0)
         distortion.settings(options, model, camera, moment)
         moved = replace(model, means=model.means + 1.0)
@@ -106,7 +113,7 @@ def test_on_a_device_the_centre_is_looked_for_seldom_and_goes_on_through_a_check
         later = make_schedule().at(CENTRE_EVERY + 1, 0)
         found = distortion.settings(options, elsewhere, camera, later).depth_origin
         assert found == pytest.approx(6.0 if moves else 5.0)
-        other = Distortion(0.1, after=0)
+        other = DistortionLoss(0.1, after=0)
         other.load(distortion.to_arrays())
         assert other.settings(options, elsewhere, camera, later).depth_origin == found
 

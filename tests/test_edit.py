@@ -30,7 +30,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.formats import format_named, plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import MOST_EDITS, Place, Scene, SceneFacts, turn_of
+from splatpipe.pipeline.splat.scene import MOST_EDITS, Scene, SceneFacts, SplatOrigin, turn_of
 from splatpipe.pipeline.survey.frames import Origin
 from splatpipe.pipeline.survey.handover import frame_of
 from splatpipe.pipeline.survey.world import open_world
@@ -38,7 +38,7 @@ from splatpipe.pipeline.survey.world import open_world
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from tiny_scene import Recorder, cameras, true_model
 
-PLACE = Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
+PLACE = SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
 PLACED = SceneFacts("z up", False, True, PLACE)
 SAME_DB = 60.0  # what is only moved: float32's rounding of means, scales and harmonics
 OUTPUT = Output(Path("out.ply"), format_named("ply"))

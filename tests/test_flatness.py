@@ -15,7 +15,7 @@ from splatpipe.pipeline.train import flatness, loop
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.lengths import Stretch
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import resolve_schedule
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
@@ -30,10 +30,10 @@ SIZES = FLAT.model_copy(update={"coarse_levels": 1, "sh_degree": 1})  # half of 
 PARTS = ("model.ply", "history.json", "exposures.json", "plan.json")
 
 
-def make_plan(iterations: int, threshold: float, last: int = 0, **options: object) -> Plan:
+def make_plan(iterations: int, threshold: float, last: int = 0, **options: object) -> TrainingPlan:
     fields = TrainConfig().model_dump() | {"iterations": iterations, "stop_when_flat": threshold} | options
     config = TrainConfig.model_validate(fields)
-    return Plan(config, resolve_schedule(config), 1.0, 0.01, ("a", "b"), (), 0.1, 10, last or iterations)
+    return TrainingPlan(config, resolve_schedule(config), 1.0, 0.01, ("a", "b"), (), 0.1, 10, last or iterations)
 
 
 def power_law(exponent: float, noise: float = 0.0, until: int = 5000) -> list[tuple[int, float]]:
@@ -180,7 +180,7 @@ def test_a_size_whose_loss_is_flat_gives_way_to_larger_photos_at_once(scene: Pat
 def test_a_training_that_may_not_end_early_ends_its_smaller_sizes_all_the_same(scene: Path, tmp_path: Path) -> None:
     trained(scene, tmp_path / "any", SIZES)
     (tmp_path / "planned").mkdir()
-    plan = replace(Plan.from_json((tmp_path / "any/plan.json").read_text()), ends_when_flat=False)
+    plan = replace(TrainingPlan.from_json((tmp_path / "any/plan.json").read_text()), ends_when_flat=False)
     (tmp_path / "planned/plan.json").write_text(plan.to_json())
     summary, _ = trained(scene, tmp_path / "planned", SIZES)
     assert summary["sizes_ended"] == [48] and "flat_at" not in summary and summary["iterations"] == 161
@@ -193,7 +193,7 @@ def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
     whole, _ = trained(scene, tmp_path / "whole", config)
     step = loop.iterate
 
-    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == int(str(whole["iterations"])) - before_end:
             raise KeyboardInterrupt
         step(state, plan, photo)

@@ -24,12 +24,12 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import write_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.train import flattening, loop
-from splatpipe.pipeline.train.distortion import FREE_PX, HALF_PX, depth_origin, spread_loss
-from splatpipe.pipeline.train.evenness import unevenness
+from splatpipe.pipeline.train.distortion_loss import FREE_PX, HALF_PX, depth_origin, spread_loss
 from splatpipe.pipeline.train.exposure import Exposure, exposures_json, read_exposures
 from splatpipe.pipeline.train.flattening import LEAST_ITERATIONS, TrainedParts, flatten, flattening_plan, options_of
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
 from splatpipe.pipeline.train.options import SplatDepthsConfig
+from splatpipe.pipeline.train.smoothness_loss import unevenness
 from splatpipe.stages import splat_depths
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.geometry.alignment import Correspondences, Shared, robust_similarity
+from splatpipe.pipeline.geometry.alignment import Correspondences, SharedErrors, robust_similarity
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.survey.flights import Stamp, tell_flights
 
@@ -57,7 +57,7 @@ def test_shared_errors_are_estimated_and_the_shape_is_exact(step_m: float) -> No
     source[20:] += [9.0, 0.0, 0.0]
     group = np.repeat([0, 1], 20)
     target = TRUTH.apply(source) + np.outer(group, [0.3 * step_m, 0.0, step_m])
-    shared = Shared(group, np.array([[3.0, 3.0, 5.0], [3.0, 3.0, 1e4]]))
+    shared = SharedErrors(group, np.array([[3.0, 3.0, 5.0], [3.0, 3.0, 1e4]]))
     fit = robust_similarity(Correspondences(source, target, np.full((40, 3), 1.0), shared), 10.0)
     assert fit.inliers.all()
     pull = 1e-9 + 1e-3 * step_m  # the sigmas of shared errors draw a step to zero by their share
@@ -77,7 +77,7 @@ def test_accuracy_with_shared_errors_is_what_repetition_shows() -> None:
     source = rng.uniform(-3, 3, (30, 3))
     source[15:] += [6.0, 0.0, 0.0]
     group = np.repeat([0, 1], 15)
-    shared = Shared(group, np.full((2, 3), 2.0))
+    shared = SharedErrors(group, np.full((2, 3), 2.0))
     scales, stated = [], []
     for _ in range(25):
         noise = rng.normal(size=(30, 3)) * 0.3 + (rng.normal(size=(2, 3)) * 2.0)[group]

@@ -8,10 +8,10 @@ import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.geometry.upright import enu_from_gimbal
-from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.photos.scan import Candidate
-from splatpipe.pipeline.sfm.footprints import Views, crossing_distances, overlaps
+from splatpipe.pipeline.sfm.footprints import StatedPoses, crossing_distances, overlaps
 from splatpipe.pipeline.sfm.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairs import Costs, Layout, choose_pairing, components, select_pairs
 from splatpipe.pipeline.survey.photo_positions import positions_json, read_positions
@@ -19,9 +19,9 @@ from splatpipe.pipeline.survey.photo_positions import positions_json, read_posit
 HALF_SIZE = (0.6, 0.45)
 
 
-def views(centres: np.ndarray, yaw: np.ndarray, pitch: np.ndarray) -> Views:
+def views(centres: np.ndarray, yaw: np.ndarray, pitch: np.ndarray) -> StatedPoses:
     count = len(centres)
-    return Views(
+    return StatedPoses(
         centres.astype(np.float64),
         enu_from_gimbal(yaw.astype(np.float64), pitch.astype(np.float64), np.zeros(count)),
         np.tile(HALF_SIZE, (count, 1)),
@@ -29,11 +29,11 @@ def views(centres: np.ndarray, yaw: np.ndarray, pitch: np.ndarray) -> Views:
     )
 
 
-def nadir(centres: np.ndarray) -> Views:
+def nadir(centres: np.ndarray) -> StatedPoses:
     return views(centres, np.zeros(len(centres)), np.full(len(centres), -90.0))
 
 
-def orbit(count: int, radius_m: float, height_m: float) -> Views:
+def orbit(count: int, radius_m: float, height_m: float) -> StatedPoses:
     """Around a building, looking at it."""
     azimuths = np.arange(count) * 360.0 / count
     radians = np.radians(azimuths)
@@ -45,7 +45,7 @@ def never() -> Costs:
     raise AssertionError("the photos' content is not needed")
 
 
-def layout_of(these: Views) -> Layout:
+def layout_of(these: StatedPoses) -> Layout:
     count = len(these)
     names = [f"{index:04d}.jpg" for index in range(count)]
     return Layout(names, np.full(count, np.nan), these.centres_m, np.full(count, 1.0), these.axes, these)
@@ -114,7 +114,7 @@ def test_a_photo_that_looks_away_is_still_connected() -> None:
 @pytest.fixture(scope="module")
 def checked() -> list[CheckedPhoto]:
     paths = sorted(capture_path().glob("*.JPG"))
-    results = [check_photo(Candidate(path.name, path), Limits(320, 10**8)) for path in paths]
+    results = [check_photo(Candidate(path.name, path), PictureLimits(320, 10**8)) for path in paths]
     return [result for result in results if isinstance(result, CheckedPhoto)]
 
 

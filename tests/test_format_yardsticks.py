@@ -18,7 +18,7 @@ from splatpipe.pipeline.splat.spz import spz_bytes
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import tiny_scene
-from captures import Capture, decibels, likely_frame
+from captures import CaptureRun, decibels, likely_frame
 from floater_planting import KINDS, SEEN_ALPHA, plant, sights_of
 from position_errors import SITE_M, position_row, site_of
 
@@ -60,7 +60,7 @@ def test_a_frame_that_nobody_names_is_found(scene):
     back = np.eye(4)
     back[:3, :3] = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).numpy()  # y down from z up
     cameras = [replace(camera, cam_from_world=camera.cam_from_world @ back) for camera in cameras]
-    capture = Capture("tiny", turned, cameras)
+    capture = CaptureRun("tiny", turned, cameras)
     originals = capture.pictures(turned)
     assert decibels(capture.pictures(scene), originals) > 90.0
     unknown = Scene(turned.turned("y up").gaussians, SceneFacts("z up"))

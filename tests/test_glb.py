@@ -18,14 +18,14 @@ from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.formats import glb
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import write_head
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 from glb_parts import packed, parts
 from some_splats import some_gaussians
 
-FACTS = SceneFacts("z up", True, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"), ({"step": "crop"},))
+FACTS = SceneFacts("z up", True, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"), ({"step": "crop"},))
 SPLATTING = "KHR_gaussian_splatting"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}

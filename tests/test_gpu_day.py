@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import gpu_parts
-from gpu_parts import Outcome, Part
+from gpu_parts import GpuPart, PartOutcome
 
 PIECES = """
 import os, subprocess, sys, time
@@ -30,7 +30,7 @@ def never(pid_file):
 """
 
 
-def run(tmp_path: Path, parts: list[Part], seconds: float) -> list[Outcome]:
+def run(tmp_path: Path, parts: list[GpuPart], seconds: float) -> list[PartOutcome]:
     (tmp_path / "pieces.py").write_text(PIECES)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     return list(gpu_parts.run_parts(parts, tmp_path / "rows", environment, time.monotonic() + seconds))[-1]
@@ -46,10 +46,10 @@ def is_running(pid: int) -> bool:
 def test_a_part_that_fails_or_hangs_leaves_what_it_had_and_the_others_go_on(tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
     parts = [
-        Part("beside", "pieces:well", {"count": 1}, beside=True),
-        Part("bad", "pieces:badly"),
-        Part("hangs", "pieces:never", {"pid_file": str(pid_file)}, limit_s=3.0),
-        Part("good", "pieces:well", {"count": 3}),
+        GpuPart("beside", "pieces:well", {"count": 1}, beside=True),
+        GpuPart("bad", "pieces:badly"),
+        GpuPart("hangs", "pieces:never", {"pid_file": str(pid_file)}, limit_s=3.0),
+        GpuPart("good", "pieces:well", {"count": 3}),
     ]
     outcomes = run(tmp_path, parts, 60.0)
     assert [(each.name, each.state, len(each.rows)) for each in outcomes] == [
@@ -64,5 +64,5 @@ def test_a_part_that_fails_or_hangs_leaves_what_it_had_and_the_others_go_on(tmp_
 
 def test_what_there_is_no_time_for_is_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu_parts, "LEAST_S", 1000.0)
-    (outcome,) = run(tmp_path, [Part("good", "pieces:well", {"count": 1})], 60.0)
+    (outcome,) = run(tmp_path, [GpuPart("good", "pieces:well", {"count": 1})], 60.0)
     assert (outcome.state, outcome.rows) == ("not begun", [])

@@ -5,10 +5,10 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from splatpipe.pipeline.geometry.joint_fit import JointFit, Observed, Priors, find_blunders, fit_jointly
+from splatpipe.pipeline.geometry.joint_fit import JointFit, JointObservations, Priors, find_blunders, fit_jointly
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.geometry.triangulation import Rays, triangulate
-from splatpipe.pipeline.survey.model import View
+from splatpipe.pipeline.survey.model import ModelView
 
 Array = NDArray[np.float64]
 TRUTH = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))
@@ -17,7 +17,7 @@ CONTROL, PHOTOS = 6, 20
 OFFSET = np.array([0.8, -1.2, 47.0])
 
 
-def observed(seed: int = 0, sigma: float = 0.02) -> tuple[Observed, Priors]:
+def observed(seed: int = 0, sigma: float = 0.02) -> tuple[JointObservations, Priors]:
     """Control, and positions of one flight that are off together."""
     rng = np.random.default_rng(seed)
     world = np.concatenate(
@@ -29,7 +29,7 @@ def observed(seed: int = 0, sigma: float = 0.02) -> tuple[Observed, Priors]:
     is_control = np.arange(len(world)) < CONTROL
     group = np.where(is_control, -1, 0).astype(np.int64)
     return (
-        Observed(TRUTH.inverse().apply(world), target, sigmas, group, is_control),
+        JointObservations(TRUTH.inverse().apply(world), target, sigmas, group, is_control),
         Priors(np.array([[9.0, 9.0, 1000.0]])),
     )
 
@@ -54,7 +54,7 @@ def test_stated_standard_deviations_are_those_of_many_fits() -> None:
     drawn = []
     for _ in range(200):
         target = exact + rng.normal(size=exact.shape) * points.sigmas
-        noisy = Observed(points.source, target, points.sigmas, points.group, points.is_control)
+        noisy = JointObservations(points.source, target, points.sigmas, points.group, points.is_control)
         drawn.append(errors(fit_jointly(TRUTH, noisy, priors), place))
     stated = fit_jointly(TRUTH, points, priors).sigmas_at(place)
     np.testing.assert_allclose(np.std(drawn, axis=0), stated, rtol=0.2)
@@ -64,7 +64,7 @@ def test_unknown_heights_do_not_matter() -> None:
     points, priors = observed()
     sigmas, target = points.sigmas.copy(), points.target.copy()
     sigmas[:2, 2], target[:2, 2] = np.inf, -1000.0
-    fit = fit_jointly(NEAR, Observed(points.source, target, sigmas, points.group, points.is_control), priors)
+    fit = fit_jointly(NEAR, JointObservations(points.source, target, sigmas, points.group, points.is_control), priors)
     assert np.abs(errors(fit, points.source[:CONTROL])).max() < 0.05
 
 
@@ -97,7 +97,7 @@ def test_blunders_among_very_many_points_are_found() -> None:
     target = world + rng.normal(size=world.shape) * 0.06
     target[[7, 123, 399]] += [1.5, -1.0, 0.8]
     count = len(world)
-    many = Observed(
+    many = JointObservations(
         TRUTH.inverse().apply(world), target, np.full((count, 3), 0.02), np.full(count, -1), np.ones(count, bool)
     )
     assert find_blunders(NEAR, many, Priors(np.zeros((0, 3))), 0.1) == (7, 123, 399)
@@ -133,7 +133,7 @@ def test_lens_weighs_marks_as_it_shows_them() -> None:
     """Against the derivative of x = f u (1 + k r²) by hand, in photos twice as large as the model's."""
     f, k = 800.0, -0.2
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1200, height=900, params=[f, 600.0, 450.0, k])
-    view = View(camera, np.eye(3, 4), scale=0.5)
+    view = ModelView(camera, np.eye(3, 4), scale=0.5)
     u, v = ray = np.array([0.5, -0.3])
     radial, squares = 1.0 + k * (u * u + v * v), np.array([[u * u, u * v], [u * v, v * v]])
     by_hand = 2.0 * f * (radial * np.eye(2) + 2.0 * k * squares)

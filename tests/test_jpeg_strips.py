@@ -57,7 +57,7 @@ def test_a_picture_of_one_strip_is_a_plain_file(tmp_path: Path) -> None:
 
 
 @dataclass
-class Watched:
+class WatchedPhoto:
     """A photo that keeps what it was asked for."""
 
     pixels: np.ndarray
@@ -80,7 +80,7 @@ def test_resampled_strips_look_at_few_rows_and_have_the_same_bits(monkeypatch: p
     source = pycolmap.Camera(model="SIMPLE_RADIAL", width=400, height=400, params=[380, 200, 200, -0.05])
     target = pinhole(400, 400)
     target.rescale(side, side)
-    photo = Watched(picture(400, 400))
+    photo = WatchedPhoto(picture(400, 400))
     whole = resample(photo.pixels, source, target)
     monkeypatch.setattr(resampling, "SINGLE_PIXELS", 8 * side)
     monkeypatch.setattr(resampling, "PROJECTED", 3 * side)

@@ -10,8 +10,8 @@ import pytest
 
 from splatpipe.pipeline.sfm.agreement import compare, epipolar_errors
 from splatpipe.pipeline.sfm.cuts import find_cut
+from splatpipe.pipeline.sfm.external_evidence import disagreement
 from splatpipe.pipeline.sfm.judging import contradicting, judge
-from splatpipe.pipeline.sfm.outside import disagreement
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from view_graph import FOCAL, Ring, make_ring, model_of, moved, turn_up, with_matches

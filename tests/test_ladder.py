@@ -12,13 +12,13 @@ import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.sfm.capture import Capture, Found
-from splatpipe.pipeline.sfm.ladder import Work, climb, settle, without
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
+from splatpipe.pipeline.sfm.ladder import LadderContext, climb, settle, without
 from splatpipe.pipeline.sfm.ladder_joins import join
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs
 from splatpipe.pipeline.sfm.mapping import MappingOptions, map_incremental
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.sfm.verified import Verified, read_verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 from splatpipe.stages import features, matches
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -28,7 +28,7 @@ COUNT = 8
 FAST = FeaturesConfig(extractor="opencv-sift", max_features=1500)
 
 
-def matched(inputs: Inputs, folder: Path) -> Capture:
+def matched(inputs: Inputs, folder: Path) -> MappingInput:
     """What `features` and `matches` leave of a capture."""
     recorder = corner_photos.Recorder()
     for stage in ("features", "matches", "scratch"):
@@ -36,7 +36,7 @@ def matched(inputs: Inputs, folder: Path) -> Capture:
     features.run(FAST, inputs, folder / "features", recorder)
     inputs = corner_photos.with_parts(inputs, features__database=folder / "features" / "database.db")
     matches.run(MatchesConfig(), inputs, folder / "matches", recorder)
-    return Capture(
+    return MappingInput(
         database=folder / "matches" / "database.db",
         features=folder / "features" / "database.db",
         colours=np.load(folder / "features" / "colours.npy"),
@@ -49,7 +49,7 @@ def matched(inputs: Inputs, folder: Path) -> Capture:
     )
 
 
-def thinned(capture: Capture, keep: Callable[[int, int], bool], name: str) -> Capture:
+def thinned(capture: MappingInput, keep: Callable[[int, int], bool], name: str) -> MappingInput:
     """The same capture with only some of its verified pairs."""
     target = capture.scratch / f"{name}.db"
     with pycolmap.Database.open(capture.database) as source, pycolmap.Database.open(target) as database:
@@ -70,21 +70,21 @@ def thinned(capture: Capture, keep: Callable[[int, int], bool], name: str) -> Ca
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def room(tmp_path_factory: pytest.TempPathFactory) -> MappingInput:
     folder = tmp_path_factory.mktemp("room")
     names = [f"{number}.png" for number in range(COUNT)]
     return matched(corner_photos.write_capture(folder / "in", corner_photos.room(names)), folder)
 
 
 @pytest.fixture(scope="module")
-def whole(room: Capture) -> tuple[pycolmap.Reconstruction, Verified]:
+def whole(room: MappingInput) -> tuple[pycolmap.Reconstruction, ViewGraph]:
     model = map_incremental(room.database, room.scratch, MappingOptions(), lambda *_: None)[0]
     assert model.num_reg_images() == COUNT
     return model, read_verified(room.database)
 
 
 def test_pairs_that_show_the_same_thing_are_proposed_and_hold(
-    room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]
+    room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     model, verified = whole
     assert propose_pairs(model, verified, 10) == []  # all that overlap were matched
@@ -101,13 +101,13 @@ def test_pairs_that_show_the_same_thing_are_proposed_and_hold(
 
 
 def found_without(
-    capture: Capture, whole: tuple[pycolmap.Reconstruction, Verified], left: set[int], **more: object
-) -> Found:
+    capture: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph], left: set[int], **more: object
+) -> MappingResult:
     """A model that lacks photos, on the view graph of a capture."""
     verified = read_verified(capture.database)
     model = without(whole[0], verified, left)
     assert model.num_reg_images() == COUNT - len(left)
-    return Found(model, (), capture.database, verified, capture.colours, **more)
+    return MappingResult(model, (), capture.database, verified, capture.colours, **more)
 
 
 def centre_errors(model: pycolmap.Reconstruction) -> dict[int, float]:
@@ -122,7 +122,7 @@ def centre_errors(model: pycolmap.Reconstruction) -> dict[int, float]:
     return {n: float(np.linalg.norm(fit * model.images[n].projection_center() - true[n]) / size) for n in placed}
 
 
-def assert_all_right(found: Found, rung: str) -> None:
+def assert_all_right(found: MappingResult, rung: str) -> None:
     assert found.model.num_reg_images() == COUNT
     assert max(centre_errors(found.model).values()) < 0.01  # small photos, focal length not known
     assert [row["rung"] for row in found.rungs if row["placed"]] == [rung]
@@ -134,21 +134,21 @@ def assert_all_right(found: Found, rung: str) -> None:
 
 
 def test_photos_are_registered_to_the_finished_model(
-    room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]
+    room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     found = climb(room, found_without(room, whole, {1, 5}), SparseConfig(), corner_photos.Recorder())
     assert_all_right(found, "registration")
     assert found.model.num_points3D() > 0.9 * whole[0].num_points3D()
 
 
-def test_a_photo_without_pairs_gets_some(room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]) -> None:
+def test_a_photo_without_pairs_gets_some(room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]) -> None:
     capture = thinned(room, lambda i, j: 8 not in (i, j), "no pairs")
     found = climb(capture, found_without(capture, whole, {8}), SparseConfig(), corner_photos.Recorder())
     assert_all_right(found, "more pairs")
     assert any(8 in pair for pair in found.verified.matches)
 
 
-def test_weak_keypoints_are_made_stronger(room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]) -> None:
+def test_weak_keypoints_are_made_stronger(room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]) -> None:
     weak = thinned(room, lambda i, j: 8 not in (i, j), "weak")
     with pycolmap.Database.open(weak.database) as database:
         few = database.read_keypoints(8)[:40]
@@ -163,7 +163,7 @@ def test_weak_keypoints_are_made_stronger(room: Capture, whole: tuple[pycolmap.R
 
 
 def test_sub_models_are_joined_over_what_they_share(
-    room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]
+    room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     model, verified = whole
     first, second = without(model, verified, {5, 6, 7, 8}), without(model, verified, {1, 2, 3})
@@ -176,14 +176,17 @@ def test_sub_models_are_joined_over_what_they_share(
     apart = without(model, verified, {1, 2, 3, 4})
     apart.transform(pycolmap.Sim3d(0.4, turn, np.array([3.0, -7.0, 11.0])))
     found = climb(
-        room, Found(first, (apart,), room.database, verified, room.colours), SparseConfig(), corner_photos.Recorder()
+        room,
+        MappingResult(first, (apart,), room.database, verified, room.colours),
+        SparseConfig(),
+        corner_photos.Recorder(),
     )
     assert_all_right(found, "registration")
     assert found.others == ()
 
 
 def test_models_that_share_nothing_but_chance_stay_apart(
-    whole: tuple[pycolmap.Reconstruction, Verified],
+    whole: tuple[pycolmap.Reconstruction, ViewGraph],
 ) -> None:
     model, verified = whole
     first, second = without(model, verified, {5, 6, 7, 8}), without(model, verified, {1, 2, 3, 4})
@@ -195,7 +198,9 @@ def test_models_that_share_nothing_but_chance_stay_apart(
     assert join(first, second, replace(verified, matches=shuffled), seed=0) is None
 
 
-def test_a_photo_of_another_place_is_not_placed(room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]) -> None:
+def test_a_photo_of_another_place_is_not_placed(
+    room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
+) -> None:
     """What it shows by chance matches nothing, but for a poster that hangs in the room as well."""
     before = found_without(room, whole, {8})
     generator = np.random.default_rng(0)
@@ -208,12 +213,14 @@ def test_a_photo_of_another_place_is_not_placed(room: Capture, whole: tuple[pyco
     assert len(poster) == 25
     matches[7, 8] = np.array(poster, np.uint32)
     wrong = replace(before, verified=replace(before.verified, matches=matches))
-    work = Work(room, MappingOptions(), corner_photos.Recorder())
+    work = LadderContext(room, MappingOptions(), corner_photos.Recorder())
     assert settle(work, wrong).model.num_reg_images() == COUNT - 1
 
 
-def test_where_nothing_is_left_nothing_changes(room: Capture, whole: tuple[pycolmap.Reconstruction, Verified]) -> None:
-    complete = Found(whole[0], (), room.database, whole[1], room.colours)
+def test_where_nothing_is_left_nothing_changes(
+    room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
+) -> None:
+    complete = MappingResult(whole[0], (), room.database, whole[1], room.colours)
     assert climb(room, complete, SparseConfig(), corner_photos.Recorder()) is complete
     lacking = found_without(room, whole, {2})
     assert climb(room, lacking, SparseConfig(ladder=False), corner_photos.Recorder()) is lacking

@@ -21,7 +21,7 @@ SIZES = [(1, 1), (17, 33), (18, 34), (1, 40), (40, 1), (9, 15), (50, 64), (23, 7
 pytestmark = pytest.mark.usefixtures("isa")
 
 
-class Given:
+class RandomPicture:
     """A picture of random numbers before random nodes.
 
     Args:
@@ -59,8 +59,8 @@ class Given:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("kind", ["known", "unknown", "masked"])
 def test_picture_and_gradients_are_those_of_the_definition(size: tuple[int, int], kind: str) -> None:
-    ours = Given(*size, kind).found()
-    exact = Given(*size, kind, torch.float64).found(reference=True)
+    ours = RandomPicture(*size, kind).found()
+    exact = RandomPicture(*size, kind, torch.float64).found(reference=True)
     torch.testing.assert_close(ours[0], exact[0].float(), rtol=0, atol=PICTURE_ATOL)
     for gradient, right in zip(ours[1:], exact[1:], strict=True):
         assert torch.linalg.vector_norm(gradient - right) <= GRADIENT_RTOL * torch.linalg.vector_norm(right)
@@ -68,7 +68,7 @@ def test_picture_and_gradients_are_those_of_the_definition(size: tuple[int, int]
 
 
 def test_gradients_of_the_definition_are_those_of_finite_differences() -> None:
-    given = Given(10, 12, "known", torch.float64)
+    given = RandomPicture(10, 12, "known", torch.float64)
     everywhere = torch.ones(10, 12, dtype=torch.bool)  # elsewhere the nodes have less than their derivative
     behind = replace(given.behind, around=everywhere, mask=everywhere)
     leaves = tuple(tensor.requires_grad_() for tensor in (given.colour, given.alpha, given.nodes))
@@ -77,7 +77,7 @@ def test_gradients_of_the_definition_are_those_of_finite_differences() -> None:
 
 @pytest.mark.parametrize("kind", ["known", "unknown"])
 def test_any_number_of_threads_leaves_the_same_bits(kind: str) -> None:
-    given, found = Given(211, 313, kind), []
+    given, found = RandomPicture(211, 313, kind), []
     for threads in (1, 2, 5):
         set_threads(threads)
         found.append(given.found())
@@ -86,12 +86,12 @@ def test_any_number_of_threads_leaves_the_same_bits(kind: str) -> None:
 
 
 def test_windows_show_what_the_whole_shows_and_their_gradients_add_up() -> None:
-    given = Given(60, 90, "known")
+    given = RandomPicture(60, 90, "known")
     whole = given.found()
     picture, by_alpha, by_nodes = (torch.zeros_like(tensor) for tensor in (whole[0], whole[2], whole[3]))
     for rows in (slice(0, 24), slice(24, 60)):
         for columns in (slice(0, 40), slice(40, 90)):
-            part = Given(60, 90, "known")
+            part = RandomPicture(60, 90, "known")
             there = (
                 slice(rows.start // STEP_PX, rows.start // STEP_PX + nodes_along(rows.stop - rows.start)),
                 slice(columns.start // STEP_PX, columns.start // STEP_PX + nodes_along(columns.stop - columns.start)),
@@ -111,7 +111,7 @@ def test_windows_show_what_the_whole_shows_and_their_gradients_add_up() -> None:
 
 
 def test_what_is_no_sky_may_be_anything() -> None:
-    given = Given(30, 50, "known")
+    given = RandomPicture(30, 50, "known")
     expected = given.found()
     mask = given.behind.mask
     assert mask is not None
@@ -121,7 +121,7 @@ def test_what_is_no_sky_may_be_anything() -> None:
 
 
 def test_nodes_that_do_not_fit_are_refused() -> None:
-    given = Given(20, 20, "known")
+    given = RandomPicture(20, 20, "known")
     for step, around in ((9, given.behind.around), (0, given.behind.around), (6, given.behind.around), (8, None)):
         with pytest.raises(ValueError, match="nodes"):
             laid_over_nodes(given.colour, given.alpha, given.nodes, replace(given.behind, step=step, around=around))

@@ -14,7 +14,7 @@ from splatpipe.pipeline.train.lengths import (
     FIRST_MOST,
     PART_VISITS,
     WHOLE_VISITS,
-    Footage,
+    PhotoSizes,
     Stretch,
     divided,
     growth_until,
@@ -23,10 +23,10 @@ from splatpipe.pipeline.train.lengths import (
     stretches,
 )
 from splatpipe.pipeline.train.limits import PIXEL_BYTES, SMALLEST_WINDOW, window_within
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.schedule import resolve_schedule
+from splatpipe.pipeline.train.windows import TrainingSize
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -36,8 +36,8 @@ PHOTOS = (11, 50, 167, 500, 1000)
 SIZES = {0.3: (640, 480), 1.0: (1152, 864), 4.0: (2304, 1728), 20.0: (5184, 3888)}
 
 
-def footage_of(photos: int, size: float, window: int = WINDOW) -> Footage:
-    return Footage(((*SIZES[size], photos),), window)
+def footage_of(photos: int, size: float, window: int = WINDOW) -> PhotoSizes:
+    return PhotoSizes(((*SIZES[size], photos),), window)
 
 
 @pytest.mark.parametrize("photos", PHOTOS)
@@ -51,7 +51,7 @@ def test_every_part_of_every_photo_is_seen_often_enough_at_every_size(photos: in
     assert footage.parts(first) == photos and whole >= WHOLE_VISITS * photos
     assert all(count >= PART_VISITS * footage.parts(level) for level, count in finer)
     assert least <= sum(count for _, count in found)
-    shown = [Look(level, footage.window_at(level)) for level, _ in found]
+    shown = [TrainingSize(level, footage.window_at(level)) for level, _ in found]
     assert all(0.0 < footage.pixels(look) <= WINDOW and footage.largest(look) <= WINDOW for look in shown)
     assert growth_until(found) == sum(count for _, count in found[:-1]) + found[-1][1] // 2
 
@@ -63,7 +63,7 @@ def test_few_photos_take_the_least_and_more_take_more_in_proportion() -> None:
     # What 50 photos are looked at in all: no more than 1.4 times what 7,000 iterations at 0.5 megapixels were.
     footage = footage_of(50, 4.0)
     pixels = sum(
-        count * footage.pixels(Look(level, footage.window_at(level))) for level, count in lengths(footage, 7000)
+        count * footage.pixels(TrainingSize(level, footage.window_at(level))) for level, count in lengths(footage, 7000)
     )
     assert 0.7 < pixels / (7000 * 0.5e6) < 1.4
 
@@ -91,10 +91,10 @@ def test_a_size_that_a_short_run_would_hardly_see_is_left_out() -> None:
 
 
 def test_photos_of_several_sizes_begin_where_half_of_them_fit_in_whole() -> None:
-    mixed = Footage(((*SIZES[0.3], 60), (*SIZES[20.0], 40)), WINDOW)
+    mixed = PhotoSizes(((*SIZES[0.3], 60), (*SIZES[20.0], 40)), WINDOW)
     assert mixed.first_level == 0 and mixed.parts(0) > mixed.photos
-    assert mixed.window_at(0) == WINDOW and mixed.share(Look(0, WINDOW)) < 1.0
-    assert Footage(((*SIZES[20.0], 40),), 0).first_level == 0
+    assert mixed.window_at(0) == WINDOW and mixed.share(TrainingSize(0, WINDOW)) < 1.0
+    assert PhotoSizes(((*SIZES[20.0], 40),), 0).first_level == 0
 
 
 def test_stretches_are_the_lengths_with_the_options_halvings_before_them() -> None:
@@ -114,8 +114,14 @@ def test_a_schedule_grows_gaussians_into_the_finest_size_and_resets_none_there()
     assert schedule.finest_from < schedule.density.last < schedule.iterations
     resets = [iteration for iteration in range(1, schedule.iterations + 1) if schedule.density.is_reset(iteration)]
     assert resets and max(resets) < each[0][1]
-    assert schedule.look_at(1) == Look(2) and schedule.look_at(schedule.iterations + 5) == Look(0, WINDOW)
-    assert [schedule.looks_to(each[0][1] + 1)[index] for index in (0, -2, -1)] == [Look(2), Look(2), Look(1, WINDOW)]
+    assert schedule.look_at(1) == TrainingSize(2) and schedule.look_at(schedule.iterations + 5) == TrainingSize(
+        0, WINDOW
+    )
+    assert [schedule.looks_to(each[0][1] + 1)[index] for index in (0, -2, -1)] == [
+        TrainingSize(2),
+        TrainingSize(2),
+        TrainingSize(1, WINDOW),
+    ]
 
 
 def test_many_photos_lengthen_the_phases_and_not_the_steps() -> None:
@@ -148,14 +154,14 @@ def views_of(size: float, count: int = 50) -> list:
     return views
 
 
-def plan_of(size: float, **options: object) -> Plan:
+def plan_of(size: float, **options: object) -> TrainingPlan:
     views = views_of(size)
     return make_plan(TrainConfig.model_validate(options), views, tiny_scene.split_of(views, 8), 1000, WINDOW)
 
 
 def test_a_plan_keeps_its_sizes_and_windows_and_tells_them() -> None:
     plan = plan_of(4.0, least_iterations=7000)
-    assert Plan.from_json(plan.to_json()) == plan and plan.last_iteration == plan.schedule.iterations
+    assert TrainingPlan.from_json(plan.to_json()) == plan and plan.last_iteration == plan.schedule.iterations
     assert plan.train_megapixels == pytest.approx(3.98, abs=0.01) and plan.megapixels is None
     assert "0.25 to 3.98 MP in windows of 0.44 MP" in plan.described()
     smaller = plan.of(plan.options.model_copy(update={"max_megapixels": 0.3}))

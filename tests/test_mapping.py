@@ -9,22 +9,22 @@ import pytest
 
 from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
 from splatpipe.pipeline.sfm.reduction import PAIR_FLOOR, best_keypoints, write_reduced
-from splatpipe.pipeline.sfm.verified import Verified, read_verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from flight_scene import FOCAL_PX, GSD_M, Flight, make_flight, write_database
+from flight_scene import FOCAL_PX, GSD_M, SyntheticFlight, make_flight, write_database
 from mapped_apart import centre_errors, centres, oracle
 
 PHOTOS, SEED, OBSERVATIONS = 48, 1, 500
 
 
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight() -> SyntheticFlight:
     return make_flight(PHOTOS, SEED, OBSERVATIONS)
 
 
 @pytest.fixture(scope="module")
-def database(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def database(flight: SyntheticFlight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("flight") / "database.db"
     write_database(flight, path, SEED)
     return path
@@ -35,14 +35,14 @@ def mapped(database: Path, tmp_path_factory: pytest.TempPathFactory) -> list[pyc
     return map_incremental(database, tmp_path_factory.mktemp("scratch"), MappingOptions(), lambda *_: None)
 
 
-def error_gsd(model: pycolmap.Reconstruction, flight: Flight) -> float:
+def error_gsd(model: pycolmap.Reconstruction, flight: SyntheticFlight) -> float:
     numbers, found = centres(model)
     errors, _ = centre_errors(found, flight.centres_m[np.array(numbers) - 1])
     return float(np.sqrt(np.mean(errors**2))) / GSD_M
 
 
 def test_cameras_come_out_at_the_truth_for_all_that_is_wrong(
-    mapped: list[pycolmap.Reconstruction], flight: Flight
+    mapped: list[pycolmap.Reconstruction], flight: SyntheticFlight
 ) -> None:
     """Although a fifth of the matches is wrong and the focal length starts 3 % off."""
     assert [model.num_reg_images() for model in mapped] == [PHOTOS]
@@ -52,7 +52,9 @@ def test_cameras_come_out_at_the_truth_for_all_that_is_wrong(
     assert error_gsd(mapped[0], flight) < 2.0 * error_gsd(oracle(flight), flight)
 
 
-def test_all_true_tracks_are_in_the_model_at_last(mapped: list[pycolmap.Reconstruction], flight: Flight) -> None:
+def test_all_true_tracks_are_in_the_model_at_last(
+    mapped: list[pycolmap.Reconstruction], flight: SyntheticFlight
+) -> None:
     model = mapped[0]
     starts = np.searchsorted(flight.photo, np.arange(PHOTOS))
     votes, observed = [], 0
@@ -87,7 +89,7 @@ def test_the_best_keypoints_are_spread_and_bring_their_partners() -> None:
     places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2).astype(np.float32)
     matches = {(1, 2): np.stack([np.arange(1600), np.arange(1600)[::-1]], axis=1).astype(np.uint32)}
     matches[1, 3] = matches[1, 2][700:720]  # these are verified twice: in the middle, and first of their cells
-    chosen = best_keypoints(Verified({}, {}, {}, {1: places, 2: places, 3: places}, matches), 128)
+    chosen = best_keypoints(ViewGraph({}, {}, {}, {1: places, 2: places, 3: places}, matches), 128)
     cells = np.bincount((places[chosen[1]] // 5).astype(int) @ [1, 8], minlength=64)
     assert cells.min() == 2
     assert chosen[1][700:720].all()
@@ -100,7 +102,7 @@ def test_the_best_keypoints_are_spread_and_bring_their_partners() -> None:
 
 def test_photos_without_matches_have_none_chosen() -> None:
     places = np.zeros((3, 2), np.float32)
-    chosen = best_keypoints(Verified({}, {}, {}, {1: places, 2: places[:0]}, {}), 10)
+    chosen = best_keypoints(ViewGraph({}, {}, {}, {1: places, 2: places[:0]}, {}), 10)
     assert chosen[1].tolist() == [False, False, False] and len(chosen[2]) == 0
 
 

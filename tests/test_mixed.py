@@ -12,7 +12,7 @@ from splatpipe.pipeline.photos.camera_groups import CameraGroup, describe_camera
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import Exif
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from surveyed import HEIGHT, LENS, TRUTH, WIDTH, true_model
@@ -97,7 +97,7 @@ def test_exif_of_another_size_is_scaled_and_said_so() -> None:
     assert any("1600 × 900" in note and "cropped" in note for note in notes.notes)
 
 
-def two_cameras(alone: float) -> tuple[pycolmap.Reconstruction, Verified, list[dict[str, object]]]:
+def two_cameras(alone: float) -> tuple[pycolmap.Reconstruction, ViewGraph, list[dict[str, object]]]:
     """The demo's cameras, the last photo by the same body at half the size, its focal length wrong by a factor."""
     source = true_model(points=400)
     model = pycolmap.Reconstruction()
@@ -123,7 +123,7 @@ def two_cameras(alone: float) -> tuple[pycolmap.Reconstruction, Verified, list[d
     names = {number: TRUTH["photos"][number - 1]["name"] for number in numbers}
     body = {"make": "DJI", "model_name": "FC330", "focal_source": "sensor-table"}
     groups = [body | {"width": WIDTH // k, "height": HEIGHT // k, "focal_px": LENS[0] / 1.03 / k} for k in (1, 2)]
-    return model, Verified(names, camera_of, priors, {}, {}), groups
+    return model, ViewGraph(names, camera_of, priors, {}, {}), groups
 
 
 def test_a_single_photos_focal_length_is_that_of_its_body() -> None:

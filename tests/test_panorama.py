@@ -13,7 +13,7 @@ from splatpipe.pipeline.splat.panorama import (
     ROWS,
     Panorama,
     cells_of,
-    laid_over,
+    composite_over,
     read_panorama,
     write_panorama,
 )
@@ -94,7 +94,7 @@ def test_render_over_another_background_is_a_render_laid_over_it() -> None:
     old = (0.2, 0.9, 0.4)
     over_old = alpha[:, :, None] * own + (1.0 - alpha)[:, :, None] * torch.tensor(old)
     expected = alpha[:, :, None] * own + (1.0 - alpha)[:, :, None] * behind
-    torch.testing.assert_close(laid_over(over_old, alpha, old, behind), expected)
+    torch.testing.assert_close(composite_over(over_old, alpha, old, behind), expected)
 
 
 def test_file_comes_back_and_is_the_same_each_time(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from path_frames import Frame, change, nearest_first
+from path_frames import PathFrame, change, nearest_first
 
 
 def camera(place: tuple[float, float, float], turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Camera:
@@ -31,10 +31,10 @@ def test_brighter_is_told_from_moved() -> None:
         columns, rows = np.meshgrid(np.arange(120) + 0.5 + 10.0 * x, np.arange(90) + 0.5)
         grey = 120.0 + 60.0 * np.sin(columns / 9.0) * np.sin(rows / 7.0) + brighter
         pixels = np.repeat(np.round(grey)[:, :, None], 3, axis=2).astype(np.uint8)
-        frames.append(Frame(camera((x, 0, 0)), pixels, np.full((90, 120), 10.0, np.float32)))
+        frames.append(PathFrame(camera((x, 0, 0)), pixels, np.full((90, 120), 10.0, np.float32)))
     moved, brighter = change(frames[0], frames[1]), change(frames[0], frames[2])
     assert moved["places"] == brighter["places"] > 900
     assert abs(moved["exposure"]) < 0.1 and moved["colour"] < 0.1
     assert abs(brighter["exposure"] - 12.0) < 0.1 and abs(brighter["colour"] - 12.0) < 0.1
-    hidden = Frame(frames[1].camera, frames[1].pixels, np.full((90, 120), 5.0, np.float32))
+    hidden = PathFrame(frames[1].camera, frames[1].pixels, np.full((90, 120), 5.0, np.float32))
     assert change(frames[0], hidden) == {"places": 0}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.surface.photo_samples import Lens, PhotoSource
+from splatpipe.pipeline.surface.photo_samples import DistortionGrid, PhotoSource
 from splatpipe.pipeline.surface.pixel_file import pixels_on_disk
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -20,7 +20,7 @@ CAMERA = photo_camera("photo", (0.0, 0.0, 20.0), (0.0, 0.0, 0.0))
 def photos(decoded: Counter[int]) -> tuple[list[PhotoSource], list[np.ndarray]]:
     """Three that tell when they are decoded; the last one is larger than its pinhole."""
     random = np.random.default_rng(1)
-    lens = Lens(301, 199, 120.0, np.zeros((3, 3, 2)))
+    lens = DistortionGrid(301, 199, 120.0, np.zeros((3, 3, 2)))
     pixels = [random.integers(0, 256, (h, w, 3)).astype(np.uint8) for h, w in ((180, 240), (180, 240), (199, 301))]
 
     def source(number: int) -> PhotoSource:
@@ -59,7 +59,7 @@ def test_photos_that_memory_holds_stay_as_they_are(tmp_path: Path) -> None:
 
 def test_what_the_disk_has_no_room_for_stays_as_it_is(tmp_path: Path) -> None:
     vast = PhotoSource(
-        CAMERA, lambda: np.zeros((0, 0, 3), np.uint8), None, Lens(1 << 30, 1 << 30, 8.0, np.zeros((2, 2, 2)))
+        CAMERA, lambda: np.zeros((0, 0, 3), np.uint8), None, DistortionGrid(1 << 30, 1 << 30, 8.0, np.zeros((2, 2, 2)))
     )
     with pixels_on_disk([vast], tmp_path, held_bytes=1000) as mapped:
         assert mapped == [vast]

@@ -12,15 +12,15 @@ import pytest
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.geometry.alignment import robust_similarity
-from splatpipe.pipeline.geometry.correspondences import Correspondences, Shared
+from splatpipe.pipeline.geometry.correspondences import Correspondences, SharedErrors
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector, turn_between
 from splatpipe.pipeline.survey.fitting import NoPlaceError, PositionFit
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.gps import georeference, tell
 from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.survey.local_survey import stations_of
 from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.place import stations_of
 from splatpipe.pipeline.survey.receiver_noise import fit_with_noise
 from splatpipe.pipeline.survey.uncertainty import student_95
 
@@ -185,7 +185,7 @@ def test_flights_share_errors_besides_their_noise() -> None:
     rng = np.random.default_rng(3)
     group = np.repeat([0, 1], 20)
     target = CENTRES + rng.normal(size=(40, 3)) + np.where(group[:, None] == 1, [4.0, 0.0, 0.0], 0.0)
-    shared = Shared(group, np.full((2, 3), 3.0))
+    shared = SharedErrors(group, np.full((2, 3), 3.0))
     before = np.arange(40) - 1
     before[20] = -1
     points = Correspondences(MODEL_FROM_WORLD.apply(CENTRES), target, np.full((40, 3), 3.0), shared)

@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("isa")
 
 
 @dataclass
-class Outcome:
+class RenderOutcome:
     """A render and the gradients of a weighted sum of it."""
 
     render: Render
@@ -47,7 +47,7 @@ class Outcome:
 
 def evaluate(
     scene: Gaussians, camera: Camera, options: RenderOptions, backend: str = "native", weight: Tensor | None = None
-) -> Outcome:
+) -> RenderOutcome:
     """Render and differentiate; ``weight`` (h, w) is multiplied to every picture's random weights."""
     scene = scene.detach().clone().requires_grad_()
     probe = torch.zeros(len(scene), 2, dtype=scene.means.dtype, requires_grad=True)
@@ -59,7 +59,7 @@ def evaluate(
         weights = torch.randn(picture.shape, generator=generator)
         total = total + (picture * weights * (1.0 if weight is None else weight[..., None])).sum()
     leaves = scene.tensors() | {"means2d": probe}
-    return Outcome(result, dict(zip(leaves, torch.autograd.grad(total, list(leaves.values())), strict=True)))
+    return RenderOutcome(result, dict(zip(leaves, torch.autograd.grad(total, list(leaves.values())), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,12 @@ class _Arguments:
     weight: bytes
 
 
-_ANSWERS: dict[_Arguments, Outcome] = {}
+_ANSWERS: dict[_Arguments, RenderOutcome] = {}
 
 
-def evaluate_exactly(scene: Gaussians, camera: Camera, options: RenderOptions, weight: Tensor | None = None) -> Outcome:
+def evaluate_exactly(
+    scene: Gaussians, camera: Camera, options: RenderOptions, weight: Tensor | None = None
+) -> RenderOutcome:
     """``evaluate`` with the reference in float64."""
     arguments = _Arguments(
         b"".join(tensor.numpy().tobytes() for tensor in scene.tensors().values()),
@@ -252,7 +254,7 @@ def test_zero_quaternion_is_the_identity_without_gradient() -> None:
     assert (ours.gradients["quats"] == 0).all()
 
 
-def same_bits(a: Outcome, b: Outcome) -> bool:
+def same_bits(a: RenderOutcome, b: RenderOutcome) -> bool:
     pictures = ("colour", "alpha", "depth_sum", "depth_square_sum", "median_depth", "visible", "radii")
     return all(torch.equal(getattr(a.render, p), getattr(b.render, p)) for p in pictures) and all(
         torch.equal(a.gradients[name], b.gradients[name]) for name in a.gradients

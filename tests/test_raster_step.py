@@ -13,7 +13,7 @@ from torch import Tensor
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render, set_threads
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.dropout import _Dropped
+from splatpipe.pipeline.train.dropout import _DropoutLogits
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from random_scene import random_camera, random_scene
@@ -47,7 +47,7 @@ def trained(start: Gaussians, fused: bool, dropout: bool = False, magnitudes: bo
     for step in range(STEPS):
         model, probe = scene, torch.zeros(len(scene), 2, requires_grad=True)
         if dropout:
-            model = replace(scene, opacity_logits=_Dropped.apply(scene.opacity_logits, kept, 0.25))
+            model = replace(scene, opacity_logits=_DropoutLogits.apply(scene.opacity_logits, kept, 0.25))
         options = RenderOptions(min(step, scene.sh_degree), depth=step % 2 == 1, magnitudes=magnitudes)
         rendered = render(model, (WIDE, TALL)[step % 2], options, means2d_probe=probe, buffers=buffers)
         pictures = (rendered.colour, rendered.alpha, rendered.depth_square_sum)
@@ -129,7 +129,9 @@ def test_the_first_rows_alone_can_be_stepped(dropout: bool) -> None:
         optimizer, probe = Adam(scene.tensors()), torch.zeros(1, 2).expand(500, 2).requires_grad_()
         model = whole
         if dropout:
-            model = replace(whole, opacity_logits=_Dropped.apply(whole.opacity_logits, torch.arange(500) % 4 > 0, 0.25))
+            model = replace(
+                whole, opacity_logits=_DropoutLogits.apply(whole.opacity_logits, torch.arange(500) % 4 > 0, 0.25)
+            )
         rendered = render(model, WIDE, RenderOptions(3, depth=False), means2d_probe=probe, buffers=buffers)
         rendered.colour.square().mean().backward()
         for name, tensor in scene.tensors().items():

@@ -10,18 +10,18 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.photo_list import PhotoList
-from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.probing import probe
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
-from splatpipe.pipeline.sfm.verified import read_verified
+from splatpipe.pipeline.sfm.view_graph import read_verified
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import corner_photos
 from view_graph import Ring, add_points, make_ring, model_of, moved, turn_up, write_database, write_descriptors
 
 
-def capture_of(ring: Ring, folder: Path, reach: int = 99) -> Capture:
+def capture_of(ring: Ring, folder: Path, reach: int = 99) -> MappingInput:
     """Matches of photos up to ``reach`` places apart, and none round the end; descriptors of all."""
     folder.mkdir()
     write_database(ring.verified, folder / "matches.db", lambda i, j: j - i <= reach)
@@ -32,7 +32,7 @@ def capture_of(ring: Ring, folder: Path, reach: int = 99) -> Capture:
     scratch = folder / "scratch"
     scratch.mkdir()
     databases = folder / "matches.db", folder / "features.db"
-    return Capture(*databases, colours, PhotoList(()), folder, folder, [], [camera], scratch)
+    return MappingInput(*databases, colours, PhotoList(()), folder, folder, [], [camera], scratch)
 
 
 def far_off(ring: Ring, model: pycolmap.Reconstruction) -> float:
@@ -45,7 +45,7 @@ def far_off(ring: Ring, model: pycolmap.Reconstruction) -> float:
     return float(np.sqrt(np.mean(np.sum(np.square(off), axis=1)))) / 20.0
 
 
-def answers(found: Found) -> list[tuple[object, ...]]:
+def answers(found: MappingResult) -> list[tuple[object, ...]]:
     """All bits of an answer but the time that it took."""
     rows = [tuple((key, str(row[key])) for key in sorted(row) if key != "cpu_s") for row in found.tried]
     poses = [found.model.images[number].cam_from_world().matrix().tobytes() for number in found.model.reg_image_ids()]
@@ -53,13 +53,13 @@ def answers(found: Found) -> list[tuple[object, ...]]:
 
 
 @pytest.fixture(scope="module")
-def weak(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ring, Capture]:
+def weak(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ring, MappingInput]:
     """Forty matches a pair: too few for incremental mapping to begin with, enough for all photos at once."""
     ring = make_ring(most=45)
     return ring, capture_of(ring, tmp_path_factory.mktemp("weak") / "capture")
 
 
-def test_auto_takes_the_other_mapper_where_the_first_one_fails(weak: tuple[Ring, Capture]) -> None:
+def test_auto_takes_the_other_mapper_where_the_first_one_fails(weak: tuple[Ring, MappingInput]) -> None:
     ring, capture = weak
     found = reconstruct(capture, SparseConfig(), corner_photos.Recorder())
     assert found.model.num_reg_images() == 24
@@ -76,14 +76,14 @@ def test_photos_from_one_spot_are_not_placed_without_points(tmp_path: Path) -> N
     assert "from different places" in refused.value.hint
 
 
-def test_a_mapper_that_was_asked_for_is_not_replaced(weak: tuple[Ring, Capture]) -> None:
+def test_a_mapper_that_was_asked_for_is_not_replaced(weak: tuple[Ring, MappingInput]) -> None:
     found = reconstruct(weak[1], SparseConfig(mapper="global"), corner_photos.Recorder())
     assert [row["how"] for row in found.tried] == ["global"]
     with pytest.raises(SplatpipeError, match="of 24 photos could be placed"):
         reconstruct(weak[1], SparseConfig(mapper="incremental"), corner_photos.Recorder())
 
 
-def test_the_number_of_threads_changes_no_bit_of_the_answer(weak: tuple[Ring, Capture]) -> None:
+def test_the_number_of_threads_changes_no_bit_of_the_answer(weak: tuple[Ring, MappingInput]) -> None:
     one, two = (
         answers(reconstruct(replace(weak[1], threads=threads), SparseConfig(), corner_photos.Recorder()))
         for threads in (1, 2)

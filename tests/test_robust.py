@@ -16,17 +16,17 @@ from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.robust import (
     GRID,
     LEAST_RESIDUAL,
     MOST_OF_A_PHOTO,
     UNKNOWN,
-    Robust,
+    RobustMask,
     cell_residuals,
     share_at,
 )
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
@@ -67,13 +67,13 @@ def of_block(camera: Camera, block: tuple[int, int, int, int]) -> torch.Tensor:
     return result
 
 
-def looked(robust: Robust, camera: Camera, colour: torch.Tensor, mask: torch.Tensor | None = None) -> TrainingPhoto:
+def looked(robust: RobustMask, camera: Camera, colour: torch.Tensor, mask: torch.Tensor | None = None) -> TrainingPhoto:
     """A visit of a model that is the truth."""
     rendered = true_render(camera)
     return robust.look(TrainingPhoto(camera, colour, mask), rendered, rendered.colour)
 
 
-def an_epoch(robust: Robust, share: float = 0.05, cars: tuple[int, ...] = (2,)) -> dict[int, TrainingPhoto]:
+def an_epoch(robust: RobustMask, share: float = 0.05, cars: tuple[int, ...] = (2,)) -> dict[int, TrainingPhoto]:
     """A visit to every photo, some with a block painted into them; then the threshold of ``share``."""
     found = {}
     for number, camera in enumerate(cameras()):
@@ -84,13 +84,13 @@ def an_epoch(robust: Robust, share: float = 0.05, cars: tuple[int, ...] = (2,)) 
 
 
 @pytest.fixture
-def robust() -> Robust:
-    made = Robust([camera.name for camera in cameras()])
+def robust() -> RobustMask:
+    made = RobustMask([camera.name for camera in cameras()])
     made.watch(reversed(cameras()))  # in any order
     return made
 
 
-def test_block_that_the_other_photos_contradict_is_left_out_and_little_else(robust: Robust) -> None:
+def test_block_that_the_other_photos_contradict_is_left_out_and_little_else(robust: RobustMask) -> None:
     assert all(photo.mask is None for photo in an_epoch(robust).values())  # nothing is known before an epoch has ended
     photos = an_epoch(robust)
     assert all(photos[number].mask is None for number in photos if number != 2)
@@ -101,8 +101,10 @@ def test_block_that_the_other_photos_contradict_is_left_out_and_little_else(robu
     assert robust.share_left_out() == pytest.approx(float((~counts).float().mean()) / 9.0, rel=1e-6)
 
 
-def test_a_device_that_works_on_all_cells_leaves_out_the_same(robust: Robust, monkeypatch: pytest.MonkeyPatch) -> None:
-    other = Robust([camera.name for camera in cameras()])
+def test_a_device_that_works_on_all_cells_leaves_out_the_same(
+    robust: RobustMask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = RobustMask([camera.name for camera in cameras()])
     other.watch(cameras())
     an_epoch(robust), an_epoch(other)
     photos = an_epoch(robust)
@@ -114,7 +116,7 @@ def test_a_device_that_works_on_all_cells_leaves_out_the_same(robust: Robust, mo
     assert torch.equal(robust.scores, other.scores)
 
 
-def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(robust: Robust) -> None:
+def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(robust: RobustMask) -> None:
     """The model lacks a thing that all photos show: it has to be learnt."""
     for _ in range(2):
         for camera in cameras():
@@ -128,12 +130,12 @@ def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(rob
 
 
 def test_without_cameras_nothing_is_left_out() -> None:
-    robust = Robust([camera.name for camera in cameras()])
+    robust = RobustMask([camera.name for camera in cameras()])
     an_epoch(robust)
     assert all(photo.mask is None for photo in an_epoch(robust).values())
 
 
-def test_masked_pixels_stay_masked_and_are_not_judged(robust: Robust) -> None:
+def test_masked_pixels_stay_masked_and_are_not_judged(robust: RobustMask) -> None:
     an_epoch(robust)
     camera = cameras()[2]
     mask = ~of_block(camera, (0, 70, 108, 144))
@@ -156,7 +158,7 @@ def test_exposure_and_detail_out_of_place_are_no_motion_but_a_block_is() -> None
     assert float((residual > LEAST_RESIDUAL).float().mean()) > 0.02
 
 
-def test_holes_of_the_model_contradict_nothing(robust: Robust) -> None:
+def test_holes_of_the_model_contradict_nothing(robust: RobustMask) -> None:
     an_epoch(robust, cars=())
     camera = cameras()[2]
     rendered, hole = true_render(camera), of_block(camera, CARS[2])
@@ -164,7 +166,7 @@ def test_holes_of_the_model_contradict_nothing(robust: Robust) -> None:
     assert robust.look(TrainingPhoto(camera, true_photo(camera), None), rendered, rendered.colour).mask is None
 
 
-def test_no_more_than_a_quarter_of_a_photo_is_left_out(robust: Robust) -> None:
+def test_no_more_than_a_quarter_of_a_photo_is_left_out(robust: RobustMask) -> None:
     an_epoch(robust)
     camera = cameras()[4]
     generator = torch.Generator().manual_seed(1)
@@ -176,7 +178,7 @@ def test_no_more_than_a_quarter_of_a_photo_is_left_out(robust: Robust) -> None:
 
 
 def test_threshold_is_the_quantile_of_all_known_cells() -> None:
-    robust = Robust(["a", "b"])
+    robust = RobustMask(["a", "b"])
     robust.end_epoch(0.1)
     assert torch.isinf(robust.threshold).all()  # nothing known
     robust.scores[0] = torch.linspace(0.0, 1.0, GRID * GRID).view(GRID, GRID)
@@ -193,9 +195,9 @@ def test_share_rises_from_the_begin_of_density_control() -> None:
     assert shares == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1])
 
 
-def test_a_visit_that_is_begun_again_is_as_if_there_had_been_one(robust: Robust) -> None:
+def test_a_visit_that_is_begun_again_is_as_if_there_had_been_one(robust: RobustMask) -> None:
     plain, camera = RenderOptions(sh_degree=3), cameras()[2]
-    now = Moment(1, 1, 0.0, 0, 3, (0.0, 0.0, 0.0), 0.0, True)
+    now = ScheduleStep(1, 1, 0.0, 0, 3, (0.0, 0.0, 0.0), 0.0, True)
     model = tiny_scene.true_model()
     for number, colour in enumerate((true_photo(camera), painted(true_photo(camera), CARS[2]))):
         before = {name: tensor.clone() for name, tensor in robust.to_arrays().items()}
@@ -209,17 +211,17 @@ def test_a_visit_that_is_begun_again_is_as_if_there_had_been_one(robust: Robust)
         looked(robust, camera, colour)
 
 
-def test_memory_goes_through_arrays_and_refuses_another_shape(robust: Robust) -> None:
+def test_memory_goes_through_arrays_and_refuses_another_shape(robust: RobustMask) -> None:
     an_epoch(robust)
-    other = Robust([camera.name for camera in cameras()])
+    other = RobustMask([camera.name for camera in cameras()])
     other.load({name: tensor.clone() for name, tensor in robust.to_arrays().items()})
     assert all(torch.equal(tensor, robust.to_arrays()[name]) for name, tensor in other.to_arrays().items())
     with pytest.raises(ValueError, match="scores"):
-        Robust(["a"]).load(robust.to_arrays())
+        RobustMask(["a"]).load(robust.to_arrays())
 
 
 @dataclass
-class Trained:
+class TrainedRun:
     """A training on photos with blocks in two of them."""
 
     summary: dict[str, object]
@@ -241,7 +243,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Trained:
+def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> TrainedRun:
     out.mkdir(exist_ok=True)
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
     held_out = ",".join(cameras()[number].name for number in HELD_OUT)
@@ -250,7 +252,7 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
     kept: list[TrainState] = []
     step = loop.iterate
 
-    def keeping(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def keeping(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         kept[:] = [state]
         step(state, plan, photo)
 
@@ -262,14 +264,14 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
     views = [cameras()[number] for number in HELD_OUT]
     shown = [torch.from_numpy(tiny_scene.photograph(model, view)).float() / 255.0 for view in views]
     psnr = [float(metrics.psnr(one, true_photo(view))) for one, view in zip(shown, views, strict=True)]
-    return Trained(summary, float(np.mean(psnr)), kept[0], out)
+    return TrainedRun(summary, float(np.mean(psnr)), kept[0], out)
 
 
 def test_held_out_photos_are_better_without_what_moved(scene: Path, tmp_path: Path) -> None:
     off, on = trained(scene, tmp_path / "off", 0.0), trained(scene, tmp_path / "on", 0.05)
     assert on.psnr > off.psnr + 0.3
     assert "robust_left_out" not in off.summary and 0.01 < float(str(on.summary["robust_left_out"])) < 0.03
-    robust = on.state.techniques.find(Robust)
+    robust = on.state.techniques.find(RobustMask)
     assert robust is not None
     names = sorted(camera.name for number, camera in enumerate(cameras()) if number not in HELD_OUT)
     left_out = dict(zip(names, robust.left_out.tolist(), strict=True))
@@ -288,7 +290,7 @@ def test_killed_training_leaves_the_same_out_and_ends_with_the_same_bits(scene: 
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
         step = loop.iterate
 
-        def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+        def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
             if state.iteration == 71:
                 raise KeyboardInterrupt
             step(state, plan, photo)

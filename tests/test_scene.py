@@ -11,10 +11,10 @@ import torch
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat_header, write_splat
-from splatpipe.pipeline.splat.scene import MOST_RECORD_BYTES, Place, Scene, SceneFacts, facts_of_record, turn_of
+from splatpipe.pipeline.splat.scene import MOST_RECORD_BYTES, Scene, SceneFacts, SplatOrigin, facts_of_record, turn_of
 from splatpipe.pipeline.survey.handover import facts_of, frame_of
 
-PLACE = Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
+PLACE = SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
 FACTS = SceneFacts("z up", True, True, PLACE, ({"step": "crop", "box": [0, 1]},))
 
 

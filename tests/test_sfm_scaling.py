@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from splatpipe.pipeline.sfm.verified import read_verified
+from splatpipe.pipeline.sfm.view_graph import read_verified
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import flight_scene as scene
@@ -21,11 +21,11 @@ COUNT = 30
 
 
 @pytest.fixture(scope="module")
-def flight() -> scene.Flight:
+def flight() -> scene.SyntheticFlight:
     return scene.make_flight(COUNT, 0)
 
 
-def test_a_flight_has_the_observations_and_the_noise_that_are_asked_for(flight: scene.Flight) -> None:
+def test_a_flight_has_the_observations_and_the_noise_that_are_asked_for(flight: scene.SyntheticFlight) -> None:
     per_photo = np.bincount(flight.photo)
     assert per_photo.min() > 1000 and per_photo.mean() > 1500
     assert np.bincount(flight.point).max() == scene.LONGEST_TRACK
@@ -41,7 +41,7 @@ def test_a_flight_has_the_observations_and_the_noise_that_are_asked_for(flight: 
 
 
 def test_a_fifth_of_the_verified_matches_is_wrong_and_near_the_epipolar_line(
-    flight: scene.Flight, tmp_path: Path
+    flight: scene.SyntheticFlight, tmp_path: Path
 ) -> None:
     scene.write_database(flight, tmp_path / "database.db", 0)
     verified = read_verified(tmp_path / "database.db")
@@ -66,7 +66,7 @@ def test_a_fifth_of_the_verified_matches_is_wrong_and_near_the_epipolar_line(
     assert np.percentile(off, 95) < 2.0 * scene.EPIPOLAR_PX  # the lens bends the true ones off a pinhole's lines
 
 
-def test_pairs_a_photo_are_bounded_for_any_number_of_photos(flight: scene.Flight) -> None:
+def test_pairs_a_photo_are_bounded_for_any_number_of_photos(flight: scene.SyntheticFlight) -> None:
     small = 2 * len(scene.choose_pairs(flight, 0)) / COUNT
     large = 2 * len(scene.choose_pairs(scene.make_flight(90, 0, 10), 0)) / 90
     assert small < 30 and large < 30

@@ -21,7 +21,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.splat.formats.sog import encode_sog, read, write
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from tiny_scene import cameras, true_model
@@ -153,7 +153,7 @@ def test_our_reader_reads_what_the_specification_says(tmp_path: Path) -> None:
 
 
 def test_a_scene_comes_back_with_its_place_and_looks_the_same(tmp_path: Path) -> None:
-    place = Place(47.8, 13.5, 515.0, "EPSG:3855", "EPSG:32633")
+    place = SplatOrigin(47.8, 13.5, 515.0, "EPSG:3855", "EPSG:32633")
     scene = Scene(true_model(), SceneFacts("z up", metres=True, place=place, edits=({"what": "crop"},)))
     write(tmp_path / "a.sog", scene)
     found = read(tmp_path / "a.sog")

@@ -17,12 +17,12 @@ from splatpipe.pipeline.splat.formats.files import (
     write_scene,
 )
 from splatpipe.pipeline.splat.ply import write_splat
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from some_splats import some_gaussians
 
-FACTS = SceneFacts("z up", False, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
+FACTS = SceneFacts("z up", False, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
 
 
 READ = [kind for kind in SPLAT_FORMATS if any(each.reads and each.module == kind.module for each in SPLAT_FORMATS)]

@@ -19,7 +19,7 @@ from splatpipe.pipeline.raster.definitions import RenderOptions
 from splatpipe.pipeline.raster.rasterizer import render
 from splatpipe.pipeline.splat.formats import spz
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 from splatpipe.pipeline.splat.spz import spz_bytes
 
 QUARTER_TURN = math.sqrt(0.5)
@@ -182,7 +182,7 @@ def test_what_is_not_finite_is_refused() -> None:
         spz_bytes(made, antialias=False)
 
 
-FACTS = SceneFacts("y up", True, True, Place(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
+FACTS = SceneFacts("y up", True, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
 
 
 def version_4(data: bytes, degree: int = 3, extensions: bytes = b"", flags: int = 0) -> bytes:

@@ -13,8 +13,8 @@ from splatpipe.pipeline.splat.ply import write_splat
 from splatpipe.pipeline.splat.sparse_count import sparse_comment
 from splatpipe.pipeline.train import plan as planned
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.start import Start, read_start, started
+from splatpipe.pipeline.train.plan import TrainingPlan
+from splatpipe.pipeline.train.start import InitialGaussians, read_start, started
 from splatpipe.stages import train
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -23,11 +23,11 @@ import tiny_scene
 SPARSE, SWEPT = 40, 100
 
 
-def numbered() -> Start:
+def numbered() -> InitialGaussians:
     """A start whose means tell the rows."""
     gaussians = tiny_scene.true_model(SPARSE + SWEPT)
     gaussians.means = torch.arange(3.0 * len(gaussians)).view(-1, 3)
-    return Start(gaussians, SPARSE)
+    return InitialGaussians(gaussians, SPARSE)
 
 
 def rows_of(gaussians: Gaussians) -> list[int]:
@@ -68,7 +68,7 @@ def test_density_control_grows_by_its_schedule_from_what_a_cap_has_left_of_the_s
     parts = {"undistort.dataset": dataset, "initialize.splat": tmp_path / "init.ply"} | tiny_scene.split_part(dataset)
     inputs = Inputs(parts, tmp_path, machine=Machine("cpu", 1))
     train.run(tiny_scene.plain(iterations=60, max_gaussians=400), inputs, tmp_path, tiny_scene.Recorder())
-    plan = Plan.from_json((tmp_path / "plan.json").read_text())
+    plan = TrainingPlan.from_json((tmp_path / "plan.json").read_text())
     assert plan.initial_gaussians == 200
     events = json.loads((tmp_path / "history.json").read_text())["density"]
     room = [room_at(plan.schedule.density, 200, event["iteration"]) for event in events]

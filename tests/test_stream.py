@@ -20,9 +20,9 @@ from splatpipe.pipeline.geometry.camera import Camera, reduced_size
 from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.photos.images import load_colour, load_mask, reduced_camera, reduced_view
 from splatpipe.pipeline.train import photo_cache
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.visits import PhotoVisits
+from splatpipe.pipeline.train.windows import TrainingSize
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -44,7 +44,7 @@ def cache(tmp_path: Path) -> Path:
 
 
 def streamed(views: list[View], cache: Path, levels: list[int], first: int = 1, **size: float) -> list[TrainingPhoto]:
-    with PhotoStream.over(views, [Look(level) for level in levels], 0, first, cache, **size) as photos:
+    with PhotoStream.over(views, [TrainingSize(level) for level in levels], 0, first, cache, **size) as photos:
         return list(photos)
 
 
@@ -157,7 +157,7 @@ def touched(place: int, full: int, reduced: int) -> npt.NDArray[np.bool_]:
 def test_photos_are_decoded_once_and_the_files_are_not_needed_again(dataset: Path, cache: Path) -> None:
     views = load_views(dataset)
     levels = [1] * len(views) + [0] * len(views)
-    with PhotoStream.over(views, [Look(level) for level in levels * 2], 0, 1, cache) as photos:
+    with PhotoStream.over(views, [TrainingSize(level) for level in levels * 2], 0, 1, cache) as photos:
         first = [next(photos) for _ in levels]
         next_ones = [next(photos)]
         shutil.rmtree(dataset)
@@ -174,10 +174,10 @@ def test_a_stream_that_goes_on_with_other_looks_is_as_one_begun_with_them(
     views = load_views(dataset)
     planned, later = [2] * 20 + [1] * 20, [2] * 12 + [1] * 5 + [0] * 13
     expected = streamed(views, cache, later)
-    with PhotoStream.over(views, [Look(level) for level in planned], 0, begun, cache) as photos:
+    with PhotoStream.over(views, [TrainingSize(level) for level in planned], 0, begun, cache) as photos:
         photos.fill(tiny_scene.Recorder())
         seen = [next(photos) for _ in range(begun, 13)]
-        photos.go_on(PhotoVisits([view.camera for view in views], [Look(level) for level in later], 0), 13)
+        photos.go_on(PhotoVisits([view.camera for view in views], [TrainingSize(level) for level in later], 0), 13)
         seen += photos
     assert len(seen) == len(expected[begun - 1 :])
     assert all(same(one, other) for one, other in zip(seen, expected[begun - 1 :], strict=True))
@@ -185,11 +185,11 @@ def test_a_stream_that_goes_on_with_other_looks_is_as_one_begun_with_them(
 
 def test_cache_has_no_name_and_the_thread_ends_with_the_stream(dataset: Path, cache: Path) -> None:
     views = load_views(dataset)
-    with PhotoStream.over(views, [Look()] * 40, 0, 1, cache) as photos:
+    with PhotoStream.over(views, [TrainingSize()] * 40, 0, 1, cache) as photos:
         for _ in range(20):
             next(photos)
             assert not list(cache.iterdir())
-    with pytest.raises(KeyboardInterrupt), PhotoStream.over(views, [Look()] * 40, 0, 1, cache) as photos:
+    with pytest.raises(KeyboardInterrupt), PhotoStream.over(views, [TrainingSize()] * 40, 0, 1, cache) as photos:
         next(photos)
         raise KeyboardInterrupt
     assert not list(cache.iterdir())
@@ -253,7 +253,7 @@ def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_and_that_is_told(
     for room, warnings in ((30_000, 1), (0, 1), (1 << 20, 0)):
         monkeypatch.setattr(photo_cache, "SHARE_OF_FREE", room / free)
         recorder = tiny_scene.Recorder()
-        with PhotoStream.over(views, [Look()] * 30, 0, 1, cache) as photos:
+        with PhotoStream.over(views, [TrainingSize()] * 30, 0, 1, cache) as photos:
             photos.tell(recorder)
             assert all(same(one, other) for one, other in zip(photos, usual, strict=True))
         assert len(recorder.warnings) == warnings
@@ -261,9 +261,11 @@ def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_and_that_is_told(
 
 def test_photos_wanted_once_are_not_stored(dataset: Path, cache: Path) -> None:
     views = load_views(dataset)
-    with PhotoStream.over(views, [Look()] * len(views), 0, 1, cache) as photos:
+    with PhotoStream.over(views, [TrainingSize()] * len(views), 0, 1, cache) as photos:
         assert photos.wanted_bytes() == 0
-    with PhotoStream.over(views, [Look(1)] * len(views) + [Look()] * (len(views) + 2), 0, 1, cache) as photos:
+    with PhotoStream.over(
+        views, [TrainingSize(1)] * len(views) + [TrainingSize()] * (len(views) + 2), 0, 1, cache
+    ) as photos:
         pages = -(-3 * tiny_scene.WIDTH * tiny_scene.HEIGHT // 4096) * 4096
         half = -(-3 * tiny_scene.WIDTH * tiny_scene.HEIGHT // 4 // 4096) * 4096
         unmasked, masked = len(views) - 1, 2 * 4096  # one more byte a pixel with a mask

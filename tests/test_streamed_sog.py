@@ -11,10 +11,10 @@ import torch
 from splatpipe.pipeline.splat.formats import sog
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.levels import LevelNode, build_levels
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts, facts_of_record
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
 from splatpipe.pipeline.splat.streamed_sog import LOD_META, write_streamed_sog
 
-FACTS = SceneFacts("z up", metres=True, place=Place(47.8, 13.5, 515.0, crs="EPSG:32633"))
+FACTS = SceneFacts("z up", metres=True, place=SplatOrigin(47.8, 13.5, 515.0, crs="EPSG:32633"))
 
 
 @pytest.fixture(scope="module")

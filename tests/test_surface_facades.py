@@ -19,13 +19,13 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface import elevation as elevation_module
-from splatpipe.pipeline.surface.elevation import Elevation, Photos, draw_elevation, wall_sheet
+from splatpipe.pipeline.surface.elevation import Elevation, ElevationPhotos, draw_elevation, wall_sheet
 from splatpipe.pipeline.surface.facades import FacadesTask, make_facades
 from splatpipe.pipeline.surface.facets import Facets, facets_of, upright_facets
 from splatpipe.pipeline.surface.holes import filled
-from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
 from splatpipe.pipeline.surface.openings import outlines, projections, recesses
+from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sources import DepthSource
 from splatpipe.pipeline.surface.walls import LEAST_HEIGHT_M, Wall, find_walls
@@ -81,7 +81,9 @@ def walls() -> dict[str, Wall]:
 
 
 def drawn(name: str, threads: int = 1) -> Elevation:
-    return draw_elevation(walls()[name], PIXEL_M, Photos(photos(), Levels.plain(16), threads), lambda done, total: None)
+    return draw_elevation(
+        walls()[name], PIXEL_M, ElevationPhotos(photos(), PhotoGains.plain(16), threads), lambda done, total: None
+    )
 
 
 @cache

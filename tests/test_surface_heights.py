@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.surface.heights import Capture, Heights, surface_heights, tile_heights
+from splatpipe.pipeline.surface.heights import HeightInput, Heights, surface_heights, tile_heights
 from splatpipe.pipeline.surface.holes import filled
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sheet import Sheet
-from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, photos_seeing
 from splatpipe.pipeline.surface.tiles import Tile
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -21,7 +21,7 @@ from house_site import EAVES_M, ExactDepths, cameras, depths_of, edge_distance, 
 CELL_M = 0.2  # two pixels of the cameras that look down
 LATTICE = Lattice(-11.04, 8.07, CELL_M, 110, 80)
 WHOLE = Tile(0, 0, 80, 110)
-RELIEF = Relief(-1.0, 8.0)
+RELIEF = HeightRange(-1.0, 8.0)
 PIXEL_M = 0.1  # on the ground, of a camera that looks down
 
 
@@ -46,9 +46,9 @@ def noisy() -> tuple[ExactDepths, ...]:
     return tuple(result)
 
 
-def capture(maps: tuple[ExactDepths, ...], limit_bytes: int = 1 << 30, lattice: Lattice = LATTICE) -> Capture:
-    return Capture(
-        [DepthSource(found.camera, lambda found=found: found) for found in maps], lattice, RELIEF, Shelf(limit_bytes)
+def capture(maps: tuple[ExactDepths, ...], limit_bytes: int = 1 << 30, lattice: Lattice = LATTICE) -> HeightInput:
+    return HeightInput(
+        [DepthSource(found.camera, lambda found=found: found) for found in maps], lattice, RELIEF, LruCache(limit_bytes)
     )
 
 
@@ -134,9 +134,9 @@ def test_a_turned_sheet_gives_the_same_surface() -> None:
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]
     turn[:3, 3] = [0.5, -0.2, -2.0]
-    sheet = Sheet(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), Relief(-3.0, 6.0))
+    sheet = Sheet(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), HeightRange(-3.0, 6.0))
     sources = [sheet.moved_depths(DepthSource(found.camera, lambda found=found: found)) for found in exact()]
-    made = tile_heights(Capture(sources, sheet.lattice, sheet.relief, Shelf(1 << 30)), Tile(0, 0, 50, 60))
+    made = tile_heights(HeightInput(sources, sheet.lattice, sheet.relief, LruCache(1 << 30)), Tile(0, 0, 50, 60))
     places = np.concatenate([sheet.lattice.centres(made.tile), made.height[..., None]], axis=-1)
     east, north, up = np.moveaxis(sheet.local(places), -1, 0)
     clear = edge_distance(east, north) > 2 * CELL_M
@@ -203,12 +203,12 @@ def test_a_hole_at_a_wall_is_ground_and_a_wide_one_stays() -> None:
 def test_photos_that_cannot_see_a_tile_are_not_loaded() -> None:
     far = photo_camera("far", (200.0, 0.0, 20.0), (200.0, 0.0, 0.0))
     away = photo_camera("away", (20.0, 0.0, 2.0), (40.0, 0.0, 2.0))
-    assert seen_by([far, away], LATTICE, WHOLE, RELIEF) == []
+    assert photos_seeing([far, away], LATTICE, WHOLE, RELIEF) == []
 
     def never() -> ExactDepths:
         raise AssertionError("loaded")
 
-    tile_heights(Capture([DepthSource(far, never)], LATTICE, RELIEF, Shelf(1)), WHOLE)
+    tile_heights(HeightInput([DepthSource(far, never)], LATTICE, RELIEF, LruCache(1)), WHOLE)
 
 
 def test_depths_of_another_size_are_refused() -> None:
@@ -224,7 +224,7 @@ def test_a_lattice_without_cells_is_refused(arguments: tuple[float, float, float
 
 
 def test_a_shelf_keeps_within_its_limit() -> None:
-    shelf: Shelf[str] = Shelf(25)
+    shelf: LruCache[str] = LruCache(25)
     loads: list[str] = []
 
     def load(name: str) -> tuple[str, int]:

@@ -13,23 +13,23 @@ from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, rated, sampled
-from splatpipe.pipeline.surface.sight import Points, place_in, sight
-from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, window_of
+from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, DistortionGrid, PhotoSource, rated, sampled
+from splatpipe.pipeline.surface.point_visibility import Points, place_in, sight
+from splatpipe.pipeline.surface.sources import HeightRange, PhotoWindow, PosedDepthMap, window_of
 from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.surface.votes import Votes
+from splatpipe.pipeline.surface.votes import HeightVotes
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from house_site import cameras, depths_of, photo_of, true_height
 
 LATTICE = Lattice(-6.02, 5.03, 0.1, 120, 100)
 TILE = Tile(-3, -2, 70, 80)
-RELIEF = Relief(-1.0, 8.0)
+RELIEF = HeightRange(-1.0, 8.0)
 WHOLE = PhotoWindow(0, 0, 240, 180)
 
 
 @cache
-def maps() -> tuple[DepthMap, ...]:
+def maps() -> tuple[PosedDepthMap, ...]:
     """Exact depths with holes and noise."""
     random, found = np.random.default_rng(3), [depths_of(camera) for camera in cameras()[::3]]
     for each in found:
@@ -39,8 +39,8 @@ def maps() -> tuple[DepthMap, ...]:
     return tuple(found)
 
 
-def votes(window: PhotoWindow = WHOLE, tile: Tile = TILE) -> Votes:
-    made = Votes(LATTICE, tile, RELIEF)
+def votes(window: PhotoWindow = WHOLE, tile: Tile = TILE) -> HeightVotes:
+    made = HeightVotes(LATTICE, tile, RELIEF)
     for found in maps():
         made.add(found, window)
     return made
@@ -91,7 +91,7 @@ def test_a_larger_window_and_another_tile_change_no_bit() -> None:
     cut = np.s_[20 + 3 : 30 + 3, 30 + 2 : 42 + 2]
     for one, other in zip(part, whole, strict=False):
         assert np.array_equal(one.height.reshape(10, 12), other.height.reshape(70, 80)[cut], equal_nan=True)
-    made = Votes(LATTICE, tight, RELIEF)
+    made = HeightVotes(LATTICE, tight, RELIEF)
     for found in maps():
         made.add(found, window_of(found.camera, LATTICE, tight, RELIEF) or WHOLE)
     for one, other in zip(made.layers(), part, strict=True):
@@ -101,7 +101,7 @@ def test_a_larger_window_and_another_tile_change_no_bit() -> None:
 
 def test_heights_are_those_of_the_planes_through_pixels() -> None:
     found = depths_of(cameras()[4])  # looks straight down on the roof
-    made = Votes(LATTICE, TILE, RELIEF)
+    made = HeightVotes(LATTICE, TILE, RELIEF)
     made.add(found, WHOLE)
     layer = made.layers()[0]
     east, north = np.moveaxis(LATTICE.centres(TILE), -1, 0)
@@ -261,6 +261,6 @@ def test_a_lens_that_leads_beyond_the_photo_ends_at_its_rim() -> None:
     camera, points = cameras()[4], places()
     pixels = np.full((50, 40, 3), 77, np.uint8)
     for nodes in (np.full((3, 3, 2), 1e9), np.full((3, 3, 2), -np.inf), np.full((3, 3, 2), np.nan)):
-        source = PhotoSource(camera, lambda: pixels, None, Lens(40, 50, 100.0, nodes))
+        source = PhotoSource(camera, lambda: pixels, None, DistortionGrid(40, 50, 100.0, nodes))
         seen = place_in(camera, *points).inside
         assert (sampled(source, pixels, points, seen, 0.1, PLAIN_TONE)[seen] == 77).all()

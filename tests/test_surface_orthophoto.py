@@ -14,11 +14,11 @@ from splatpipe.pipeline.surface import mosaic
 from splatpipe.pipeline.surface.exposures import exposure_levels
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.levels import GAMMA, OFFSET, Levels
-from splatpipe.pipeline.surface.orthophoto import SPREAD, Album, Orthophoto, orthophotos, tile_orthophoto
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, Lens, PhotoSource, sampled, tone_curve
-from splatpipe.pipeline.surface.sight import contiguous, place_in
-from splatpipe.pipeline.surface.sources import DepthSource, Relief, Shelf
+from splatpipe.pipeline.surface.orthophoto import SPREAD, OrthoInput, Orthophoto, orthophotos, tile_orthophoto
+from splatpipe.pipeline.surface.photo_gains import GAMMA, OFFSET, PhotoGains
+from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, DistortionGrid, PhotoSource, sampled, tone_curve
+from splatpipe.pipeline.surface.point_visibility import contiguous, place_in
+from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -27,12 +27,12 @@ from house_site import cameras, depths_of, edge_distance, photo_of, true_height,
 HEIGHTS = Lattice(-11.04, 8.07, 0.1, 220, 160)
 FINE = Lattice(-11.04, 8.07, 0.1, 220, 160)
 WHOLE = Tile(0, 0, 160, 220)
-RELIEF = Relief(-1.0, 8.0)
+RELIEF = HeightRange(-1.0, 8.0)
 EXPOSURES = 2.0 ** np.random.default_rng(2).uniform(-0.3, 0.3, len(cameras()))
 
 
 @cache
-def plain_album() -> Album:
+def plain_album() -> OrthoInput:
     """All photos, each exposed differently."""
     sources = []
     for camera, exposure in zip(cameras(), EXPOSURES, strict=True):
@@ -42,10 +42,12 @@ def plain_album() -> Album:
         sources.append(PhotoSource(camera, lambda photo=photo: photo, depths))
     east, north = np.moveaxis(HEIGHTS.centres(WHOLE), -1, 0)
     surface = HeightField(HEIGHTS, true_height(east, north).astype(np.float32))
-    return Album(sources, surface, FINE, RELIEF, Levels.plain(len(sources)), Shelf(1 << 28), Shelf(1 << 28))
+    return OrthoInput(
+        sources, surface, FINE, RELIEF, PhotoGains.plain(len(sources)), LruCache(1 << 28), LruCache(1 << 28)
+    )
 
 
-def levels(album: Album) -> Levels:
+def levels(album: OrthoInput) -> PhotoGains:
     """Levelled at places on the surface."""
     centres, up = HEIGHTS.centres(WHOLE)[1::3, 1::3], album.surface.height[1::3, 1::3]
     places = np.concatenate([centres, up[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
@@ -53,7 +55,7 @@ def levels(album: Album) -> Levels:
 
 
 @cache
-def album() -> Album:
+def album() -> OrthoInput:
     """The same with exposures levelled."""
     return replace(plain_album(), levels=levels(plain_album()))
 
@@ -172,7 +174,7 @@ def test_far_from_all_that_is_seen_there_is_no_colour() -> None:
 def test_a_photo_without_depths_colours_nothing() -> None:
     whole = plain_album()
     blind = replace(
-        whole, sources=[replace(source, depths=None) for source in whole.sources[:3]], levels=Levels.plain(3)
+        whole, sources=[replace(source, depths=None) for source in whole.sources[:3]], levels=PhotoGains.plain(3)
     )
     part = tile_orthophoto(blind, Tile(0, 0, 12, 10))
     assert not part.known.any()
@@ -185,7 +187,7 @@ def test_pixels_of_another_size_are_refused() -> None:
     whole = plain_album()
     odd = replace(whole.sources[0], load=lambda: np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(ValueError, match="pixels of"):
-        tile_orthophoto(replace(whole, sources=[odd], pixels=Shelf(1)), WHOLE)
+        tile_orthophoto(replace(whole, sources=[odd], pixels=LruCache(1)), WHOLE)
 
 
 def test_a_photo_is_seen_through_its_lens() -> None:
@@ -193,11 +195,11 @@ def test_a_photo_is_seen_through_its_lens() -> None:
     camera, shift = source.camera, 5
     across, down = np.meshgrid(np.arange(0, camera.width + 8, 8.0), np.arange(0, camera.height + 8, 8.0))
     nodes = np.stack([across + shift, down + shift], axis=-1)
-    lens = Lens(camera.width + 2 * shift, camera.height + 2 * shift, 8.0, nodes)
+    lens = DistortionGrid(camera.width + 2 * shift, camera.height + 2 * shift, 8.0, nodes)
     wide = np.pad(source.load(), ((shift, shift), (shift, shift), (0, 0)), mode="edge")
     seen_through = replace(source, load=lambda: wide, lens=lens)
-    part = tile_orthophoto(replace(plain_album(), sources=[seen_through], pixels=Shelf(1)), Tile(120, 10, 8, 8))
-    same = tile_orthophoto(replace(plain_album(), sources=[source], pixels=Shelf(1)), Tile(120, 10, 8, 8))
+    part = tile_orthophoto(replace(plain_album(), sources=[seen_through], pixels=LruCache(1)), Tile(120, 10, 8, 8))
+    same = tile_orthophoto(replace(plain_album(), sources=[source], pixels=LruCache(1)), Tile(120, 10, 8, 8))
     assert part.known.all()
     assert np.array_equal(part.colour, same.colour)
 

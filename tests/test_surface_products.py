@@ -17,17 +17,17 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface import ortho as ortho_file
-from splatpipe.pipeline.surface import site as site_survey
+from splatpipe.pipeline.surface import site_extent as site_survey
 from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
 from splatpipe.pipeline.surface.grid import make_grid
-from splatpipe.pipeline.surface.heights import Capture, tile_heights
+from splatpipe.pipeline.surface.heights import HeightInput, tile_heights
 from splatpipe.pipeline.surface.known_cells import known_cells
 from splatpipe.pipeline.surface.options import DsmConfig
 from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import grid_sheets
-from splatpipe.pipeline.surface.site import Site, load_site, save_site, survey_site
-from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, Shelf
+from splatpipe.pipeline.surface.site_extent import SiteExtent, load_site, measure_extent, save_site
+from splatpipe.pipeline.surface.sources import DepthSource, LruCache, MetricMap
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.survey.frames import Frame, Origin
 from splatpipe.stages import dsm as dsm_stage
@@ -43,7 +43,7 @@ HOUSE = PlanArea.seen_from_above([(np.array([[-5.45, -4.45], [5.45, -4.45], [5.4
 
 
 @dataclass
-class Told:
+class InterruptingReporter:
     """A reporter that may interrupt.
 
     Attributes:
@@ -74,20 +74,20 @@ def photos() -> list[PhotoSource]:
 
 
 @cache
-def site() -> Site:
-    found = survey_site(sources(), 1.0, None, 1)
+def site() -> SiteExtent:
+    found = measure_extent(sources(), 1.0, None, 1)
     assert found is not None
     return found
 
 
 def dsm(folder: Path, area: PlanArea | None = HOUSE, report: Any = None) -> dict[str, Any]:
     task = DsmTask(run_surface(FRAME, photos(), area), site(), CELL_M, 1)
-    return make_dsm(task, folder / "work", folder, report or Told())
+    return make_dsm(task, folder / "work", folder, report or InterruptingReporter())
 
 
 def ortho(folder: Path, report: Any = None) -> dict[str, Any]:
     task = OrthoTask(run_surface(FRAME, photos(), HOUSE), site(), folder / "dsm.tif", CELL_M, CELL_M / 2, 1)
-    return make_ortho(task, folder / "ortho_work", folder, report or Told())
+    return make_ortho(task, folder / "ortho_work", folder, report or InterruptingReporter())
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_a_site_is_as_large_and_as_fine_as_its_photos() -> None:
 
 
 def test_a_site_ends_at_its_boundary() -> None:
-    found = survey_site(sources(), 1.0, HOUSE, 1)
+    found = measure_extent(sources(), 1.0, HOUSE, 1)
     assert found is not None
     assert np.abs(found.reach).max() <= 5.5
 
@@ -130,7 +130,7 @@ def test_depths_that_reach_too_far_for_a_site_are_refused() -> None:
     pose[:3, 3] -= pose[:3, :3] @ [100_000.0, 100_000.0, 0.0]
     away = MetricMap(replace(found.camera, cam_from_world=pose), found.depth, found.confidence)
     with pytest.raises(SplatpipeError, match="too far"):
-        survey_site([sources()[0], DepthSource(away.camera, lambda: away)], 1.0, None, 1)
+        measure_extent([sources()[0], DepthSource(away.camera, lambda: away)], 1.0, None, 1)
 
 
 def test_of_a_site_in_many_small_parts_the_largest_is_kept() -> None:
@@ -143,7 +143,7 @@ def test_of_a_site_in_many_small_parts_the_largest_is_kept() -> None:
 def test_a_stage_that_finds_no_site_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dsm_stage, "open_run_surface", lambda *_: run_surface(FRAME, photos(), HOUSE))
     monkeypatch.setattr(dsm_stage, "survey_site", lambda *_: None)
-    told = Told()
+    told = InterruptingReporter()
     assert dsm_stage.run(DsmConfig(), Inputs({}, tmp_path, {}, Machine("cpu", 1)), tmp_path, told) == {"cells": 0}
     assert told.calls == 1
     assert load_site(tmp_path / "site.json") is None
@@ -151,7 +151,7 @@ def test_a_stage_that_finds_no_site_says_so_and_ends(tmp_path: Path, monkeypatch
 
 def test_what_is_there_already_is_told_of_as_done(made: Path, tmp_path: Path) -> None:
     shutil.copytree(made / "work", tmp_path / "work")
-    told = Told()
+    told = InterruptingReporter()
     dsm(tmp_path, report=told)
     assert told.calls == 1
 
@@ -222,7 +222,7 @@ def test_the_orthophoto_covers_all_that_the_surface_model_does(
         OrthoTask(surface, replace(site(), covered=covered), tmp_path / "dsm.tif", CELL_M, CELL_M / 2, 1),
         tmp_path / "work",
         tmp_path,
-        Told(),
+        InterruptingReporter(),
     )
     whole, part = (centres(folder / "ortho.tif")[0][3] > 0 for folder in (made, tmp_path))
     assert np.array_equal(whole, part)
@@ -242,10 +242,10 @@ def test_an_interrupted_product_goes_on_with_the_same_bytes(made: Path, tmp_path
     for name in ("dsm.tif",) if product is ortho else ():
         (tmp_path / name).write_bytes((made / name).read_bytes())
     with pytest.raises(KeyboardInterrupt):
-        product(tmp_path, report=Told(stop_after=0))
+        product(tmp_path, report=InterruptingReporter(stop_after=0))
     assert not (tmp_path / ("dsm.tif" if product is dsm else "ortho.tif")).exists()
     product(tmp_path)
-    again = Told()
+    again = InterruptingReporter()
     product(tmp_path, report=again)
     assert again.calls == 1  # all sheets were there
     for path in tmp_path.glob("*.tif"):
@@ -258,8 +258,8 @@ def test_sheets_of_a_grid_agree_where_they_meet() -> None:
     whole = np.full((grid.height, grid.width), np.nan)
     for sheet in grid_sheets(grid, low, high, side=25):
         plane, part = sheet.sheet, sheet.part
-        moved = Capture(
-            [plane.moved_depths(source) for source in sources()], plane.lattice, plane.relief, Shelf(1 << 30)
+        moved = HeightInput(
+            [plane.moved_depths(source) for source in sources()], plane.lattice, plane.relief, LruCache(1 << 30)
         )
         found = tile_heights(moved, Tile(0, 0, part.height, part.width))
         heights = sheet.heights(found.tile, found.height)

@@ -16,9 +16,9 @@ from rasterio.transform import Affine
 
 from splatpipe.demo import depth_maps, parts
 from splatpipe.demo.orthographic import AHEAD_M, facade_view, top_view, views, wall_planes
-from splatpipe.demo.relief import relief, seen_in
+from splatpipe.demo.relief import relief, relief_in
 from splatpipe.demo.truth import Triangles, depth_map, true_surface
-from splatpipe.demo.visibility import Sight, photos_that_see
+from splatpipe.demo.visibility import TrueView, photos_that_see
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.survey.world import open_world
@@ -29,7 +29,7 @@ import surface_checks
 from rays import first_hits
 from surface_checks import matching, measure_dsm, measure_facades, measure_points, target_difference
 from surface_products import Facade, Raster, plan_crs, read_cloud, read_facades, read_mesh, read_raster, true_frame
-from surface_scene import GSD_M, Site, Truth, site_of, straight, true_picture
+from surface_scene import GSD_M, SceneTruth, TruthGrid, site_of, straight, true_picture
 from surface_truth import Demand, measure
 from triangle_distances import spread, surface_of
 
@@ -44,11 +44,11 @@ def surface() -> Triangles:
 
 
 @pytest.fixture(scope="module")
-def truth(surface: Triangles) -> Truth:
+def truth(surface: Triangles) -> SceneTruth:
     """Of photos that look through everything, which is quickly made: what hides what is told by other tests."""
     cameras = [camera.scaled(118, 88) for camera in depth_maps.true_cameras()[1]]
-    sights = [Sight(camera, np.full((88, 118), np.inf, np.float32)) for camera in cameras]
-    return Truth(surface, parts.parts_of(surface), sights)
+    sights = [TrueView(camera, np.full((88, 118), np.inf, np.float32)) for camera in cameras]
+    return SceneTruth(surface, parts.parts_of(surface), sights)
 
 
 def grid_of(cell: float) -> Raster:
@@ -62,7 +62,7 @@ def grid_of(cell: float) -> Raster:
 
 
 @pytest.fixture(scope="module")
-def perfect(truth: Truth) -> tuple[Raster, Site]:
+def perfect(truth: SceneTruth) -> tuple[Raster, TruthGrid]:
     """The true surface model as a product, and the truth on its grid."""
     world, grid = open_world(true_frame(CRS)), grid_of(CELL_M)
     site = site_of(truth, grid, world.crs_from_local)
@@ -73,14 +73,14 @@ def perfect(truth: Truth) -> tuple[Raster, Site]:
     return Raster(np.where(there, heights, 0.0)[None], there, grid.affine, CRS), site
 
 
-def counted(site: Site, raster: Raster) -> dict[str, dict[str, float]]:
+def counted(site: TruthGrid, raster: Raster) -> dict[str, dict[str, float]]:
     return {row["what"]: row for row in measure_dsm(site, raster)}
 
 
 def test_reliefs_are_what_parallel_rays_hit(surface: Triangles) -> None:
     rng = np.random.default_rng(0)
     for view in (top_view(0.53), facade_view("south", 0.307), facade_view("east", 0.307)):
-        found = seen_in(view, surface)
+        found = relief_in(view, surface)
         for row, column in zip(*(rng.integers(0, size, 5) for size in found.height.shape), strict=True):
             start = view.from_grid(np.array([column + 0.5, row + 0.5, 0.0]))
             with np.errstate(invalid="ignore"):  # triangles that are seen edge-on
@@ -121,7 +121,7 @@ def test_parts_are_where_they_are_built(surface: Triangles) -> None:
     assert (of == parts.HOUSE).sum() > 4000
 
 
-def test_the_truth_is_perfect_and_all_of_it_counts(perfect: tuple[Raster, Site]) -> None:
+def test_the_truth_is_perfect_and_all_of_it_counts(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
     rows = counted(site, raster)
     for what in ("roofs and ground", "roofs", "ground", "metal roof"):
@@ -132,14 +132,14 @@ def test_the_truth_is_perfect_and_all_of_it_counts(perfect: tuple[Raster, Site])
     assert both * CELL_M**2 > 500.0  # of the 1,500 m² flown over
 
 
-def test_a_model_a_gsd_too_high_is_told(perfect: tuple[Raster, Site]) -> None:
+def test_a_model_a_gsd_too_high_is_told(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
     rows = counted(site, replace(raster, bands=raster.bands + GSD_M))
     assert rows["ground"]["bias"] == pytest.approx(1.0, abs=1e-6)
     assert 0.75 < rows["roofs"]["bias"] < 0.99
 
 
-def test_a_model_that_ends_early_or_has_no_data_is_incomplete(perfect: tuple[Raster, Site]) -> None:
+def test_a_model_that_ends_early_or_has_no_data_is_incomplete(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
     there = raster.there.copy()
     there[:, : there.shape[1] // 2] = False
@@ -151,7 +151,7 @@ def test_a_model_that_ends_early_or_has_no_data_is_incomplete(perfect: tuple[Ras
     assert row["complete"] == row["within_3"] < 0.5
 
 
-def test_a_smoothed_model_is_wrong_at_the_eaves_which_count_apart(perfect: tuple[Raster, Site]) -> None:
+def test_a_smoothed_model_is_wrong_at_the_eaves_which_count_apart(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
     held = raster.bands[0]
     smooth = sum(np.roll(held, (r, c), (0, 1)) for r in (-1, 0, 1) for c in (-1, 0, 1)) / 9.0
@@ -165,12 +165,12 @@ def wall_facade(name: str, surface: Triangles, ahead: float = 0.0) -> Facade:
     pixel = 0.05
     view = replace(facade_view(name, pixel), origin=wall.point(0.0, high, AHEAD_M[name]))
     view = replace(view, width=round(span / pixel), height=round(high / pixel))
-    depth = seen_in(view, surface).height + AHEAD_M[name] + ahead
+    depth = relief_in(view, surface).height + AHEAD_M[name] + ahead
     corners = np.stack([wall.point(0.0, high), wall.point(span, high), wall.point(span, 0.0), wall.point(0.0, 0.0)])
     return Facade(name, corners, np.where(np.isfinite(depth), depth, np.nan))
 
 
-def test_elevations_are_judged_by_their_walls(truth: Truth) -> None:
+def test_elevations_are_judged_by_their_walls(truth: SceneTruth) -> None:
     facades = [wall_facade(name, truth.triangles) for name in ("south", "north", "west")]
     facades[1] = wall_facade("north", truth.triangles, 1.0 * GSD_M)
     facades[2].depth[:, : facades[2].depth.shape[1] // 2] = np.nan
@@ -194,7 +194,7 @@ def test_an_elevation_seen_from_inside_is_no_wall_s(surface: Triangles) -> None:
     assert matching([mirrored], "south") is None and matching([facade], "north") is None
 
 
-def plate(size: float = 16.0) -> tuple[Triangles, list[Sight]]:
+def plate(size: float = 16.0) -> tuple[Triangles, list[TrueView]]:
     """A level square about the house's place, and nine photos of it from above."""
     a, b, c, d = (np.array([x * size / 2, y * size / 2, 0.0]) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
     triangles = np.array([[a, b, c], [a, c, d]])
@@ -203,7 +203,7 @@ def plate(size: float = 16.0) -> tuple[Triangles, list[Sight]]:
         for y in (-4.0, 0.0, 4.0):
             pose = np.array([[1.0, 0, 0, -x], [0, -1, 0, y], [0, 0, -1, 20.0], [0, 0, 0, 1]])
             camera = Camera(f"{x}{y}", 120, 90, 60.0, 60.0, 60.0, 45.0, pose)
-            sights.append(Sight(camera, depth_map(camera, triangles).astype(np.float32)))
+            sights.append(TrueView(camera, depth_map(camera, triangles).astype(np.float32)))
     return triangles, sights
 
 
@@ -219,7 +219,7 @@ def test_photos_see_what_nothing_hides() -> None:
 def test_clouds_and_meshes_are_judged_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surface_checks, "SAMPLES", 8_000)
     triangles, sights = plate()
-    scene = Truth(triangles, np.full(2, parts.GROUND, np.int8), sights)
+    scene = SceneTruth(triangles, np.full(2, parts.GROUND, np.int8), sights)
     rng = np.random.default_rng(0)
     true = surface_of(triangles, 0.1, rng)
     points = spread(triangles, 40_000, rng)[0]
@@ -248,7 +248,7 @@ def test_targets_are_found_where_they_are() -> None:
     assert np.isnan(target_difference(picture, np.array([20.0, 140.0]))).all()
 
 
-def test_the_true_picture_falls_on_the_product_s_pixels(perfect: tuple[Raster, Site], tmp_path: Path) -> None:
+def test_the_true_picture_falls_on_the_product_s_pixels(perfect: tuple[Raster, TruthGrid], tmp_path: Path) -> None:
     """A picture whose colours say where they are, eastwards and southwards."""
     view = top_view(0.1)
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
@@ -293,7 +293,7 @@ def write_products(out: Path, raster: Raster, surface: Triangles) -> None:
 
 
 def test_files_are_measured_and_what_is_missing_fails(
-    perfect: tuple[Raster, Site], truth: Truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    perfect: tuple[Raster, TruthGrid], truth: SceneTruth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_products(tmp_path, perfect[0], truth.triangles)
     folder = tmp_path / "depths"

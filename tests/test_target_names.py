@@ -17,7 +17,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.model import SparseModel, model_of
 from splatpipe.pipeline.survey.target_finds import QUADRANT, TargetFind
-from splatpipe.pipeline.survey.target_marks import Expected, TargetMarks, named_tracks
+from splatpipe.pipeline.survey.target_marks import ExpectedPoints, TargetMarks, named_tracks
 
 NAMES = tuple(POINTS)
 PHOTOS = {photo["name"]: Photo(photo["name"], "0" * 64, WIDTH, HEIGHT, 0) for photo in TRUTH["photos"]}
@@ -53,7 +53,7 @@ def strangers(count: int) -> list[TargetFind]:
 
 
 def named(found: Sequence[TargetFind], positions: Similarity | None, names: Sequence[str] = NAMES) -> TargetMarks:
-    return named_tracks(found, names, (model(), PHOTOS), Expected(NAMES, PLACES, positions), {})
+    return named_tracks(found, names, (model(), PHOTOS), ExpectedPoints(NAMES, PLACES, positions), {})
 
 
 def assert_true(marks: TargetMarks, least: int) -> None:
@@ -84,7 +84,7 @@ def test_three_numbered_targets_name_the_quadrants_where_photos_have_no_position
 def test_a_quadrant_where_no_point_is_gets_no_name() -> None:
     known = [name for name in NAMES if name not in ("P05", "P16")]
     rows = [NAMES.index(name) for name in known]
-    expected = Expected(tuple(known), PLACES[rows], MISPLACED)
+    expected = ExpectedPoints(tuple(known), PLACES[rows], MISPLACED)
     marks = named_tracks(finds(), known, (model(), PHOTOS), expected, {})
     assert_true(marks, len(known) - 1)
     assert set(marks.pixels()) <= set(known) and marks.refused["targets where no point is"] >= 2

@@ -12,7 +12,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from measure import SilentReporter
-from target_scenes import Look, coded, quadrants, render
+from target_scenes import TargetAppearance, coded, quadrants, render
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -44,7 +44,7 @@ def test_quadrants_from_12_px_are_found_to_a_tenth_of_a_pixel() -> None:
     rng = np.random.default_rng(3)
     found, errors = 0, []
     for number in (2, 24):
-        drawn, placed = render(demo_photo(number), [("", quadrants)] * 12, Look((12.0, 30.0)), rng, 90.0)
+        drawn, placed = render(demo_photo(number), [("", quadrants)] * 12, TargetAppearance((12.0, 30.0)), rng, 90.0)
         finds = find_quadrant_targets(drawn)
         for target in placed:
             off = [(f.x - target.centre[0], f.y - target.centre[1]) for f in finds]
@@ -64,7 +64,7 @@ def test_coded_targets_from_20_px_are_read_and_found() -> None:
         for number in (3, 17, 29):
             cells = dictionary.generateImageMarker(number, dictionary.markerSize + 2) > 127
             kinds.append((f"{name.removeprefix('DICT_').lower()}:{number}", coded(cells.astype(np.uint8))))
-    drawn, placed = render(demo_photo(3), kinds, Look((20.0, 40.0)), rng, 110.0)
+    drawn, placed = render(demo_photo(3), kinds, TargetAppearance((20.0, 40.0)), rng, 110.0)
     finds = {f"{f.dictionary}:{f.number}": f for f in find_coded_targets(drawn)}
     read = [target for target in placed if target.name in finds]
     assert len(finds) == len(read) >= 8  # of 9

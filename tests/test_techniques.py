@@ -16,8 +16,8 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.plan import Plan, make_plan
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques
@@ -35,11 +35,11 @@ class Tint(Technique):
         self.red = torch.zeros(1)
         self.calls: list[str] = []
 
-    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
         self.calls.append(f"settings {now.iteration}")
         return settings
 
-    def before_render(self, model: Gaussians, now: Moment) -> Gaussians:
+    def before_render(self, model: Gaussians, now: ScheduleStep) -> Gaussians:
         self.calls.append("before_render")
         return model
 
@@ -74,7 +74,7 @@ class Tint(Technique):
 
 
 @pytest.fixture
-def plan() -> Plan:
+def plan() -> TrainingPlan:
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras(2)]
     return make_plan(tiny_scene.plain(iterations=1000), views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
 
@@ -84,7 +84,7 @@ def photos() -> list[TrainingPhoto]:
     return [TrainingPhoto(camera, grey, None) for camera in tiny_scene.cameras(2)]
 
 
-def test_an_iteration_calls_every_hook_in_order(plan: Plan) -> None:
+def test_an_iteration_calls_every_hook_in_order(plan: TrainingPlan) -> None:
     tint = Tint()
     state = TrainState.begin(tiny_scene.true_model(), plan, Techniques((tint,)))
     for photo, ended in zip(photos(), (0, 2), strict=True):
@@ -95,7 +95,7 @@ def test_an_iteration_calls_every_hook_in_order(plan: Plan) -> None:
     assert state.history.density[-1]["pruned"] == 1
 
 
-def test_a_picture_and_a_penalty_change_what_is_learnt(plan: Plan) -> None:
+def test_a_picture_and_a_penalty_change_what_is_learnt(plan: TrainingPlan) -> None:
     learnt = []
     for techniques in (Techniques(), Techniques((Tint(),))):
         state = TrainState.begin(tiny_scene.true_model(), plan, techniques)
@@ -104,7 +104,7 @@ def test_a_picture_and_a_penalty_change_what_is_learnt(plan: Plan) -> None:
     assert learnt[1] < learnt[0]
 
 
-def test_a_photo_of_which_nothing_counts_leaves_techniques_alone(plan: Plan) -> None:
+def test_a_photo_of_which_nothing_counts_leaves_techniques_alone(plan: TrainingPlan) -> None:
     tint, photo = Tint(), photos()[0]
     state = TrainState.begin(tiny_scene.true_model(), plan, Techniques((tint,)))
     nothing = torch.zeros(photo.colour.shape[:2], dtype=torch.bool)
@@ -112,7 +112,7 @@ def test_a_photo_of_which_nothing_counts_leaves_techniques_alone(plan: Plan) -> 
     assert tint.calls == ["unwanted"] and state.iteration == 1 and float(tint.red) == 0.0
 
 
-def test_a_checkpoint_keeps_what_a_technique_learnt_and_one_without_it_is_refused(plan: Plan) -> None:
+def test_a_checkpoint_keeps_what_a_technique_learnt_and_one_without_it_is_refused(plan: TrainingPlan) -> None:
     state = TrainState.begin(tiny_scene.true_model(), plan, Techniques((Tint(),)))
     iterate(state, plan, photos()[0])
     checkpoint, again = state.checkpoint("any"), Tint()

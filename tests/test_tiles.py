@@ -18,7 +18,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.levels import LevelNode, build_levels
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts, facts_of_record
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
 from splatpipe.pipeline.splat.tiles import write_tiles
 from splatpipe.pipeline.survey.globe import write_tiles_on_globe
 
@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from glb_parts import parts
 from some_splats import some_gaussians
 
-PLACE = Place(52.2, 21.0, 113.25, "ellipsoidal", "EPSG:32634")
+PLACE = SplatOrigin(52.2, 21.0, 113.25, "ellipsoidal", "EPSG:32634")
 FACTS = SceneFacts("z up", True, True, PLACE, ({"step": "crop"},))
 BOTH = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
 SITE_M = 3000.0
@@ -217,7 +217,7 @@ def test_programs_of_esri_are_told_the_crs_and_how_to_reach_it(tmp_path: Path):
         (replace(PLACE, crs=""), {"wkid": 32634, "vcsWkid": 115700}),
     ],
 )
-def test_only_what_is_known_of_a_crs_is_told(tmp_path: Path, place: Place, said: dict[str, int] | None):
+def test_only_what_is_known_of_a_crs_is_told(tmp_path: Path, place: SplatOrigin, said: dict[str, int] | None):
     scene, root = two_levels()
     placement = write_tiles_on_globe(tmp_path, replace(scene, facts=replace(FACTS, place=place)), root)
     assert tileset(tmp_path)["extensions"].get("ESRI_crs") == said

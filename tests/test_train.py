@@ -25,7 +25,7 @@ from splatpipe.pipeline.train import iteration, loop
 from splatpipe.pipeline.train import plan as planned
 from splatpipe.pipeline.train.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.stages import initialize, train
@@ -115,7 +115,7 @@ def test_another_folder_gives_the_same_bits_and_another_seed_does_not(
     assert sorted(path.name for path in undisturbed.iterdir()) == PARTS
 
 
-class Killed(BaseException):
+class Kill(BaseException):
     """Stands for a kill: nothing of the trainer catches it."""
 
 
@@ -123,7 +123,7 @@ def die_at(monkeypatch: pytest.MonkeyPatch, iteration: int, how: Callable[[], No
     """Let ``how`` happen in the middle of an iteration, with a checkpoint after every one before."""
     step = loop.iterate
 
-    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == iteration:
             how()
         step(state, plan, photo)
@@ -134,14 +134,14 @@ def die_at(monkeypatch: pytest.MonkeyPatch, iteration: int, how: Callable[[], No
 
 
 def killed() -> None:
-    raise Killed
+    raise Kill
 
 
 @pytest.mark.parametrize("when", [1, 2, 11, 26, 35, 60])
 def test_killed_training_goes_on_and_ends_with_the_same_bits(
     scene: Path, undisturbed: Path, tmp_path: Path, when: int
 ) -> None:
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         die_at(patch, when, killed)
         trained(scene, tmp_path)
     assert (tmp_path / loop.CHECKPOINT).exists() == (when > 1)
@@ -157,7 +157,7 @@ def test_killed_training_with_every_technique_ends_with_the_same_bits(scene: Pat
     whole = trained(scene, tmp_path / "whole", config)
     for name, value in TECHNIQUES.items():
         assert getattr(tiny_scene.plain(), name) != value
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         die_at(patch, 34, killed)
         trained(scene, tmp_path / "killed", config)
     assert digest(trained(scene, tmp_path / "killed", config, threads=2)) == digest(whole)
@@ -172,7 +172,7 @@ def test_killed_training_by_the_published_method_ends_with_the_same_bits(
     monkeypatch.setattr(planned, "resolve_schedule", tiny_scene.resolver(**limits))
     config = QUICK.model_copy(update={"density": "published"})
     whole = trained(scene, tmp_path / "whole", config)
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         die_at(patch, 38, killed)
         trained(scene, tmp_path / "killed", config)
     assert digest(trained(scene, tmp_path / "killed", config, threads=2)) == digest(whole) != digest(undisturbed)
@@ -188,7 +188,7 @@ def test_interrupt_saves_a_checkpoint_and_is_passed_on(scene: Path, undisturbed:
         patch.setattr(loop, "CHECKPOINT_SECONDS", 1e9)
         trained(scene, tmp_path)
     assert signal.getsignal(signal.SIGTERM) == before
-    plan = Plan.from_json((tmp_path / "plan.json").read_text())
+    plan = TrainingPlan.from_json((tmp_path / "plan.json").read_text())
     assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts["iteration"] == 20
     assert digest(trained(scene, tmp_path)) == digest(undisturbed)
 
@@ -196,7 +196,7 @@ def test_interrupt_saves_a_checkpoint_and_is_passed_on(scene: Path, undisturbed:
 def test_going_on_with_another_instruction_set_is_told(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         die_at(patch, 20, killed)
         trained(scene, tmp_path)
     monkeypatch.setattr(rasterizer, "isa_name", lambda: "other")

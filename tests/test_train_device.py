@@ -21,13 +21,13 @@ from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows, taken_in_place
 from splatpipe.pipeline.train import limits, memory, planning, state
 from splatpipe.pipeline.train.checkpoint import HostArrays, load_checkpoint, save_checkpoint
-from splatpipe.pipeline.train.densify import Growth, along_curve
+from splatpipe.pipeline.train.densify import DensifiedGaussians, along_curve
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
-from splatpipe.pipeline.train.planning import Scene, pilot
-from splatpipe.pipeline.train.start import Start
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.planning import PlanningInput, pilot
+from splatpipe.pipeline.train.start import InitialGaussians
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.techniques import Techniques
 from splatpipe.pipeline.train.upload import QUEUED, Upload, Uploader, colours_of
@@ -41,7 +41,7 @@ from on_cpu import kernels_on_cpu
 ALL = tiny_scene.plain(iterations=20, max_gaussians=250)
 
 
-def make_small_plan(config: TrainConfig) -> Plan:
+def make_small_plan(config: TrainConfig) -> TrainingPlan:
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras(4)]
     return make_plan(config, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
 
@@ -208,11 +208,11 @@ def test_the_host_is_a_few_iterations_ahead_of_a_device_and_no_more(monkeypatch:
     assert log == begun + [line for n in range(3) for line in (f"wait {n}", f"queue {n + QUEUED}")]
 
 
-def budgeted(seconds: float, device: Device) -> tuple[Plan, Scene]:
+def budgeted(seconds: float, device: Device) -> tuple[TrainingPlan, PlanningInput]:
     config = TrainConfig(time_budget_s=seconds)
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras(4)]
     plan = make_plan(config, views, tiny_scene.split_of(views), 100)
-    return plan, Scene(config, Start(tiny_scene.true_model(100), 100), views, 1, Machine(), device)
+    return plan, PlanningInput(config, InitialGaussians(tiny_scene.true_model(100), 100), views, 1, Machine(), device)
 
 
 def test_a_budgets_forecast_is_measured_where_a_device_works(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,7 +246,7 @@ def test_rows_lie_along_a_curve_after_density_control() -> None:
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(2000, 3, generator=generator)
     rows = torch.arange(2000)
-    growth = Growth(rows, rows >= 1500, means, means + 1.0, means[:, 0])
+    growth = DensifiedGaussians(rows, rows >= 1500, means, means + 1.0, means[:, 0])
     sorted_ = along_curve(growth)
     with use_kernels(kernels_on_cpu()):
         assert torch.equal(along_curve(growth).source, sorted_.source)

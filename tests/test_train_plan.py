@@ -19,16 +19,16 @@ from splatpipe.pipeline.train.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import (
-    Plan,
+    TrainingPlan,
     load_or_write_plan,
     make_plan,
     scene_extent,
 )
 from splatpipe.pipeline.train.rates import Rates, rates_of
 from splatpipe.pipeline.train.schedule import resolve_schedule
+from splatpipe.pipeline.train.windows import TrainingSize
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -139,7 +139,7 @@ def test_how_to_render_follows_from_the_plan_and_survives_its_file(
 ) -> None:
     config = TrainConfig.model_validate({"background": background, "antialias": behind > 0.0})
     plan = make_plan(config, views(), tiny_scene.split_of(views()), 9)
-    assert Plan.from_json(plan.to_json()) == plan
+    assert TrainingPlan.from_json(plan.to_json()) == plan
     (tmp_path / "rendering.json").write_text(plan.rendering().to_json())
     found = load_rendering(tmp_path / "rendering.json")
     assert found == plan.rendering() == Rendering(behind > 0.0, (behind,) * 3, plan.near, None)
@@ -148,7 +148,7 @@ def test_how_to_render_follows_from_the_plan_and_survives_its_file(
 def test_coarse_photos_come_first_in_equal_shares() -> None:
     schedule = resolve_schedule(TrainConfig(iterations=12, coarse_levels=2))
     assert [look.level for look in schedule.looks_to(10)] == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
-    assert resolve_schedule(TrainConfig(iterations=3)).looks_to(3) == [Look()] * 3
+    assert resolve_schedule(TrainConfig(iterations=3)).looks_to(3) == [TrainingSize()] * 3
 
 
 def test_held_out_photos_are_not_trained_on() -> None:
@@ -169,12 +169,12 @@ def test_plan_is_written_once_and_taken_as_it_is(tmp_path: Path) -> None:
     assert load_or_write_plan(path, lambda: first) == first
     text = path.read_bytes()
 
-    def not_called() -> Plan:
+    def not_called() -> TrainingPlan:
         raise AssertionError("a plan that is there is taken as it is")
 
     assert load_or_write_plan(path, not_called) == first
     assert path.read_bytes() == text
-    assert Plan.from_json(text.decode()).digest() == first.digest()
+    assert TrainingPlan.from_json(text.decode()).digest() == first.digest()
 
 
 @pytest.mark.parametrize(

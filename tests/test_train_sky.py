@@ -26,9 +26,9 @@ from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.splat.sky_mask import SkyMask, directions
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.measure import Effort, Subject, measure
+from splatpipe.pipeline.train.measure import MeasuringBudget, TimedScene, measure
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.sky import SkyModel, filled
 from splatpipe.pipeline.train.sky_file import read_skies, write_skies
 from splatpipe.pipeline.train.state import TrainState
@@ -233,7 +233,7 @@ def test_training_clears_the_sky_of_gaussians_and_held_out_photos_gain(scene: Pa
     assert quality["model"][1] > quality["off"][1] + 3.0
 
 
-class Killed(BaseException):
+class Kill(BaseException):
     """Stands for a kill."""
 
 
@@ -241,12 +241,12 @@ class Killed(BaseException):
 def test_killed_training_goes_on_to_the_same_bits(scene: Path, tmp_path: Path, when: int) -> None:
     step = loop.iterate
 
-    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == when:
-            raise Killed
+            raise Kill
         step(state, plan, photo)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
         patch.setattr(loop, "iterate", dying)
@@ -304,11 +304,11 @@ def test_a_budget_measures_iterations_with_the_sky_and_leaves_it_as_it_was(scene
     )
     moved = []
 
-    def step(state: TrainState, trial: Plan, photo: TrainingPhoto) -> None:
+    def step(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto) -> None:
         loop.iterate(state, trial, photo)
         trained = state.techniques.find(SkyModel)
         assert trained is not None
         moved.append(not torch.equal(trained.panorama.colours, before))
 
-    measure(plan, Subject(start, views, cpu(), sky), step, Effort(0.0, 1e-3))
+    measure(plan, TimedScene(start, views, cpu(), sky), step, MeasuringBudget(0.0, 1e-3))
     assert any(moved) and torch.equal(sky.panorama.colours, before)

@@ -16,12 +16,12 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.looks import Look, windows_of
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import Schedule
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.windows import TrainingSize, windows_of
 from splatpipe.stages import initialize, train
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -39,9 +39,9 @@ TECHNIQUES: dict[str, object] = {
 }
 
 
-def look_at(schedule: Schedule, iteration: int) -> Look:
+def look_at(schedule: Schedule, iteration: int) -> TrainingSize:
     """Half the size in whole photos, then windows of the full size."""
-    return Look(1) if iteration <= COARSE else Look(0, WINDOW_PIXELS)
+    return TrainingSize(1) if iteration <= COARSE else TrainingSize(0, WINDOW_PIXELS)
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ def test_training_on_windows_approaches_the_truth_in_a_photo_it_never_saw(scene:
     assert after > 23.5 and after > before + 7.0
 
 
-class Killed(BaseException):
+class Kill(BaseException):
     """Stands for a kill: nothing of the trainer catches it."""
 
 
@@ -98,12 +98,12 @@ def test_killed_training_on_windows_ends_with_the_same_bits_on_any_number_of_thr
     whole = trained(scene, tmp_path / "whole", config)
     step = loop.iterate
 
-    def dying(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == 37:
-            raise Killed
+            raise Kill
         step(state, plan, photo)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
         patch.setattr(loop, "iterate", dying)
@@ -111,5 +111,5 @@ def test_killed_training_on_windows_ends_with_the_same_bits_on_any_number_of_thr
     assert (tmp_path / "killed" / loop.CHECKPOINT).exists()
     assert digests(trained(scene, tmp_path / "killed", config, threads=3)) == digests(whole)
     assert digests(trained(scene, tmp_path / "seed", config.model_copy(update={"seed": 1}))) != digests(whole)
-    monkeypatch.setattr(Schedule, "look_at", lambda schedule, iteration: Look(int(iteration <= COARSE)))
+    monkeypatch.setattr(Schedule, "look_at", lambda schedule, iteration: TrainingSize(int(iteration <= COARSE)))
     assert digests(trained(scene, tmp_path / "in whole photos", config)) != digests(whole)

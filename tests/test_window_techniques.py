@@ -18,19 +18,19 @@ from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, STEP_PX
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 from splatpipe.pipeline.splat.sky_mask import SkyMask
 from splatpipe.pipeline.train.density import Density
-from splatpipe.pipeline.train.distortion import Distortion
+from splatpipe.pipeline.train.distortion_loss import DistortionLoss
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.hooks import Shot
 from splatpipe.pipeline.train.iteration import SSIM_WEIGHT
-from splatpipe.pipeline.train.looks import windows_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photo_cells import PhotoCells
-from splatpipe.pipeline.train.robust import GRID, UNKNOWN, Robust
-from splatpipe.pipeline.train.schedule import Moment, resolve_schedule
-from splatpipe.pipeline.train.seen_sky import seen_by_cpu, seen_by_device
+from splatpipe.pipeline.train.photo_sky import photo_sky_on_cpu, photo_sky_on_device
+from splatpipe.pipeline.train.robust import GRID, UNKNOWN, RobustMask
+from splatpipe.pipeline.train.schedule import ScheduleStep, resolve_schedule
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques
+from splatpipe.pipeline.train.windows import windows_of
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
@@ -89,7 +89,7 @@ def the_sky() -> SkyModel:
 def said(photos: list[TrainingPhoto], weights: list[float], penalties: bool) -> dict[str, Tensor]:
     """The weighted loss of some photos with its gradients by all that is trained."""
     model, sky, exposure = gaussians(), the_sky(), Exposure([CAMERA.name, "another"])
-    each = (sky, exposure, Distortion(0.5, 20)) if penalties else (exposure,)
+    each = (sky, exposure, DistortionLoss(0.5, 20)) if penalties else (exposure,)
     techniques = Techniques(each)
     total = torch.zeros(())
     for photo, weight in zip(photos, weights, strict=True):
@@ -138,11 +138,11 @@ def test_the_sky_of_a_window_is_the_whole_photos_there(size: tuple[int, int]) ->
     _, sky = skies.trace(skies.look())
     found, camera = SkyMask.packed(sky), skies.look().scaled(*size)
     bits = torch.from_numpy(found.bits)
-    wholes = seen_by_cpu(found, camera), seen_by_device(bits, found.shape, camera)
+    wholes = photo_sky_on_cpu(found, camera), photo_sky_on_device(bits, found.shape, camera)
     for window in windows_of(*size, size[0] * size[1] // 5):
         part = camera.cut(window.left, window.top, window.width, window.height)
         rows, columns = slice(window.top, window.bottom), slice(window.left, window.right)
-        parts = seen_by_cpu(found, part), seen_by_device(bits, found.shape, part)
+        parts = photo_sky_on_cpu(found, part), photo_sky_on_device(bits, found.shape, part)
         for seen, whole in zip(parts, wholes, strict=True):
             for ours, expected in ((seen.mask, whole.mask), (seen.around, whole.around)):
                 assert ours.shape == (part.height, part.width)
@@ -229,7 +229,7 @@ def with_a_car(number: int) -> TrainingPhoto:
     return TrainingPhoto(camera, colour, None)
 
 
-def visited(robust: Robust, photos: list[TrainingPhoto]) -> list[TrainingPhoto]:
+def visited(robust: RobustMask, photos: list[TrainingPhoto]) -> list[TrainingPhoto]:
     """What each visit of a model that is the truth leaves of its photo."""
     found = []
     for photo in photos:
@@ -255,7 +255,7 @@ def left_out(photos: list[TrainingPhoto]) -> Tensor:
 def test_moving_things_are_left_out_of_windows_as_of_the_whole_photo() -> None:
     outs, scores = [], []
     for divided in (False, True):
-        robust = Robust([camera.name for camera in cameras()])
+        robust = RobustMask([camera.name for camera in cameras()])
         robust.watch(cameras())
         photos = [with_a_car(number) for number in range(len(cameras()))]
         given = [windows(photo, CAR_PIXELS) if divided else [photo] for photo in photos]
@@ -276,7 +276,7 @@ def test_moving_things_are_left_out_of_windows_as_of_the_whole_photo() -> None:
 
 
 def test_a_window_that_shows_nothing_of_a_cell_leaves_what_is_known_of_it() -> None:
-    robust = Robust([cameras()[2].name])
+    robust = RobustMask([cameras()[2].name])
     first, *_, last = windows(with_a_car(2), CAR_PIXELS)
     visited(robust, [first])
     after_one = robust.scores.clone()
@@ -287,5 +287,5 @@ def test_a_window_that_shows_nothing_of_a_cell_leaves_what_is_known_of_it() -> N
 
 
 def test_the_moment_is_one_in_which_everything_takes_part() -> None:
-    assert isinstance(LATE, Moment) and Distortion(0.5, 20).is_counted(LATE.place)
+    assert isinstance(LATE, ScheduleStep) and DistortionLoss(0.5, 20).is_counted(LATE.place)
     assert np.isfinite(gaussians().means.detach().numpy()).all()

@@ -14,10 +14,10 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.splat.metrics import SSIM_WINDOW
 from splatpipe.pipeline.splat.panorama import STEP_PX
-from splatpipe.pipeline.train import looks
-from splatpipe.pipeline.train.looks import Frame, Look, windows_of
+from splatpipe.pipeline.train import windows
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.visits import PartVisits, PhotoVisits, Visits
+from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize, windows_of
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -33,7 +33,7 @@ def views(tmp_path: Path) -> list[View]:
 
 
 def streamed(
-    views: list[View], cache: Path, looks: list[Look], first: int = 1, fill: bool = False
+    views: list[View], cache: Path, looks: list[TrainingSize], first: int = 1, fill: bool = False
 ) -> list[TrainingPhoto]:
     with PhotoStream.over(views, looks, 0, first, cache) as photos:
         if fill:
@@ -54,15 +54,15 @@ def test_windows_are_nearly_equal_cells_that_cover_the_picture_once(width: int, 
     assert (covered == 1).all()
     sizes = [window.pixels for window in found]
     assert max(sizes) <= pixels and len(found) <= np.ceil(1.35 * width * height / pixels)
-    slack = 2 * looks.NODES_PX  # borders are moved to nodes
+    slack = 2 * windows.NODES_PX  # borders are moved to nodes
     for sides in ([window.width for window in found], [window.height for window in found]):
         assert max(sides) - min(sides) <= slack
     window = found[0]
-    assert max(window.width / window.height, window.height / window.width) < looks.MOST_OBLONG + 0.2
+    assert max(window.width / window.height, window.height / window.width) < windows.MOST_OBLONG + 0.2
 
 
 def test_a_window_begins_on_a_node_of_the_sky_once_it_is_grown_by_what_ssim_sees() -> None:
-    assert SSIM_WINDOW // 2 == looks.REACH_PX and looks.NODES_PX == STEP_PX
+    assert SSIM_WINDOW // 2 == windows.REACH_PX and windows.NODES_PX == STEP_PX
     for window in windows_of(1000, 700, 90_000):
         cut = window.grown(1000, 700)
         assert cut.left % STEP_PX == 0 == cut.top % STEP_PX
@@ -71,15 +71,15 @@ def test_a_window_begins_on_a_node_of_the_sky_once_it_is_grown_by_what_ssim_sees
 
 
 def test_what_fits_is_whole_and_what_can_not_be_divided_so_far_is_divided_as_far_as_it_goes() -> None:
-    assert windows_of(100, 50, 5000) == windows_of(100, 50, 0) == [Frame(0, 0, 100, 50)]
-    assert all(min(window.width, window.height) >= looks.NODES_PX for window in windows_of(100, 50, 10))
+    assert windows_of(100, 50, 5000) == windows_of(100, 50, 0) == [PixelRectangle(0, 0, 100, 50)]
+    assert all(min(window.width, window.height) >= windows.NODES_PX for window in windows_of(100, 50, 10))
 
 
 def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own() -> None:
     cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
     rounds, windows = 6, len(windows_of(720, 540, 70_000))
-    visits = PhotoVisits(cameras, [Look(1)] * 9 + [Look(0, 70_000)] * (9 * windows * rounds), 0)
-    seen: dict[int, list[Frame]] = {view: [] for view in range(9)}
+    visits = PhotoVisits(cameras, [TrainingSize(1)] * 9 + [TrainingSize(0, 70_000)] * (9 * windows * rounds), 0)
+    seen: dict[int, list[PixelRectangle]] = {view: [] for view in range(9)}
     for iteration in range(10, len(visits) + 1):
         visit = visits.at(iteration)
         seen[visit.view].append(visit.window)
@@ -89,17 +89,17 @@ def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own()
             assert sorted(map(str, frames[begin : begin + windows])) == sorted(map(str, windows_of(720, 540, 70_000)))
             orders.add(tuple(map(str, frames[begin : begin + windows])))
     assert len(orders) > 0.9 * 9 * rounds
-    other = PhotoVisits(cameras, [Look(0, 70_000)] * 90, 1)
+    other = PhotoVisits(cameras, [TrainingSize(0, 70_000)] * 90, 1)
     assert [visits.at(number + 9).window for number in range(1, 91)] != [other.at(n).window for n in range(1, 91)]
 
 
 def test_windows_of_photos_of_several_sizes_are_seen_equally_often() -> None:
     small, large = tiny_scene.cameras()[:2]
     cameras = [small.scaled(640, 480), large.scaled(2000, 1500), small.scaled(600, 500)]
-    look = Look(0, 100_000)
+    look = TrainingSize(0, 100_000)
     cells = [len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras]
     assert len(set(cells)) > 1
-    visits = PhotoVisits(cameras, [Look(2)] * 6 + [look] * (3 * sum(cells) + 1), 0)
+    visits = PhotoVisits(cameras, [TrainingSize(2)] * 6 + [look] * (3 * sum(cells) + 1), 0)
     seen = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
     rounds = [seen[6 + start : 6 + start + sum(cells)] for start in range(0, 3 * sum(cells), sum(cells))]
     shown = [[(visit.view, visit.window) for visit in each] for each in rounds]
@@ -114,10 +114,12 @@ def rounds_of(visits: Visits) -> dict[int, int]:
 
 def test_a_round_ends_when_every_photo_has_been_seen_and_of_larger_ones_every_window() -> None:
     cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
-    look, windows = Look(0, 70_000), len(windows_of(720, 540, 70_000))
-    whole = PhotoVisits(cameras, [Look(2)] * 12 + [Look(1)] * 17, 0)  # epochs of photos, whatever their size
+    look, windows = TrainingSize(0, 70_000), len(windows_of(720, 540, 70_000))
+    whole = PhotoVisits(
+        cameras, [TrainingSize(2)] * 12 + [TrainingSize(1)] * 17, 0
+    )  # epochs of photos, whatever their size
     assert rounds_of(whole) == {9: 9, 18: 9, 27: 9}
-    visits = PhotoVisits(cameras, [Look(1)] * 12 + [look] * (18 * windows + 10), 0)
+    visits = PhotoVisits(cameras, [TrainingSize(1)] * 12 + [look] * (18 * windows + 10), 0)
     ends = [9, 18, 18 + 9 * windows, 18 + 18 * windows]
     assert rounds_of(visits) == dict(zip(ends, (9, 9, 9 * windows, 9 * windows), strict=True))
     seen = Counter(visits.at(iteration).view for iteration in range(ends[1] + 1, ends[2] + 1))
@@ -126,12 +128,12 @@ def test_a_round_ends_when_every_photo_has_been_seen_and_of_larger_ones_every_wi
 
 def test_rounds_of_windows_that_are_mixed_or_chosen_begin_with_their_size() -> None:
     small, large = tiny_scene.cameras()[:2]
-    cameras, look = [small.scaled(640, 480), large.scaled(2000, 1500)], Look(0, 100_000)
+    cameras, look = [small.scaled(640, 480), large.scaled(2000, 1500)], TrainingSize(0, 100_000)
     count = sum(len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras)
-    mixed = PhotoVisits(cameras, [Look(2)] * 5 + [look] * (2 * count + 1), 0)
+    mixed = PhotoVisits(cameras, [TrainingSize(2)] * 5 + [look] * (2 * count + 1), 0)
     assert rounds_of(mixed) == {2: 2, 4: 2, 5: 1, 5 + count: count, 5 + 2 * count: count}
-    parts = {1: [(0, Frame(0, 0, 9, 9))], 0: [(view, Frame(0, 0, 9, 9)) for view in (0, 1, 1)]}
-    chosen = PartVisits(cameras, [Look(1)] * 2 + [look] * 7, 0, None, parts)
+    parts = {1: [(0, PixelRectangle(0, 0, 9, 9))], 0: [(view, PixelRectangle(0, 0, 9, 9)) for view in (0, 1, 1)]}
+    chosen = PartVisits(cameras, [TrainingSize(1)] * 2 + [look] * 7, 0, None, parts)
     assert rounds_of(chosen) == {1: 1, 2: 1, 5: 3, 8: 3}
 
 
@@ -139,10 +141,10 @@ def test_rounds_of_windows_that_are_mixed_or_chosen_begin_with_their_size() -> N
 def test_windows_of_the_stream_are_parts_of_the_whole_photo_to_the_bit(
     views: list[View], tmp_path: Path, fill: bool
 ) -> None:
-    photos = {photo.camera.name: photo for photo in streamed(views, tmp_path, [Look()] * len(views))}
+    photos = {photo.camera.name: photo for photo in streamed(views, tmp_path, [TrainingSize()] * len(views))}
     counts: Counter[tuple[object, ...]] = Counter()
     shares: Counter[str] = Counter()
-    for photo in streamed(views, tmp_path, [Look(0, PIXELS)] * 6 * len(views), fill=fill):
+    for photo in streamed(views, tmp_path, [TrainingSize(0, PIXELS)] * 6 * len(views), fill=fill):
         whole, part = photos[photo.camera.name], photo.camera.window
         assert part is not None and photo.inner is not None
         rows = slice(part.top, part.top + photo.camera.height)
@@ -153,13 +155,13 @@ def test_windows_of_the_stream_are_parts_of_the_whole_photo_to_the_bit(
         assert photo.is_empty == (photo.mask is not None and not photo.mask[top:bottom, left:right].any())
         counts[(photo.camera.name, part.left + left, part.top + top, part.left + right, part.top + bottom)] += 1
         shares[photo.camera.name] += photo.share  # type: ignore[assignment]
-    expected = [window.within(Frame(0, 0, 0, 0)) for window in windows_of(72, 54, PIXELS)]
+    expected = [window.within(PixelRectangle(0, 0, 0, 0)) for window in windows_of(72, 54, PIXELS)]
     assert counts == Counter((view.camera.name, *frame) for view in views for frame in expected)
     assert all(share == pytest.approx(1.0) for share in shares.values()) and len(shares) == len(views)
 
 
 def test_window_of_an_iteration_does_not_depend_on_where_the_stream_began(views: list[View], tmp_path: Path) -> None:
-    asked = [Look(1, 300)] * 20 + [Look(0, PIXELS)] * 20
+    asked = [TrainingSize(1, 300)] * 20 + [TrainingSize(0, PIXELS)] * 20
     whole = streamed(views, tmp_path, asked)
     for first, fill in ((2, True), (17, False), (33, True)):
         later = streamed(views, tmp_path, asked, first, fill)
@@ -169,7 +171,7 @@ def test_window_of_an_iteration_does_not_depend_on_where_the_stream_began(views:
 
 
 def test_one_decode_fills_all_levels_and_is_told(views: list[View], tmp_path: Path) -> None:
-    asked = [Look(2)] * 9 + [Look(1, 400)] * 18 + [Look(0, PIXELS)] * 18
+    asked = [TrainingSize(2)] * 9 + [TrainingSize(1, 400)] * 18 + [TrainingSize(0, PIXELS)] * 18
     usual = streamed(views, tmp_path, asked)
     recorder = tiny_scene.Recorder()
     with PhotoStream.over(views, asked, 0, 1, tmp_path) as photos:
@@ -196,7 +198,7 @@ def test_windows_want_no_more_memory_of_a_large_photo(tmp_path: Path, window_pix
 
 
 def test_windows_are_refused_where_a_photo_is_resampled(views: list[View], tmp_path: Path) -> None:
-    photo = streamed(views, tmp_path, [Look(0, PIXELS)])[0]
+    photo = streamed(views, tmp_path, [TrainingSize(0, PIXELS)])[0]
     assert isinstance(photo.camera, Camera) and photo.camera.whole().window is None
     with pytest.raises(ValueError, match="scale the whole"):
         photo.camera.scaled(10, 10)

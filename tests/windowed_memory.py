@@ -15,8 +15,8 @@ import numpy as np
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.stream import PhotoStream
+from splatpipe.pipeline.train.windows import TrainingSize
 
 FIRST = 6  # photos, halved often, without a limit: threads and allocators take what they need once
 MORE = 30
@@ -26,8 +26,8 @@ def main(picture: str, cache: str, window_pixels: str, more_bytes: str) -> None:
     height, width = cv2.imread(picture).shape[:2]
     camera = Camera("photo", width, height, width, width, width / 2, height / 2, np.eye(4))
     views = [View(replace(camera, name=str(number)), Path(picture), None) for number in range(3)]
-    warm_up = [Look(3)] * FIRST
-    with PhotoStream.over(views, warm_up + [Look(0, int(window_pixels))] * MORE, 0, 1, Path(cache)) as photos:
+    warm_up = [TrainingSize(3)] * FIRST
+    with PhotoStream.over(views, warm_up + [TrainingSize(0, int(window_pixels))] * MORE, 0, 1, Path(cache)) as photos:
         for _ in views:  # by then each is decoded and stored
             next(photos)
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

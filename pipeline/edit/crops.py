@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.digests import file_digest
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.survey.boundary import WITHOUT, placed, placed_area
-from splatpipe.pipeline.survey.boundary_file import Drawing, read_boundary
+from splatpipe.pipeline.survey.boundary_file import BoundaryFile, read_boundary
 
 DIGEST_CHARACTERS = 16  # of a polygon's file in a splat's record: enough to know it again
 SHOWN_DIGITS = 3  # of coordinates in messages
@@ -160,7 +160,7 @@ class CropPolygon:
             "area_m2": round(area.size(), 2),
         }
 
-    def _area(self, drawing: Drawing, piece: Workpiece) -> PlanArea:
+    def _area(self, drawing: BoundaryFile, piece: Workpiece) -> PlanArea:
         if self.local:
             return PlanArea.seen_from_above(drawing.polygons)
         if piece.frame is None:
@@ -173,7 +173,7 @@ class CropPolygon:
         except SplatpipeError as error:
             raise _for_edits(error) from error
 
-    def _nothing(self, drawing: Drawing, piece: Workpiece) -> SplatpipeError:
+    def _nothing(self, drawing: BoundaryFile, piece: Workpiece) -> SplatpipeError:
         if self.local or piece.frame is None or not self.inside:
             return _nothing(f"polygon {drawing.name}", piece, Coordinates.of(piece.facts, self.local))
         try:

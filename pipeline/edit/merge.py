@@ -15,7 +15,7 @@ from splatpipe.pipeline.edit.workpiece import Workpiece, between
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Place, Scene, SceneFacts, turn_of
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, turn_of
 from splatpipe.pipeline.survey.crs import UNKNOWN, describe_vertical, parse_vertical, same_datum
 from splatpipe.pipeline.survey.frames import Origin
 
@@ -101,7 +101,7 @@ def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similar
     return Similarity.identity()
 
 
-def _on_earth(ours: Place, other: Place, name: str) -> Similarity:
+def _on_earth(ours: SplatOrigin, other: SplatOrigin, name: str) -> Similarity:
     datums = parse_vertical(ours.vertical_datum), parse_vertical(other.vertical_datum)
     known = datums[0] == datums[1] or (UNKNOWN not in datums and same_datum(*datums))
     if not known:
@@ -120,6 +120,6 @@ def _on_earth(ours: Place, other: Place, name: str) -> Similarity:
     return to_ours
 
 
-def origin_of(place: Place) -> Origin:
+def origin_of(place: SplatOrigin) -> Origin:
     """Where a splat has its zero."""
     return Origin(place.latitude, place.longitude, place.height_m)

@@ -24,7 +24,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.images import Pixels
 from splatpipe.pipeline.splat.formats.files import write_scene
-from splatpipe.pipeline.splat.scene import Place, Scene
+from splatpipe.pipeline.splat.scene import Scene, SplatOrigin
 
 RECORD, PICTURE = ".edits.json", ".edit.png"
 
@@ -65,7 +65,7 @@ class _Look:
     """Where a splat lies, for pictures."""
 
     points: Points
-    place: Place | None
+    place: SplatOrigin | None
     count: int
 
 
@@ -211,7 +211,7 @@ def _write_picture(task: Task, views: Views, before: _Look, right: Pixels) -> No
         raise MachineError(f"Cannot write the picture: {error.strerror}.", hint="Check the free space.") from error
 
 
-def _between(before: Place | None, after: Place | None) -> Similarity:
+def _between(before: SplatOrigin | None, after: SplatOrigin | None) -> Similarity:
     if before is None or after is None:
         return Similarity(1.0, np.eye(3), np.zeros(3))
     return between(origin_of(before), origin_of(after))

@@ -22,7 +22,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import laid_over
+from splatpipe.pipeline.splat.panorama import composite_over
 
 Picture = Float32[np.ndarray, "h w 3"]
 FITTED_PIXELS = 4  # every so manieth pixel along both sides is enough for a colour map
@@ -83,7 +83,7 @@ def _rendered(model: Gaussians, camera: Camera, photos: Photos, options: rasteri
     if photos.sky is None:
         return rendered.colour
     behind = photos.sky.behind(camera, options.background)
-    return laid_over(rendered.colour, rendered.alpha, options.background, behind)
+    return composite_over(rendered.colour, rendered.alpha, options.background, behind)
 
 
 def _error_slope(colour: Tensor, photo: Pixels, mask: Mask | None) -> Tensor:

@@ -36,9 +36,9 @@ from splatpipe.pipeline.survey.survey_text import (
     TableKind,
     delimiter_of,
     find_columns,
+    line_errors,
     number_in,
     read_lines,
-    told_by_line,
     written_lines,
 )
 
@@ -129,7 +129,7 @@ def read_keyframes(path: Path) -> Keyframes:
         SplatpipeError: if it is none; names the line, or the keyframe in JSON, that is wrong.
     """
     lines = read_lines(path, KIND)
-    with told_by_line(path, KIND):
+    with line_errors(path, KIND):
         text = "\n".join(line for _, line in lines)
         if text.lstrip()[:1] in ("{", "["):
             return _keyframes(list(enumerate(_of_json(text), 1)))

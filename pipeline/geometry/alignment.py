@@ -14,8 +14,8 @@ from splatpipe.pipeline.geometry.correspondences import (
     REDUNDANT,
     Correspondences,
     DirectionPrior,
-    Limit,
-    Shared,
+    InlierLimit,
+    SharedErrors,
     normed,
 )
 from splatpipe.pipeline.geometry.similarity import (
@@ -33,7 +33,7 @@ from splatpipe.pipeline.geometry.similarity import (
 __all__ = [
     "Correspondences",
     "DirectionPrior",
-    "Shared",
+    "SharedErrors",
     "SimilarityFit",
     "offset_step_sigmas",
     "robust_similarity",
@@ -110,7 +110,7 @@ def robust_similarity(
     if max_error is None:
         fit, limit = _at_own_noise(points, hypotheses)
     else:
-        limit = Limit(max_error)
+        limit = InlierLimit(max_error)
         fit = _refine(_consensus(points, limit, hypotheses), points, limit, None)
     if prior is None or fit.sigma_rotation_rad <= WEAK_ROTATION_RAD:
         return fit
@@ -178,13 +178,13 @@ class _Problem:
         return moved_similarity(self.similarity, self.points.source, step)
 
 
-def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tuple[SimilarityFit, Limit]:
+def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tuple[SimilarityFit, InlierLimit]:
     """The fit of the least limit that does not cut into the noise which it shows, with half of the points or more.
 
     A limit below the noise leaves points within it, spread up to it; their spread, counted by the degrees of freedom
     that the fit leaves, says so. From some times the noise on, what is outside is no noise.
     """
-    limit = Limit(OUTLIER_SIGMAS, of_sigmas=True)
+    limit = InlierLimit(OUTLIER_SIGMAS, of_sigmas=True)
     # Errors of all sizes have no noise that half of them share; a limit as wide as the target tells nothing.
     widest = float(normed(points.target - points.target.mean(axis=0), points).max())
     while True:
@@ -195,7 +195,7 @@ def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tupl
         settled = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
         if settled or used == len(points) or limit.most > widest:
             return fit, limit
-        limit = Limit(LIMIT_STEP * limit.most, of_sigmas=True)
+        limit = InlierLimit(LIMIT_STEP * limit.most, of_sigmas=True)
 
 
 def _hypotheses(points: Correspondences) -> list[Similarity]:
@@ -207,7 +207,7 @@ def _hypotheses(points: Correspondences) -> list[Similarity]:
     return [*hypotheses, _closed_form(points, weights)]
 
 
-def _consensus(points: Correspondences, limit: Limit, hypotheses: list[Similarity]) -> Similarity:
+def _consensus(points: Correspondences, limit: InlierLimit, hypotheses: list[Similarity]) -> Similarity:
     """The best hypothesis, refined."""
     weights = (np.median(points.sigmas) / points.sigmas).mean(axis=1) ** 2
     costs = _costs(points, limit, hypotheses)
@@ -226,7 +226,7 @@ def _consensus(points: Correspondences, limit: Limit, hypotheses: list[Similarit
     return best
 
 
-def _costs(points: Correspondences, limit: Limit, hypotheses: list[Similarity]) -> Float64[np.ndarray, " h"]:
+def _costs(points: Correspondences, limit: InlierLimit, hypotheses: list[Similarity]) -> Float64[np.ndarray, " h"]:
     """The squares of the residuals, cut off at the limit; what groups share is taken off as their medians."""
     turned = np.stack([hypothesis.scale * hypothesis.rotation for hypothesis in hypotheses])
     residuals = np.einsum("hij,nj->hni", turned, points.source) - points.target
@@ -239,7 +239,9 @@ def _costs(points: Correspondences, limit: Limit, hypotheses: list[Similarity]) 
     return np.asarray(np.minimum(limit.squares(residuals, points), limit.most**2).sum(axis=1))
 
 
-def _refine(start: Similarity, points: Correspondences, limit: Limit, prior: DirectionPrior | None) -> SimilarityFit:
+def _refine(
+    start: Similarity, points: Correspondences, limit: InlierLimit, prior: DirectionPrior | None
+) -> SimilarityFit:
     """Reweighted least squares on the points near the fit, until these stay the same."""
     similarity = start
     settled = points.without(_median_offsets(start, points))

@@ -12,7 +12,7 @@ REDUNDANT = 8  # points from which on the residuals tell the noise better than t
 
 
 @dataclass(frozen=True)
-class Shared:
+class SharedErrors:
     """Errors that points of a group have in common, e.g. those of one flight.
 
     Attributes:
@@ -42,14 +42,14 @@ class Correspondences:
     source: Float64[np.ndarray, "n 3"]
     target: Float64[np.ndarray, "n 3"]
     sigmas: Float64[np.ndarray, "n 3"]
-    shared: Shared | None = None
+    shared: SharedErrors | None = None
 
     def __len__(self) -> int:
         return len(self.source)
 
     def only(self, chosen: Bool[np.ndarray, " n"]) -> Correspondences:
         """Some of them."""
-        shared = None if self.shared is None else Shared(self.shared.group[chosen], self.shared.sigmas)
+        shared = None if self.shared is None else SharedErrors(self.shared.group[chosen], self.shared.sigmas)
         return Correspondences(self.source[chosen], self.target[chosen], self.sigmas[chosen], shared)
 
     def without(self, offsets: Float64[np.ndarray, "g 3"]) -> Correspondences:
@@ -81,7 +81,7 @@ class DirectionPrior:
 
 
 @dataclass(frozen=True)
-class Limit:
+class InlierLimit:
     """How far points may be from a fit that they agree with.
 
     Attributes:

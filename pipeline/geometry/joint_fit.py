@@ -29,7 +29,7 @@ MOST_FOUND = 50  # blunders: a file with more has another fault
 
 
 @dataclass(frozen=True)
-class Observed:
+class JointObservations:
     """The same points in the model and, as stated, in the world.
 
     Attributes:
@@ -49,9 +49,9 @@ class Observed:
     def __len__(self) -> int:
         return len(self.source)
 
-    def only(self, chosen: Bool[np.ndarray, " n"]) -> Observed:
+    def only(self, chosen: Bool[np.ndarray, " n"]) -> JointObservations:
         """Some of them."""
-        return Observed(
+        return JointObservations(
             self.source[chosen], self.target[chosen], self.sigmas[chosen], self.group[chosen], self.is_control[chosen]
         )
 
@@ -103,7 +103,7 @@ class JointFit:
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
-def fit_jointly(start: Similarity, observed: Observed, priors: Priors) -> JointFit:
+def fit_jointly(start: Similarity, observed: JointObservations, priors: Priors) -> JointFit:
     """Weighted least squares of a similarity and the groups' offsets (Gauss-Newton).
 
     Args:
@@ -139,7 +139,7 @@ def fit_jointly(start: Similarity, observed: Observed, priors: Priors) -> JointF
     return JointFit(similarity, offsets, inverse, mean, residuals, noise, degrees)
 
 
-def find_blunders(start: Similarity, observed: Observed, priors: Priors, least_m: float) -> tuple[int, ...]:
+def find_blunders(start: Similarity, observed: JointObservations, priors: Priors, least_m: float) -> tuple[int, ...]:
     """Control points that contradict the others (data snooping: Baarda 1968, with the others' own noise).
 
     A point is off where the fit without it misses it by more than the others' noise and number allow. Two at a time
@@ -168,7 +168,7 @@ def find_blunders(start: Similarity, observed: Observed, priors: Priors, least_m
 
 
 def misfit(
-    fit: JointFit, observed: Observed, index: int
+    fit: JointFit, observed: JointObservations, index: int
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
     """Residual of a point that took no part in a fit, and its standard deviations by the fit's own noise.
 
@@ -190,7 +190,9 @@ def critical(degrees: int) -> float:
     return CRITICAL + CRITICAL_FEW / max(degrees, 1)
 
 
-def _worst(start: Similarity, observed: Observed, priors: Priors, found: Sequence[int], least_m: float) -> list[int]:
+def _worst(
+    start: Similarity, observed: JointObservations, priors: Priors, found: Sequence[int], least_m: float
+) -> list[int]:
     """The point, or else the two, without which the others agree best, if they are off."""
     left = [int(i) for i in np.flatnonzero(observed.is_control) if i not in found]
     for size in (1, 2):
@@ -206,7 +208,7 @@ def _worst(start: Similarity, observed: Observed, priors: Priors, found: Sequenc
     return []
 
 
-def _suspects(start: Similarity, observed: Observed, priors: Priors, left: Sequence[int]) -> list[int]:
+def _suspects(start: Similarity, observed: JointObservations, priors: Priors, left: Sequence[int]) -> list[int]:
     """The points of the largest residuals, all of them where they are few."""
     if len(left) <= MOST_SUSPECTS:
         return list(left)
@@ -218,7 +220,7 @@ def _suspects(start: Similarity, observed: Observed, priors: Priors, left: Seque
     return sorted(np.array(left)[np.argsort(-size[left], kind="stable")[:MOST_SUSPECTS]].tolist())
 
 
-def _is_off(fit: JointFit, observed: Observed, index: int, least_m: float) -> bool:
+def _is_off(fit: JointFit, observed: JointObservations, index: int, least_m: float) -> bool:
     residual, sigmas = misfit(fit, observed, index)
     known = int(np.isfinite(observed.sigmas[index]).sum())
     return studentised(residual, sigmas, known) > critical(fit.degrees) and float(np.linalg.norm(residual)) > least_m
@@ -230,7 +232,7 @@ def _without(count: int, left_out: Sequence[int]) -> Bool[np.ndarray, " n"]:
     return kept
 
 
-def _noise(residuals: Float64[np.ndarray, "n 3"], observed: Observed) -> tuple[float, int]:
+def _noise(residuals: Float64[np.ndarray, "n 3"], observed: JointObservations) -> tuple[float, int]:
     used = np.isfinite(observed.sigmas) & observed.is_control[:, None]
     degrees = int(used.sum()) - SIMILARITY
     if degrees <= 0:
@@ -252,7 +254,10 @@ def _jacobian(
 
 
 def _full_jacobian(
-    similarity: Similarity, observed: Observed, mean: Float64[np.ndarray, " 3"], member: Float64[np.ndarray, "n k"]
+    similarity: Similarity,
+    observed: JointObservations,
+    mean: Float64[np.ndarray, " 3"],
+    member: Float64[np.ndarray, "n k"],
 ) -> Float64[np.ndarray, "n 3 p"]:
     offsets = (member[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(len(observed), 3, -1)
     return np.concatenate([_jacobian(similarity, observed.source, mean), offsets], axis=2)

@@ -64,7 +64,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Triangulated:
+class TriangulatedPoint:
     """A point and what its rays say of it.
 
     Attributes:
@@ -80,7 +80,7 @@ class Triangulated:
     residuals_px: Float64[np.ndarray, "n 2"]
 
 
-def triangulate(rays: Rays, tolerance_px: float) -> Triangulated | None:
+def triangulate(rays: Rays, tolerance_px: float) -> TriangulatedPoint | None:
     """The point where most of the rays meet: every pair is a hypothesis, the best is refined on those that agree.
 
     Args:
@@ -121,7 +121,7 @@ def triangulate(rays: Rays, tolerance_px: float) -> Triangulated | None:
     if point is None:
         return None
     jacobian = rays.only(agree).jacobian(point).reshape(-1, 3)
-    return Triangulated(point, np.linalg.pinv(jacobian.T @ jacobian), agree, rays.residuals_px(point))
+    return TriangulatedPoint(point, np.linalg.pinv(jacobian.T @ jacobian), agree, rays.residuals_px(point))
 
 
 def _meeting(rays: Rays) -> Float64[np.ndarray, " 3"] | None:

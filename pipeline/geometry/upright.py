@@ -54,7 +54,7 @@ class CameraAxes:
 
 
 @dataclass(frozen=True)
-class Upright:
+class UpEstimate:
     """An estimate of up in the model's frame and, in a few words, what it was taken from."""
 
     up: Float64[np.ndarray, " 3"]
@@ -82,7 +82,7 @@ def camera_axes(cam_from_world: Float64[np.ndarray, "n 3 3"], orientations: Int6
 
 def up_from_cameras(
     axes: CameraAxes, centres: Float64[np.ndarray, "n 3"], points: Float64[np.ndarray, "m 3"]
-) -> Upright:
+) -> UpEstimate:
     """Up by the habit of holding cameras level: their horizontal axes lie in one plane, whatever they look at.
 
     Cameras that are all turned alike do not show that plane. Then only the layout of their positions tells cameras that
@@ -98,16 +98,16 @@ def up_from_cameras(
     normal, thickness, width = _plane_normal(axes.right)
     if width > LEAST_WIDTH and thickness < MOST_THICKNESS * width:
         sign = float(np.sign(((axes.up - axes.forward) @ normal).sum())) or 1.0
-        return Upright(sign * normal, "the horizontal edges of the pictures")
+        return UpEstimate(sign * normal, "the horizontal edges of the pictures")
     alike_up, alike_forward = float(np.linalg.norm(mean_up)), float(np.linalg.norm(mean_forward))
     if alike_forward > ALIKE and (alike_up < SCATTERED or _is_survey(centres, mean_up, mean_forward)):
         ground = _ground_normal(points, centres, -_unit(mean_forward))
         if ground is not None and alike_forward < STEADY:
-            return Upright(ground, "the ground below cameras that look down")
-        return Upright(-_unit(mean_forward), "the viewing direction of cameras that look down")
+            return UpEstimate(ground, "the ground below cameras that look down")
+        return UpEstimate(-_unit(mean_forward), "the viewing direction of cameras that look down")
     if alike_up > SCATTERED:
-        return Upright(_unit(mean_up), "the upper edges of the pictures")
-    return Upright(_unit(mean_up - mean_forward), "the pictures' upper edges and viewing directions")
+        return UpEstimate(_unit(mean_up), "the upper edges of the pictures")
+    return UpEstimate(_unit(mean_up - mean_forward), "the pictures' upper edges and viewing directions")
 
 
 def up_without_orientation(
@@ -115,7 +115,7 @@ def up_without_orientation(
     centres: Float64[np.ndarray, "n 3"],
     points: Float64[np.ndarray, "m 3"],
     brighter: Callable[[], Float64[np.ndarray, "n 2"]],
-) -> Upright:
+) -> UpEstimate:
     """Up for photos whose EXIF orientation is not known: held upright, or all turned by a quarter in the stored grid.
 
     The way of holding them is the one that lays the horizontal axes better into a plane. Of the two quarter turns it is
@@ -138,7 +138,9 @@ def up_without_orientation(
     if not is_plane or (width > LEAST_WIDTH and thickness * other_width <= other_thickness * width):
         return up_from_cameras(upright, centres, points)
     light = np.einsum("nij,ni->nj", cam_from_world[:, :2], brighter()).sum(axis=0)
-    return Upright((float(np.sign(light @ normal)) or 1.0) * normal, "the vertical edges of pictures that are turned")
+    return UpEstimate(
+        (float(np.sign(light @ normal)) or 1.0) * normal, "the vertical edges of pictures that are turned"
+    )
 
 
 def enu_from_gimbal(

@@ -50,7 +50,7 @@ class DensePoints:
 
 
 @dataclass(frozen=True)
-class Cover:
+class PointBudget:
     """How the points are spread.
 
     Attributes:
@@ -63,7 +63,7 @@ class Cover:
 
 
 def dense_points(
-    dataset: Path, views: Sequence[View], cover: Cover, folder: Path, threads: int, report: Reporter
+    dataset: Path, views: Sequence[View], cover: PointBudget, folder: Path, threads: int, report: Reporter
 ) -> DensePoints:
     """Points on surfaces where the sparse model has few; the same for any number of threads.
 

@@ -21,7 +21,7 @@ from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_search import AGREEING, Agreement, DepthSearch, SearchPlan
+from splatpipe.pipeline.mvs.depth_search import AGREEING, ConfirmedDepths, DepthSearch, SearchPlan
 from splatpipe.pipeline.mvs.edges import pixels_behind
 from splatpipe.pipeline.photos.dataset import View
 
@@ -45,7 +45,7 @@ class DepthMap:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptMap:
+class DepthMapFile:
     """A depth map in its file.
 
     Attributes:
@@ -95,7 +95,7 @@ def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> di
     return {"maps": len(told), "megapixels": pixels / 1e6, "found": found / max(pixels, 1)}
 
 
-def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[KeptMap]:
+def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[DepthMapFile]:
     """What ``keep_depth_maps`` left, to be read one by one.
 
     Args:
@@ -109,7 +109,7 @@ def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[KeptMap]:
     try:
         told = json.loads((folder / LIST).read_text(encoding="utf-8"))["maps"]
         return [
-            KeptMap(cameras[each["photo"]].scaled(int(each["width"]), int(each["height"])), folder / each["file"])
+            DepthMapFile(cameras[each["photo"]].scaled(int(each["width"]), int(each["height"])), folder / each["file"])
             for each in told
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -154,7 +154,7 @@ def _with_edges(search: DepthSearch, numbered: tuple[int, tuple[Camera, DepthMap
 
 
 def confirmed_maps(
-    cameras: Sequence[Camera], agreement: Callable[[int], Agreement | None], threads: int, report: Reporter
+    cameras: Sequence[Camera], agreement: Callable[[int], ConfirmedDepths | None], threads: int, report: Reporter
 ) -> Iterator[tuple[Camera, DepthMap]]:
     """Photos' depths that enough others found, too, in the order of the cameras.
 
@@ -170,7 +170,7 @@ def confirmed_maps(
         report.progress(done, len(cameras), "comparing depths", "photos")
 
 
-def _confirmed_map(camera: Camera, agreement: Agreement | None) -> DepthMap:
+def _confirmed_map(camera: Camera, agreement: ConfirmedDepths | None) -> DepthMap:
     depth = np.zeros((camera.height, camera.width), np.float32)
     confidence = np.zeros(depth.shape, np.uint8)
     if agreement is not None:

@@ -18,8 +18,8 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.array_file import save_arrays
-from splatpipe.pipeline.mvs.neighbours import Tracks, inverse_depths, load_tracks, neighbours
-from splatpipe.pipeline.mvs.patch_match import Depths, find_depths
+from splatpipe.pipeline.mvs.neighbours import SparseVisibility, inverse_depths, load_tracks, neighbours
+from splatpipe.pipeline.mvs.patch_match import DepthEstimate, find_depths
 from splatpipe.pipeline.mvs.picture import Picture
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import reduced_camera
@@ -38,7 +38,7 @@ Axes = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.nd
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ConfirmedDepths:
     """What other photos say of a photo's depths; a row for each pixel with one.
 
     Attributes:
@@ -92,7 +92,7 @@ class DepthSearch:
 
     views: Sequence[View]
     cameras: Sequence[Camera]
-    tracks: Tracks
+    tracks: SparseVisibility
     near: Sequence[Sequence[int]]
     folder: Path
     plan: SearchPlan
@@ -137,13 +137,13 @@ class DepthSearch:
         with np.load(self._photo_path(number)) as kept:
             return np.asarray(kept["colour"], np.uint8)
 
-    def depths(self, number: int) -> Depths | None:
+    def depths(self, number: int) -> DepthEstimate | None:
         """What was found in a photo; None for one that has too few neighbours or points."""
         path = self._depths_path(number)
         if not path.is_file():
             return None
         with np.load(path) as kept:
-            return Depths(kept["inverse"], kept["cost"])
+            return DepthEstimate(kept["inverse"], kept["cost"])
 
     def inverse(self, number: int) -> Inverse | None:
         """The inverse depths alone: what a neighbour is asked for."""
@@ -153,7 +153,7 @@ class DepthSearch:
         with np.load(path) as kept:
             return np.asarray(kept["inverse"], np.float32)
 
-    def agreement(self, number: int) -> Agreement | None:
+    def agreement(self, number: int) -> ConfirmedDepths | None:
         """What a photo's neighbours say of its depths; None where it has none."""
         return agreement_of(number, self.cameras, self.near[number], (self.depths(number), self.inverse))
 
@@ -193,8 +193,8 @@ def agreement_of(
     number: int,
     cameras: Sequence[Camera],
     others: Sequence[int],
-    depths: tuple[Depths | None, Callable[[int], Inverse | None]],
-) -> Agreement | None:
+    depths: tuple[DepthEstimate | None, Callable[[int], Inverse | None]],
+) -> ConfirmedDepths | None:
     """What other photos say of a photo's depths; None where it has none.
 
     Args:
@@ -216,7 +216,7 @@ def agreement_of(
         theirs = inverse_of(other)
         if theirs is not None:
             confirm((east, north, up), camera, cameras[other], theirs, (total, votes))
-    return Agreement(rows, columns, inverse, total / (1.0 + votes)[:, None], votes, own.cost[rows, columns])
+    return ConfirmedDepths(rows, columns, inverse, total / (1.0 + votes)[:, None], votes, own.cost[rows, columns])
 
 
 def confirm(

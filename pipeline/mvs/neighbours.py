@@ -23,7 +23,7 @@ FARTHER = 10.0  # times farther than the farthest: of hills and trees behind, fe
 
 
 @dataclass(frozen=True)
-class Tracks:
+class SparseVisibility:
     """Which view saw which sparse point.
 
     Attributes:
@@ -35,7 +35,7 @@ class Tracks:
     seen: tuple[Int64[np.ndarray, " _"], ...]
 
 
-def load_tracks(dataset: Path, names: Sequence[str]) -> Tracks:
+def load_tracks(dataset: Path, names: Sequence[str]) -> SparseVisibility:
     """The finite sparse points of a dataset and the views that saw them.
 
     Args:
@@ -47,10 +47,10 @@ def load_tracks(dataset: Path, names: Sequence[str]) -> Tracks:
     """
     points, seen = load_points_and_tracks(dataset)
     finite = np.asarray(np.isfinite(points.xyz).all(axis=1))
-    return Tracks(points.xyz, tuple(rows[finite[rows]] for rows in (seen[name] for name in names)))
+    return SparseVisibility(points.xyz, tuple(rows[finite[rows]] for rows in (seen[name] for name in names)))
 
 
-def neighbours(tracks: Tracks, cameras: Sequence[Camera], most: int) -> list[list[int]]:
+def neighbours(tracks: SparseVisibility, cameras: Sequence[Camera], most: int) -> list[list[int]]:
     """For each view the others to compare it with, the best first.
 
     A shared point counts the more, the nearer the angle between its two rays is to ``BEST_ANGLE_DEG`` (the shape of the
@@ -92,7 +92,7 @@ def _angle_weights(
     return np.asarray(np.exp(-0.5 * np.square((angle - BEST_ANGLE_DEG) / spread)))
 
 
-def inverse_depths(tracks: Tracks, view: int, camera: Camera, wider: float) -> tuple[float, float] | None:
+def inverse_depths(tracks: SparseVisibility, view: int, camera: Camera, wider: float) -> tuple[float, float] | None:
     """The range of inverse depths to look at: that of the view's own points, a little nearer and much farther.
 
     Args:

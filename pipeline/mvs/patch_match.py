@@ -25,7 +25,7 @@ FAR_END = 2.0  # times the smallest inverse depth; what is farther is at no dist
 
 
 @dataclass(frozen=True, eq=False)
-class Depths:
+class DepthEstimate:
     """What a photo's pixels are told.
 
     Attributes:
@@ -39,7 +39,7 @@ class Depths:
 
 def find_depths(
     photo: Picture, others: Sequence[Picture], inverse_range: tuple[float, float], seed: int, plain: bool = False
-) -> Depths:
+) -> DepthEstimate:
     """Find the depths of a photo's pixels, on the kernels' threads.
 
     Args:
@@ -63,7 +63,7 @@ def find_depths(
         )
     usable = photo.whole() if plain else photo.textured()
     found = usable & (costs <= ALIKE) & (planes[0] > FAR_END * inverse_range[0])
-    return Depths(np.where(found, planes[0], np.float32(0.0)), costs)
+    return DepthEstimate(np.where(found, planes[0], np.float32(0.0)), costs)
 
 
 def _spread(planes: Float32[np.ndarray, "3 h w"], photo: Picture) -> Float32[np.ndarray, "3 h2 w2"]:

@@ -17,9 +17,9 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_maps
-from splatpipe.pipeline.mvs.depth_search import Agreement, Inverse, agreement_of
+from splatpipe.pipeline.mvs.depth_search import ConfirmedDepths, Inverse, agreement_of
 from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
-from splatpipe.pipeline.mvs.patch_match import Depths
+from splatpipe.pipeline.mvs.patch_match import DepthEstimate
 
 
 def rendered_depth_maps(
@@ -50,9 +50,9 @@ def rendered_depth_maps(
     tracks = load_tracks(dataset, [camera.name for camera in cameras])
     near = neighbours(tracks, cameras, ASKED)
 
-    def agreement(number: int) -> Agreement | None:
+    def agreement(number: int) -> ConfirmedDepths | None:
         inverse = _kept(folder, number)
-        own = Depths(inverse, np.zeros_like(inverse))
+        own = DepthEstimate(inverse, np.zeros_like(inverse))
         return agreement_of(number, cameras, near[number], (own, partial(_kept, folder)))
 
     yield from confirmed_maps(cameras, agreement, threads, report)

@@ -18,7 +18,7 @@ from PIL import Image
 
 from splatpipe.pipeline.photos.exif import Exif, read_exif
 from splatpipe.pipeline.photos.photo_list import load_stored, open_picture
-from splatpipe.pipeline.photos.scan import Candidate, LeftOut
+from splatpipe.pipeline.photos.scan import Candidate, ExcludedPhoto
 from splatpipe.pipeline.photos.xmp import find_packet, parse_xmp
 
 MAX_FILE_BYTES = 2 << 30
@@ -36,7 +36,7 @@ _one_large_at_a_time = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Limits:
+class PictureLimits:
     """What a picture may measure: ``min_side`` (the longer side, pixels) and ``max_pixels``."""
 
     min_side: int
@@ -74,7 +74,7 @@ class CheckedPhoto:
     xmp: Mapping[str, str]
 
 
-def check_photo(candidate: Candidate, limits: Limits) -> CheckedPhoto | LeftOut:
+def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | ExcludedPhoto:
     """Read, hash and decode a file whole.
 
     Args:
@@ -87,16 +87,16 @@ def check_photo(candidate: Candidate, limits: Limits) -> CheckedPhoto | LeftOut:
     try:
         data, sha256 = _read_once(candidate.path)
     except OSError as error:
-        return LeftOut(candidate.name, f"cannot be read ({error.strerror or error})")
+        return ExcludedPhoto(candidate.name, f"cannot be read ({error.strerror or error})")
     except ValueError as error:
-        return LeftOut(candidate.name, str(error))
+        return ExcludedPhoto(candidate.name, str(error))
     try:
         picture = open_picture(BytesIO(data))
     except Exception as error:  # Pillow's readers raise almost anything on broken pictures
-        return LeftOut(candidate.name, _why_broken(error))
+        return ExcludedPhoto(candidate.name, _why_broken(error))
     with picture:
         reason = _refusal(picture, limits)
-        return LeftOut(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
+        return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
 
 
 def deep_pixels(data: bytes, picture: Image.Image, orientation: int) -> Shaped[np.ndarray, "h w *channels"] | None:
@@ -141,7 +141,7 @@ def _read_once(path: Path) -> tuple[bytes, str]:
     return data, sha.hexdigest()
 
 
-def _refusal(picture: Image.Image, limits: Limits) -> str:
+def _refusal(picture: Image.Image, limits: PictureLimits) -> str:
     """Why an opened picture is not to be decoded; empty when it is."""
     width, height = picture.size
     if width * height > limits.max_pixels:
@@ -155,11 +155,11 @@ def _refusal(picture: Image.Image, limits: Limits) -> str:
     return ""
 
 
-def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image) -> CheckedPhoto | LeftOut:
+def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image) -> CheckedPhoto | ExcludedPhoto:
     exif = read_exif(picture)
     xmp = parse_xmp(find_packet(_xmp_bytes(picture)) or find_packet(data))
     if xmp.get("GPano:ProjectionType"):
-        return LeftOut(candidate.name, "is a stitched panorama: give the single pictures it was made of")
+        return ExcludedPhoto(candidate.name, "is a stitched panorama: give the single pictures it was made of")
     orientation = stored_orientation(exif, picture)
     width, height = picture.size
     turned = picture.format == "TIFF" and orientation != 1
@@ -170,12 +170,12 @@ def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image
         try:
             loaded = _load(data, picture, orientation)
         except MemoryError:
-            return LeftOut(candidate.name, "is too large for this machine's memory")
+            return ExcludedPhoto(candidate.name, "is too large for this machine's memory")
         except Exception as error:  # as above
-            return LeftOut(candidate.name, _why_broken(error))
+            return ExcludedPhoto(candidate.name, _why_broken(error))
         pixels = _deep_facts(loaded) if isinstance(loaded, np.ndarray) else _plain_facts(loaded, (width, height))
     if pixels is None:
-        return LeftOut(candidate.name, "has no pixel with a value")
+        return ExcludedPhoto(candidate.name, "has no pixel with a value")
     return CheckedPhoto(
         name=candidate.name,
         path=candidate.path,

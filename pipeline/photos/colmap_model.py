@@ -41,7 +41,7 @@ class Pinhole:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
+class ModelPhoto:
     """A photo of the model.
 
     Attributes:
@@ -76,7 +76,7 @@ class Cloud:
     track_lengths: Int64[np.ndarray, " n"]
 
 
-def read_photos(folder: Path) -> list[Photo]:
+def read_photos(folder: Path) -> list[ModelPhoto]:
     """The posed photos of a model, by ascending id.
 
     Args:
@@ -88,14 +88,14 @@ def read_photos(folder: Path) -> list[Photo]:
     """
     cameras = _read_cameras(_File(folder / CAMERAS))
     file = _File(folder / IMAGES)
-    photos: dict[int, Photo] = {}
+    photos: dict[int, ModelPhoto] = {}
     for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size)):
         number, *pose, camera = file.take(_IMAGE)
         name = file.name()
         if camera not in cameras:
             raise ValueError(f"{IMAGES}: {name} has a camera that is not there")
         observed = file.array(_OBSERVATION)["point"]
-        photos[number] = Photo(name, cameras[camera], _matrix(np.array(pose)), observed[observed != UNMATCHED])
+        photos[number] = ModelPhoto(name, cameras[camera], _matrix(np.array(pose)), observed[observed != UNMATCHED])
     file.end()
     return [photo for _, photo in sorted(photos.items())]
 

@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64, UInt8
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.colmap_model import Cloud, Photo, read_cloud, read_photos
+from splatpipe.pipeline.photos.colmap_model import Cloud, ModelPhoto, read_cloud, read_photos
 from splatpipe.pipeline.photos.names import NameFinder, some
 
 IMAGES = "images"
@@ -85,7 +85,7 @@ def load_views(dataset: Path) -> list[View]:
     return sorted(views, key=lambda view: view.camera.name)
 
 
-def _view(dataset: Path, photo: Photo) -> View:
+def _view(dataset: Path, photo: ModelPhoto) -> View:
     mask, sky = (mask_path(dataset, photo.name, folder) for folder in (MASKS, SKY_MASKS))
     lens = photo.camera
     return View(
@@ -122,7 +122,7 @@ def load_points_and_tracks(dataset: Path) -> tuple[Points, dict[str, Int64[np.nd
     return _points(cloud), tracks
 
 
-def _rows(cloud: Cloud, photo: Photo) -> Int64[np.ndarray, " _"]:
+def _rows(cloud: Cloud, photo: ModelPhoto) -> Int64[np.ndarray, " _"]:
     """Which rows of the points a photo observes."""
     observed = np.unique(photo.points)
     rows = np.searchsorted(cloud.ids, observed)

@@ -8,10 +8,10 @@ import numpy as np
 
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.convert import read_8bit
-from splatpipe.pipeline.photos.scan import LeftOut
+from splatpipe.pipeline.photos.scan import ExcludedPhoto
 
 
-def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], list[LeftOut]]:
+def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], list[ExcludedPhoto]]:
     """Keep the first of equal photos.
 
     Args:
@@ -21,18 +21,18 @@ def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto]
         The photos that stay, and the others with the twin's name.
     """
     kept: list[CheckedPhoto] = []
-    left_out: list[LeftOut] = []
+    left_out: list[ExcludedPhoto] = []
     by_sha: dict[str, CheckedPhoto] = {}
     by_fingerprint: dict[str, CheckedPhoto] = {}
     for photo in photos:
         twin = by_sha.get(photo.sha256)
         if twin is not None:
-            left_out.append(LeftOut(photo.name, f"is the same file as {twin.name}"))
+            left_out.append(ExcludedPhoto(photo.name, f"is the same file as {twin.name}"))
             continue
         by_sha[photo.sha256] = photo
         twin = by_fingerprint.get(photo.fingerprint)
         if twin is not None and _equal_pixels(photo, twin):
-            left_out.append(LeftOut(photo.name, f"has the same pixels as {twin.name}"))
+            left_out.append(ExcludedPhoto(photo.name, f"has the same pixels as {twin.name}"))
             continue
         by_fingerprint.setdefault(photo.fingerprint, photo)
         kept.append(photo)

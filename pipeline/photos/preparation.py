@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.check import CheckedPhoto, Limits, check_photo
+from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.photos.convert import convert_photo, save_png, scale_of
 from splatpipe.pipeline.photos.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
 from splatpipe.pipeline.photos.names import printable, some
@@ -22,7 +22,7 @@ from splatpipe.pipeline.photos.photo_list import (
     MASK_DIR,
     SKY_DIR,
 )
-from splatpipe.pipeline.photos.scan import MASK_FOLDER, SKY_FOLDER, LeftOut, Scan
+from splatpipe.pipeline.photos.scan import MASK_FOLDER, SKY_FOLDER, ExcludedPhoto, Scan
 
 MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly meant
 T = TypeVar("T")
@@ -62,14 +62,14 @@ class Preparation:
         return int(self.config.max_megapixels * 1e6)
 
 
-def check_photos(scan: Scan, work: Preparation) -> tuple[list[CheckedPhoto], list[LeftOut]]:
+def check_photos(scan: Scan, work: Preparation) -> tuple[list[CheckedPhoto], list[ExcludedPhoto]]:
     """Check what the scan found; the photos that can be used, and what cannot and why."""
-    limits = Limits(work.config.min_size, work.max_pixels)
+    limits = PictureLimits(work.config.min_size, work.max_pixels)
     results = _in_threads(
         lambda candidate: check_photo(candidate, limits), scan.candidates, work, "checking photos", "photos"
     )
     checked = [result for result in results if isinstance(result, CheckedPhoto)]
-    return checked, [result for result in results if isinstance(result, LeftOut)]
+    return checked, [result for result in results if isinstance(result, ExcludedPhoto)]
 
 
 def convert_odd(

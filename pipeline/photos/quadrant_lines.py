@@ -20,7 +20,7 @@ LEAST_PIXELS = 14
 
 
 @dataclass(frozen=True)
-class Lines:
+class LinePair:
     """Two lines through a point, and what lies between them.
 
     Attributes:
@@ -119,7 +119,7 @@ def _fit_near(
     return values, correlation(seen, shown)
 
 
-def fit_within(grey: Float32[np.ndarray, "h w"], lines: Lines, reach: Float64[np.ndarray, " 2"]) -> Lines | None:
+def fit_within(grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64[np.ndarray, " 2"]) -> LinePair | None:
     """Least squares over the pixels within an ellipse; None where it has too few.
 
     Args:
@@ -146,7 +146,7 @@ def fit_within(grey: Float32[np.ndarray, "h w"], lines: Lines, reach: Float64[np
         damping = damping / 5.0
         if settled:
             break
-    return Lines(values[0]) if np.isfinite(values).all() else None
+    return LinePair(values[0]) if np.isfinite(values).all() else None
 
 
 def _stepped(
@@ -201,7 +201,7 @@ def correlation(seen: Float64[np.ndarray, "n m"], shown: Float64[np.ndarray, "n 
 
 
 def pixels_within(
-    grey: Float32[np.ndarray, "h w"], lines: Lines, reach: Float64[np.ndarray, " 2"]
+    grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64[np.ndarray, " 2"]
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]] | None:
     """Pixels within the ellipse that has the lines' reaches as conjugate half diameters."""
     axes = lines.directions() * reach[:, None]

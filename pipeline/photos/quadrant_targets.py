@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.photos.quadrant_lines import (
     RING_PX,
     RING_STEPS,
-    Lines,
+    LinePair,
     correlation,
     fit_within,
     lines_about,
@@ -117,7 +117,7 @@ def _found_in(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
     for k in np.flatnonzero(worth).tolist():
         x, y = (values[k, :2] + 0.5).tolist()
         if all(np.hypot(x - other.x, y - other.y) > APART_PX for other in found):
-            target = _fitted(grey, pixels, Lines(values[k]))
+            target = _fitted(grey, pixels, LinePair(values[k]))
             if target is not None:
                 found.append(target)
     return found
@@ -185,7 +185,7 @@ def _ring_like(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 
 
 
 def _fitted(
-    grey: Float32[np.ndarray, "h w"], pixels: UInt8[np.ndarray, "h w 3"], start: Lines
+    grey: Float32[np.ndarray, "h w"], pixels: UInt8[np.ndarray, "h w 3"], start: LinePair
 ) -> QuadrantTarget | None:
     """The target whose lines begin so; None where there is none."""
     reach = _reach(grey, start)
@@ -200,7 +200,7 @@ def _fitted_part(reach: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
     return np.clip(FIT_SHARE * reach, LEAST_FIT_PX, LARGEST_FIT_PX)
 
 
-def _reach(grey: Float32[np.ndarray, "h w"], lines: Lines) -> Float64[np.ndarray, " 2"] | None:
+def _reach(grey: Float32[np.ndarray, "h w"], lines: LinePair) -> Float64[np.ndarray, " 2"] | None:
     """How far the contrast across each line goes, the mean of both ways; None where that is no target's."""
     cx, cy, contrast = lines.values[0], lines.values[1], 2.0 * abs(lines.values[5])
     if contrast < LEAST_CONTRAST:
@@ -244,7 +244,7 @@ def _side(directions: Float64[np.ndarray, "2 2"], k: int) -> float:
 def _judged(
     grey: Float32[np.ndarray, "h w"],
     pixels: UInt8[np.ndarray, "h w 3"],
-    lines: Lines,
+    lines: LinePair,
     reach: Float64[np.ndarray, " 2"],
 ) -> QuadrantTarget | None:
     """The target, if its pixels are those of one."""
@@ -287,7 +287,7 @@ def _alone(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: floa
 
 
 def _even(
-    lines: Lines, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, " n"]
+    lines: LinePair, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, " n"]
 ) -> bool:
     """Whether sectors across from each other are equally bright: cars and their shadows are not."""
     cx, cy, first, second, _, contrast = lines.values[:6].tolist()

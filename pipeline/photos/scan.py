@@ -35,7 +35,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class ExcludedPhoto:
     """A photo that takes no part, and why: ``reason`` ends a sentence that starts with the name."""
 
     name: str
@@ -53,7 +53,7 @@ class Scan:
     """
 
     candidates: tuple[Candidate, ...]
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[ExcludedPhoto, ...]
     others: int
 
 
@@ -68,17 +68,17 @@ def scan_folder(root: Path) -> Scan:
         root: The folder that names are relative to.
     """
     candidates: list[Candidate] = []
-    left_out: list[LeftOut] = []
+    left_out: list[ExcludedPhoto] = []
     others = 0
 
     def unreadable(error: OSError) -> None:
-        left_out.append(LeftOut(_name(Path(error.filename), root), "is a folder that may not be read"))
+        left_out.append(ExcludedPhoto(_name(Path(error.filename), root), "is a folder that may not be read"))
 
     for folder, folders, files in os.walk(root, onerror=unreadable):
         passed = [name for name in folders if name.startswith(".") or name.casefold() in (MASK_FOLDER, SKY_FOLDER)]
         folders[:] = sorted(set(folders) - set(passed))
         links = [Path(folder) / name for name in folders if (Path(folder) / name).is_symlink()]
-        left_out += [LeftOut(_name(link, root), "is a link to a folder, which is not followed") for link in links]
+        left_out += [ExcludedPhoto(_name(link, root), "is a link to a folder, which is not followed") for link in links]
         for name in files:
             if name.startswith("."):
                 continue
@@ -91,7 +91,7 @@ def scan_folder(root: Path) -> Scan:
             if reason is None:
                 candidates.append(Candidate(_name(path, root), path))
             else:
-                left_out.append(LeftOut(_name(path, root), reason))
+                left_out.append(ExcludedPhoto(_name(path, root), reason))
     return Scan(
         tuple(sorted(candidates, key=lambda candidate: candidate.name)),
         tuple(sorted(left_out, key=lambda entry: entry.name)),

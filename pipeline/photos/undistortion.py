@@ -26,7 +26,7 @@ LEAST_VIEWS = 2
 
 
 @dataclass(frozen=True)
-class Placed:
+class RegisteredPhoto:
     """A photo with its camera in the model.
 
     Attributes:
@@ -44,7 +44,7 @@ class Placed:
 
 def place(
     model: pycolmap.Reconstruction, photos: Sequence[Photo], max_megapixels: float, report: Reporter
-) -> list[Placed]:
+) -> list[RegisteredPhoto]:
     """Find each image's photo and both its cameras; in name order of the photos.
 
     Raises:
@@ -52,7 +52,7 @@ def place(
     """
     by_name = {photo.name: photo for photo in photos}
     targets: dict[tuple[int, int, int], pycolmap.Camera] = {}
-    placed: dict[str, Placed] = {}
+    placed: dict[str, RegisteredPhoto] = {}
     missing: list[str] = []
     unusable: list[str] = []
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
@@ -70,7 +70,7 @@ def place(
         key = (image.camera_id, photo.width, photo.height)
         if key not in targets:
             targets[key] = pinhole_camera(source, max_megapixels, len(targets) + 1)
-        placed[photo.name] = Placed(photo, image, source, targets[key])
+        placed[photo.name] = RegisteredPhoto(photo, image, source, targets[key])
     if len(placed) < LEAST_VIEWS:
         raise SplatpipeError(
             f"Of the {len(images)} photos in the sparse model, {len(placed)} can be used.",
@@ -137,7 +137,7 @@ def pinhole_camera(source: pycolmap.Camera, max_megapixels: float, number: int) 
     return camera
 
 
-def write_view(view: Placed, inputs: Inputs, dataset: Path) -> None:
+def write_view(view: RegisteredPhoto, inputs: Inputs, dataset: Path) -> None:
     part = inputs["ingest.photos"]
     photo = open_decoded(view.photo, part, inputs.photos_dir)
     strips = resampled_strips(photo.rows, view.source, view.target)
@@ -162,7 +162,7 @@ def _write(path: Path, strips: Iterable[npt.NDArray[np.uint8]], height: int) -> 
     path.write_bytes(encoded.data)
 
 
-def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[Placed]) -> pycolmap.Reconstruction:
+def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[RegisteredPhoto]) -> pycolmap.Reconstruction:
     """The model seen by the pinhole cameras: what is observed in the undistorted photos, and nothing else.
 
     Points that other programs export without observations stay.
@@ -197,7 +197,7 @@ def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[Placed]) -> p
     return result
 
 
-def _observations(model: pycolmap.Reconstruction, view: Placed) -> tuple[list[int], npt.NDArray[np.float64]]:
+def _observations(model: pycolmap.Reconstruction, view: RegisteredPhoto) -> tuple[list[int], npt.NDArray[np.float64]]:
     """Points that a photo sees, and where the pinhole camera sees them (n, 2), within its frame."""
     indices = view.image.get_observation_point2D_idxs()
     points = [view.image.points2D[index].point3D_id for index in indices]

@@ -13,7 +13,7 @@ from torch import Tensor
 from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.cuda_api import SplatSky
 from splatpipe.pipeline.raster.isa import _native
-from splatpipe.pipeline.splat.panorama import STEP_PX, between_nodes, laid_over
+from splatpipe.pipeline.splat.panorama import STEP_PX, between_nodes, composite_over
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def laid_over_nodes_reference(
     if behind.elsewhere is not None and behind.around is not None:
         other = between_nodes(behind.elsewhere, height, width, behind.step)
         shown = torch.where(behind.around[:, :, None], shown, other)
-    return laid_over(colour, alpha, behind.background, shown)
+    return composite_over(colour, alpha, behind.background, shown)
 
 
 class _LaidOver(torch.autograd.Function):

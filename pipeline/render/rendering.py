@@ -18,7 +18,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.raster.reference import project
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import STEP_PX, Panorama, laid_over
+from splatpipe.pipeline.splat.panorama import STEP_PX, Panorama, composite_over
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 
 Model = tuple[Gaussians, Panorama | None]
@@ -128,7 +128,7 @@ def _pixels(model: Model, camera: Camera, options: rasterizer.RenderOptions) -> 
     colour = rendered.colour
     if sky is not None:
         behind = sky.behind(camera, options.background)
-        colour = laid_over(colour, rendered.alpha, options.background, behind)
+        colour = composite_over(colour, rendered.alpha, options.background, behind)
     return np.asarray((colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 

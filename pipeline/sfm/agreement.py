@@ -13,7 +13,7 @@ import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.sfm.coarseness import coarseness
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 EXPLAINED_PX = 4.0  # the distance from the epipolar line that verification itself allows; more in large photos
 LEAST_PARALLAX = 2.0  # of a match, times EXPLAINED_PX, for its depth to have a sign worth asking for
@@ -23,7 +23,7 @@ Rays = Float64[np.ndarray, "n 2"]
 
 @dataclass(frozen=True)
 class Agreement:
-    """Each verified pair of photos against a model; a row a pair, in the order of ``Verified.matches``.
+    """Each verified pair of photos against a model; a row a pair, in the order of ``ViewGraph.matches``.
 
     Attributes:
         pairs: Image ids, the smaller first.
@@ -46,7 +46,7 @@ class Agreement:
     median_px: Float64[np.ndarray, " n"]
 
 
-def compare(model: pycolmap.Reconstruction, verified: Verified) -> Agreement:
+def compare(model: pycolmap.Reconstruction, verified: ViewGraph) -> Agreement:
     """Hold every verified pair against a model, whose keypoints are those of ``verified``."""
     placed = sorted(model.reg_image_ids())
     rays = {number: _rays(model, number, verified) for number in placed}
@@ -116,7 +116,7 @@ def epipolar_errors(
     return np.where(behind | ~np.isfinite(errors), np.inf, errors)
 
 
-def _rays(model: pycolmap.Reconstruction, number: int, verified: Verified) -> Rays:
+def _rays(model: pycolmap.Reconstruction, number: int, verified: ViewGraph) -> Rays:
     places = np.asarray(verified.keypoints[number], np.float64).reshape(-1, 2)
     return np.asarray(model.images[number].camera.cam_from_img(places), np.float64).reshape(-1, 2)
 

@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.focal import adjust_within
 from splatpipe.pipeline.sfm.judging import TRUSTED_SOURCES
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 CAMERAS_TOLD = 10  # on the console; the report has them all
 FEW_PHOTOS = 3  # of a camera: fewer trade its focal length for their distance
@@ -21,7 +21,7 @@ STATED_STRAY = 0.05  # of a trusted focal length: what lenses stray from it by
 KIN_STRAY = 0.02  # of one that other photos of the same body and zoom have been calibrated to
 
 
-def hold_few(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[int]:
+def hold_few(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[int]:
     """Bring the focal lengths of cameras of one or two photos back to what is known of them, and adjust, in place.
 
     A single photo, far from others or of a flat thing, leaves its focal length free, and mapping lets it run away. What
@@ -53,7 +53,7 @@ def hold_few(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequen
 def _known(
     number: int,
     model: pycolmap.Reconstruction,
-    verified: Verified,
+    verified: ViewGraph,
     cameras: Sequence[JSON],
     placed: Mapping[int, int],
 ) -> tuple[float, float] | None:
@@ -77,7 +77,7 @@ def _body(cameras: Sequence[JSON], number: int) -> tuple[str, str, str, float]:
     return str(group.get("make", "")), str(group.get("model_name", "")), str(group.get("focal_source", "")), zoom
 
 
-def camera_rows(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[JSON]:
+def camera_rows(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[JSON]:
     """A row a camera that has photos in the model: what it is, photos, how many were placed, focal lengths, error."""
     placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     photos = Counter(verified.camera_of.values())

@@ -12,11 +12,11 @@ from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.photo_list import PhotoList
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 
 @dataclass(frozen=True)
-class Capture:
+class MappingInput:
     """The photos of a run, and all that is known of them before mapping.
 
     Attributes:
@@ -47,7 +47,7 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Found:
+class MappingResult:
     """Cameras and points so far.
 
     Attributes:
@@ -63,7 +63,7 @@ class Found:
     model: pycolmap.Reconstruction
     others: tuple[pycolmap.Reconstruction, ...]
     database: Path
-    verified: Verified
+    verified: ViewGraph
     colours: UInt8[np.ndarray, "_ 3"]
     tried: tuple[JSON, ...] = ()
     rungs: tuple[JSON, ...] = ()

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64
 
 from splatpipe.pipeline.photos.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.pairs import Pair
-from splatpipe.pipeline.sfm.quick_match import Agreement, Glimpse
+from splatpipe.pipeline.sfm.quick_match import InlierMatches, QuickFeatures
 
 LEAST_PLACES = 8  # matches that a pair is compared by
 ALIKE_SIZES = 1.5  # of a keypoint in both photos, relative to them: further apart, one photo has more detail of right
@@ -24,7 +24,9 @@ CLIPPED = -0.06  # binary logarithm of linear light from which on nothing bright
 ALONE_DETAIL, ALONE_EV = 2.0, 2.0  # of photos that match none, against all others: what they show differs, too
 
 
-def duller(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Float64[np.ndarray, "n directions"]:
+def duller(
+    glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]
+) -> Float64[np.ndarray, "n directions"]:
     """How much less fine detail each photo has than its neighbours where both show the same, by direction.
 
     Returns:
@@ -40,7 +42,7 @@ def duller(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Floa
     return _or_alone(own, [-_medians(found.detail, DIRECTIONS) for found in glimpses], ALONE_DETAIL)
 
 
-def brighter_ev(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) -> Float64[np.ndarray, " n"]:
+def brighter_ev(glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]) -> Float64[np.ndarray, " n"]:
     """Exposure values by which each photo shows the same things brighter than its neighbours do; NaN where unknown."""
     differences = {}
     for (i, j), agreed in found.items():
@@ -56,7 +58,7 @@ def brighter_ev(glimpses: Sequence[Glimpse], found: Mapping[Pair, Agreement]) ->
 
 
 def _detail_difference(
-    first: Glimpse, second: Glimpse, agreed: Agreement
+    first: QuickFeatures, second: QuickFeatures, agreed: InlierMatches
 ) -> tuple[Float64[np.ndarray, " directions"], Float64[np.ndarray, " directions"]] | None:
     """How much duller the first photo is, in its directions, and the second, in its own."""
     ratio = (first.sizes[agreed.first] / first.width) / (second.sizes[agreed.second] / second.width)

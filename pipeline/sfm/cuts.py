@@ -25,7 +25,7 @@ LEAST_MATCHES_APART = 1.0  # what holds a group that nothing holds counts as
 
 
 @dataclass(frozen=True)
-class Cut:
+class GraphCut:
     """The two groups that disagree most.
 
     Attributes:
@@ -37,13 +37,13 @@ class Cut:
     ratio: float = 0.0
 
 
-def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> Cut:
+def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> GraphCut:
     """The cut of the placed photos with the largest ratio."""
     numbers = np.unique(agreement.pairs[agreement.placed])
     if not contradicts.any() or len(numbers) < 2 * SMALLEST_GROUP:
-        return Cut()
+        return GraphCut()
     agree, against = _weights(agreement, contradicts, numbers)
-    best = Cut()
+    best = GraphCut()
     least = max(SMALLEST_GROUP, int(np.ceil(SMALLEST_SHARE * len(numbers))))
     for order in (np.argsort(_eigenvector(agree, against), kind="stable"), *_detached(agree, against)):
         held, contra = _crossing(agree, order), _crossing(against, order)
@@ -54,7 +54,7 @@ def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> Cut:
         if ratios[at] > best.ratio:
             first, second = order[: at + 1], order[at + 1 :]
             group = first if len(first) <= len(second) else second
-            best = Cut(tuple(sorted(int(numbers[row]) for row in group)), float(ratios[at]))
+            best = GraphCut(tuple(sorted(int(numbers[row]) for row in group)), float(ratios[at]))
     return best
 
 

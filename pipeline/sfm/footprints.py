@@ -23,7 +23,7 @@ ALIKE_DEG, UNLIKE_DEG = 15.0, 90.0  # SIFT matches as well as ever up to the one
 
 
 @dataclass(frozen=True)
-class Views:
+class StatedPoses:
     """How photos were taken; NaN throughout for a photo of which that is not known.
 
     Attributes:
@@ -53,7 +53,7 @@ class Views:
         return np.asarray(self.enu_from_camera[:, :, 2])
 
 
-def overlaps(views: Views, candidates: int) -> dict[tuple[int, int], float]:
+def overlaps(views: StatedPoses, candidates: int) -> dict[tuple[int, int], float]:
     """The share of two photos' points that both show, weighted by how alike they show them.
 
     Args:
@@ -77,7 +77,7 @@ def overlaps(views: Views, candidates: int) -> dict[tuple[int, int], float]:
     return shares
 
 
-def crossing_distances(views: Views) -> Float64[np.ndarray, " n"]:
+def crossing_distances(views: StatedPoses) -> Float64[np.ndarray, " n"]:
     """Distance along each photo's axis to where other views cross it (the median); NaN where too few do."""
     distances = np.full(len(views), np.nan)
     axes = views.axes
@@ -96,7 +96,7 @@ def crossing_distances(views: Views) -> Float64[np.ndarray, " n"]:
     return distances
 
 
-def _points(views: Views, i: int, crossing_m: float) -> Float64[np.ndarray, "m 3"]:
+def _points(views: StatedPoses, i: int, crossing_m: float) -> Float64[np.ndarray, "m 3"]:
     """Where the rays of a photo may end."""
     steps = (np.arange(GRID) + 0.5) / GRID * 2.0 - 1.0
     across, down = np.meshgrid(steps * views.half_size[i, 0], steps * views.half_size[i, 1])
@@ -116,7 +116,7 @@ def _points(views: Views, i: int, crossing_m: float) -> Float64[np.ndarray, "m 3
 
 
 def _share_seen(
-    views: Views, i: int, others: Int[np.ndarray, " k"], points: Float64[np.ndarray, "m 3"]
+    views: StatedPoses, i: int, others: Int[np.ndarray, " k"], points: Float64[np.ndarray, "m 3"]
 ) -> Float64[np.ndarray, " k"]:
     """Of points that photo i shows, the weighted share that each of the others shows."""
     to_point = points[None] - views.centres_m[others][:, None]  # (k, m, 3)

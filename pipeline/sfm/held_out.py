@@ -22,7 +22,7 @@ DOUBT = 0.01  # of the bootstraps may say otherwise
 
 
 @dataclass(frozen=True)
-class Tracks:
+class TrackObservations:
     """Observations of tracks, one after the other.
 
     Attributes:
@@ -36,7 +36,7 @@ class Tracks:
     pixels: Float64[np.ndarray, "n 2"]
 
 
-def tracks_of(model: pycolmap.Reconstruction, points: Int64[np.ndarray, " k"]) -> Tracks:
+def tracks_of(model: pycolmap.Reconstruction, points: Int64[np.ndarray, " k"]) -> TrackObservations:
     """The observations of some of a model's points, in their order."""
     rows = [
         (number, element.image_id, *model.images[element.image_id].points2D[element.point2D_idx].xy)
@@ -44,19 +44,19 @@ def tracks_of(model: pycolmap.Reconstruction, points: Int64[np.ndarray, " k"]) -
         for element in model.points3D[point].track.elements
     ]
     table = np.array(rows, np.float64).reshape(-1, 4)
-    return Tracks(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:])
+    return TrackObservations(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:])
 
 
-def of_photos(tracks: Tracks, images: set[int]) -> Tracks:
+def of_photos(tracks: TrackObservations, images: set[int]) -> TrackObservations:
     """The tracks as some photos see them, those of three photos or more."""
     inside = np.isin(tracks.image, sorted(images))
     lengths = np.bincount(tracks.track[inside], minlength=int(tracks.track.max(initial=-1)) + 1)
     inside &= lengths[tracks.track] >= LEAST_VIEWS
     _, numbers = np.unique(tracks.track[inside], return_inverse=True)
-    return Tracks(numbers.astype(np.int64), tracks.image[inside], tracks.pixels[inside])
+    return TrackObservations(numbers.astype(np.int64), tracks.image[inside], tracks.pixels[inside])
 
 
-def predicted_errors(model: pycolmap.Reconstruction, tracks: Tracks) -> Float64[np.ndarray, " n"]:
+def predicted_errors(model: pycolmap.Reconstruction, tracks: TrackObservations) -> Float64[np.ndarray, " n"]:
     """How far each observation lies from where the others of its track have it, pixels.
 
     Args:
@@ -134,14 +134,16 @@ def _well_placed(left: Float64[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n"]:
     return np.asarray(values[:, 0] > LEAST_ANGLE**2 * values[:, 2])
 
 
-def rows_by_camera(model: pycolmap.Reconstruction, tracks: Tracks) -> list[tuple[int, Int64[np.ndarray, " k"]]]:
+def rows_by_camera(
+    model: pycolmap.Reconstruction, tracks: TrackObservations
+) -> list[tuple[int, Int64[np.ndarray, " k"]]]:
     of_image = {number: model.images[number].camera_id for number in np.unique(tracks.image).tolist()}
     cameras = np.array([of_image[number] for number in tracks.image.tolist()], np.int64)
     return [(number, np.flatnonzero(cameras == number)) for number in np.unique(cameras).tolist()]
 
 
 def _rays(
-    model: pycolmap.Reconstruction, tracks: Tracks
+    model: pycolmap.Reconstruction, tracks: TrackObservations
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Of each observation: the photo's rotation, its centre, and the unit ray in the model's frame."""
     numbers, which = np.unique(tracks.image, return_inverse=True)

@@ -19,8 +19,8 @@ from jaxtyping import Bool
 
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.sfm.agreement import Agreement, compare
-from splatpipe.pipeline.sfm.cuts import Cut, find_cut
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.cuts import GraphCut, find_cut
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 Level = Literal["good", "doubt", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubt", "bad")
@@ -93,7 +93,7 @@ class Judgement:
 
 
 def judge(
-    model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON], placeable: int | None = None
+    model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON], placeable: int | None = None
 ) -> Judgement:
     """Judge a model.
 
@@ -160,7 +160,7 @@ def _placed(model: pycolmap.Reconstruction, total: int) -> list[Reason]:
     return [Reason(level, text, hint, "placed")]
 
 
-def _focal_lengths(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[Reason]:
+def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[Reason]:
     found, ran_away = [], 0
     photos = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     used = sorted(photos)
@@ -203,7 +203,7 @@ def _unexplained(agreement: Agreement) -> list[Reason]:
     ]
 
 
-def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: Verified) -> list[Reason]:
+def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: ViewGraph) -> list[Reason]:
     """Contradictions that are more than the odd wrong match."""
     count = int(contradicts.sum())
     if count < FEW_PAIRS:
@@ -226,7 +226,7 @@ def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: V
     return [Reason("bad" if bad or cut.ratio >= CUT_BAD else "doubt", text, hint, "bent")]
 
 
-def _who(cut: Cut, verified: Verified) -> str:
+def _who(cut: GraphCut, verified: ViewGraph) -> str:
     names = [verified.names[number] for number in cut.group]
     if len(names) <= 2:
         return " and ".join(names)

@@ -16,15 +16,15 @@ import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.agreement import compare
-from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.completion import complete
-from splatpipe.pipeline.sfm.ladder_growth import LEAST_OBSERVATIONS, Growth, mean_error_px, observations
+from splatpipe.pipeline.sfm.ladder_growth import LEAST_OBSERVATIONS, ModelMapper, mean_error_px, observations
 from splatpipe.pipeline.sfm.ladder_joins import join
 from splatpipe.pipeline.sfm.ladder_keypoints import strengthen
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, tried_pairs
 from splatpipe.pipeline.sfm.ladder_partners import Ranked, choose_pairs, rank_partners
-from splatpipe.pipeline.sfm.ladder_poses import LARGE_SHARE, LEAST_PARTNERS, Placement, place, sightings
+from splatpipe.pipeline.sfm.ladder_poses import LARGE_SHARE, LEAST_PARTNERS, PoseEstimate, place, sightings
 from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.pairs import Pair
@@ -35,7 +35,7 @@ from splatpipe.pipeline.sfm.structure import (
     poses_of,
     read_structure,
 )
-from splatpipe.pipeline.sfm.verified import Verified, read_verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
 
@@ -52,10 +52,10 @@ WORSE_ERROR_PX = 0.05  # more than it
 
 
 @dataclass(frozen=True)
-class Work:
+class LadderContext:
     """What all rungs share."""
 
-    capture: Capture
+    capture: MappingInput
     options: MappingOptions
     report: Reporter
 
@@ -63,7 +63,7 @@ class Work:
         self.report.progress(done, total, what, "photos")
 
 
-def climb(capture: Capture, found: Found, config: SparseConfig, report: Reporter) -> Found:
+def climb(capture: MappingInput, found: MappingResult, config: SparseConfig, report: Reporter) -> MappingResult:
     """Place photos that mapping left, as far as that is sure.
 
     Args:
@@ -78,10 +78,10 @@ def climb(capture: Capture, found: Found, config: SparseConfig, report: Reporter
     held = any(row.get("focal_held") for row in found.tried if row.get("chosen"))
     wide = coarseness(found.verified.cameras.values())
     options = MappingOptions(config.seed, config.min_model_size, hold_focal=bool(held), coarseness=wide)
-    work = Work(capture, options, report)
+    work = LadderContext(capture, options, report)
     if not config.ladder:
         return found
-    rungs: list[tuple[str, Callable[[Work, Found], Found]]] = [
+    rungs: list[tuple[str, Callable[[LadderContext, MappingResult], MappingResult]]] = [
         ("registration", settle),
         ("more pairs", with_more_pairs),
         ("stronger keypoints", with_stronger_keypoints),
@@ -100,13 +100,13 @@ def climb(capture: Capture, found: Found, config: SparseConfig, report: Reporter
     return found
 
 
-def unplaced(found: Found) -> list[int]:
+def unplaced(found: MappingResult) -> list[int]:
     """COLMAP's numbers of photos that the model lacks."""
     placed = set(found.model.reg_image_ids())
     return [number for number in sorted(found.verified.names) if number not in placed]
 
 
-def settle(work: Work, found: Found) -> Found:
+def settle(work: LadderContext, found: MappingResult) -> MappingResult:
     """Register single photos and join sub-models until neither helps, each on what is there."""
     while True:
         grown = _joined(work, _registered(work, found))
@@ -115,7 +115,7 @@ def settle(work: Work, found: Found) -> Found:
         found = grown
 
 
-def with_more_pairs(work: Work, found: Found) -> Found:
+def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
     """Match photos that are left with others that may show the same, then place them."""
     left = unplaced(found)
     work.tell(0, len(left), "looking for partners of photos that are left")
@@ -128,7 +128,7 @@ def with_more_pairs(work: Work, found: Found) -> Found:
     return grown if len(unplaced(grown)) < len(left) else found
 
 
-def with_stronger_keypoints(work: Work, found: Found) -> Found:
+def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> MappingResult:
     """Find new keypoints in photos that are left and in those that may show the same, then place them."""
     left = unplaced(found)
     work.tell(0, len(left), "looking for partners of photos that are left")
@@ -141,14 +141,14 @@ def with_stronger_keypoints(work: Work, found: Found) -> Found:
     verified = read_verified(stronger.database)
     wider = replace(found, database=stronger.database, verified=verified, colours=stronger.colours)
     wider = _on(found, wider)
-    growth = Growth(wider.database, wider.model, work.options)
+    growth = ModelMapper(wider.database, wider.model, work.options)
     growth.triangulate([number for number in photos if wider.model.exists_image(number)])
     growth.end()
     grown = settle(work, wider)
     return grown if len(unplaced(grown)) < len(left) else found
 
 
-def _worth_another_look(found: Found, ranked: Ranked, most: int) -> list[int]:
+def _worth_another_look(found: MappingResult, ranked: Ranked, most: int) -> list[int]:
     """Photos that are left and their likeliest partners, as many as may be; those with the most matches first.
 
     One that has plenty of keypoints and yet no match with what is placed shows something else.
@@ -169,7 +169,7 @@ def _worth_another_look(found: Found, ranked: Ranked, most: int) -> list[int]:
     return sorted(chosen)
 
 
-def _among(found: Found, ranked: Ranked, photos: Collection[int]) -> list[Pair]:
+def _among(found: MappingResult, ranked: Ranked, photos: Collection[int]) -> list[Pair]:
     """Pairs among photos: each that is left with its partners, and those that share matches already."""
     chosen = set(photos)
     pairs = {pair for pair in found.verified.matches if chosen.issuperset(pair)}
@@ -180,7 +180,7 @@ def _among(found: Found, ranked: Ranked, photos: Collection[int]) -> list[Pair]:
     return sorted(pairs)
 
 
-def _on(found: Found, wider: Found) -> Found:
+def _on(found: MappingResult, wider: MappingResult) -> MappingResult:
     """The same model on a view graph that has grown."""
     model = make_model(
         cameras_of(found.model).values(), poses_of(found.model), wider.verified, read_structure(found.model)
@@ -188,14 +188,14 @@ def _on(found: Found, wider: Found) -> Found:
     return replace(wider, model=model)
 
 
-def _registered(work: Work, found: Found) -> Found:
+def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
     """Add photos whose pose is sure, round after round, then adjust; all or nothing of what is still sure then."""
     model, added = found.model, set[int]()
     for _ in range(ROUNDS):
         left = [number for number in unplaced(found) if number not in added]
         placements = _placements(work, found.verified, model, left)
         model = _extended(model, found.verified, placements) if placements else pycolmap.Reconstruction(model)
-        growth = Growth(found.database, model, work.options)
+        growth = ModelMapper(found.database, model, work.options)
         growth.triangulate(sorted(placements))
         fresh = sorted(placements) or growth.place_by_pairs(left)
         growth.end()
@@ -208,7 +208,9 @@ def _registered(work: Work, found: Found) -> Found:
     return _adjusted(work, found, model, added)
 
 
-def _placements(work: Work, verified: Verified, model: Model, left: Collection[int]) -> dict[int, Placement]:
+def _placements(
+    work: LadderContext, verified: ViewGraph, model: Model, left: Collection[int]
+) -> dict[int, PoseEstimate]:
     structure = read_structure(model)
     counts = {number: len(verified.keypoints[number]) for number in model.reg_image_ids()}
     rows = structure.rows(counts)
@@ -230,7 +232,7 @@ def _placements(work: Work, verified: Verified, model: Model, left: Collection[i
     return placements
 
 
-def _extended(model: Model, verified: Verified, placements: Mapping[int, Placement]) -> Model:
+def _extended(model: Model, verified: ViewGraph, placements: Mapping[int, PoseEstimate]) -> Model:
     """A model with more photos, and with what they see of its points."""
     structure = read_structure(model)
     tracks = [list(track) for track in structure.tracks]
@@ -245,7 +247,7 @@ def _extended(model: Model, verified: Verified, placements: Mapping[int, Placeme
     return make_model(cameras.values(), poses, verified, ordered)
 
 
-def _joined(work: Work, found: Found) -> Found:
+def _joined(work: LadderContext, found: MappingResult) -> MappingResult:
     """Join the other models that share enough with this one."""
     remaining = []
     for other in found.others:
@@ -257,7 +259,7 @@ def _joined(work: Work, found: Found) -> Found:
         if model is None:
             remaining.append(other)
             continue
-        growth = Growth(found.database, model, work.options)
+        growth = ModelMapper(found.database, model, work.options)
         growth.triangulate(sorted(fresh))
         growth.end()
         grown = _adjusted(work, found, model, sorted(fresh))
@@ -267,7 +269,7 @@ def _joined(work: Work, found: Found) -> Found:
     return replace(found, others=tuple(remaining))
 
 
-def _adjusted(work: Work, found: Found, model: Model, added: Collection[int]) -> Found:
+def _adjusted(work: LadderContext, found: MappingResult, model: Model, added: Collection[int]) -> MappingResult:
     """Adjust a model with new photos and drop those that do not hold; the old one where nothing does or it was better.
 
     Args:
@@ -293,7 +295,7 @@ def _adjusted(work: Work, found: Found, model: Model, added: Collection[int]) ->
     return replace(found, model=model)
 
 
-def _not_held(verified: Verified, model: Model, photos: Collection[int]) -> set[int]:
+def _not_held(verified: ViewGraph, model: Model, photos: Collection[int]) -> set[int]:
     """Which of the photos lost their points in the adjustment, or are where their matches do not agree."""
     placed = set(model.reg_image_ids())
     agreement = compare(model, verified)
@@ -315,7 +317,7 @@ def _not_held(verified: Verified, model: Model, photos: Collection[int]) -> set[
     return bad
 
 
-def without(model: Model, verified: Verified, photos: Collection[int]) -> Model:
+def without(model: Model, verified: ViewGraph, photos: Collection[int]) -> Model:
     """The same model without some photos and what only they saw."""
     structure = read_structure(model)
     tracks = [[element for element in track if element[0] not in photos] for track in structure.tracks]
@@ -325,7 +327,7 @@ def without(model: Model, verified: Verified, photos: Collection[int]) -> Model:
     return make_model(cameras, poses, verified, Structure(structure.points, tracks))
 
 
-def _row(name: str, before: Found, after: Found) -> dict[str, JSON]:
+def _row(name: str, before: MappingResult, after: MappingResult) -> dict[str, JSON]:
     """What a rung brought, for ``models.json``."""
     return {
         "rung": name,

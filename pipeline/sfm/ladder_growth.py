@@ -14,7 +14,7 @@ from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
 LEAST_OBSERVATIONS = 15  # of a photo that was added, once everything is adjusted
 
 
-class Growth:
+class ModelMapper:
     """COLMAP's mapper over a model that is there already; its database must hold the model's keypoints."""
 
     def __init__(self, database: Path, model: pycolmap.Reconstruction, options: MappingOptions) -> None:

@@ -26,7 +26,7 @@ from splatpipe.pipeline.sfm.ladder_poses import (
     MANY_INLIERS,
 )
 from splatpipe.pipeline.sfm.structure import Structure, Track, cameras_of, make_model, poses_of, read_structure
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 SLACK = 3.0  # times a pose's tolerance: both models err, and neither was adjusted to the other
 TRIALS = 2000  # finds three right pairs with 99.9 % while a sixth of all are right
@@ -36,7 +36,7 @@ LEAST_LINKS = 2  # pairs of photos between the models; one alone may show a twin
 
 
 @dataclass(frozen=True)
-class Ties:
+class TiePoints:
     """Points of two models that should be one: which, and how each is seen from the other model's photos.
 
     Attributes:
@@ -61,16 +61,16 @@ class Ties:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def only(self, chosen: Int64[np.ndarray, " n"]) -> Ties:
+    def only(self, chosen: Int64[np.ndarray, " n"]) -> TiePoints:
         """Some of them."""
         both = (self.points, self.poses, self.places, self.pixels, self.limits)
         points, poses, places, pixels, limits = ((one[chosen], two[chosen]) for one, two in both)
         cells = self.cells[chosen]
-        return Ties(self.rows[chosen], self.links[chosen], points, poses, places, pixels, limits, cells)
+        return TiePoints(self.rows[chosen], self.links[chosen], points, poses, places, pixels, limits, cells)
 
 
 def join(
-    model: pycolmap.Reconstruction, other: pycolmap.Reconstruction, verified: Verified, seed: int
+    model: pycolmap.Reconstruction, other: pycolmap.Reconstruction, verified: ViewGraph, seed: int
 ) -> pycolmap.Reconstruction | None:
     """One model of two, not yet adjusted; None where it is not sure how they lie to each other.
 
@@ -96,8 +96,8 @@ def find_ties(
     here: Structure,
     other: pycolmap.Reconstruction,
     there: Structure,
-    verified: Verified,
-) -> Ties:
+    verified: ViewGraph,
+) -> TiePoints:
     """Pairs of points that verified matches between photos of both models lead to, or photos that are in both."""
     counts = {number: len(places) for number, places in verified.keypoints.items()}
     ours, theirs = set(model.reg_image_ids()), set(other.reg_image_ids())
@@ -121,9 +121,9 @@ def _tied(
     here: Structure,
     other: pycolmap.Reconstruction,
     there: Structure,
-    verified: Verified,
+    verified: ViewGraph,
     found: Mapping[tuple[int, int], tuple[int, int, int, int]],
-) -> Ties:
+) -> TiePoints:
     rows = np.array(sorted(found), np.int64).reshape(-1, 2)
     seen = np.array([found[int(a), int(b)] for a, b in rows], np.int64).reshape(-1, 4)
     sides = []
@@ -143,11 +143,11 @@ def _tied(
             cells[mine] = part[:, 0] * CELLS + part[:, 1]
         sides.append((structure.points[rows[:, side]], poses, places, pixels, limits, cells))
     points, poses_, places_, pixels_, limits_, cells_ = zip(*sides, strict=True)
-    return Ties(rows, seen[:, :2], points, poses_, places_, pixels_, limits_, cells_[0])
+    return TiePoints(rows, seen[:, :2], points, poses_, places_, pixels_, limits_, cells_[0])
 
 
 def fit_ties(
-    ties: Ties, chosen: Bool[np.ndarray, " k"], seed: int, least: int = LEAST_INLIERS
+    ties: TiePoints, chosen: Bool[np.ndarray, " k"], seed: int, least: int = LEAST_INLIERS
 ) -> tuple[Similarity, Bool[np.ndarray, " k"]] | None:
     """The similarity from there to here that most of the chosen ties agree with, and which of all ties do.
 
@@ -190,7 +190,7 @@ def fit_ties(
     return similarity, agree(ties, similarity)
 
 
-def agree(ties: Ties, similarity: Similarity) -> Bool[np.ndarray, " k"]:
+def agree(ties: TiePoints, similarity: Similarity) -> Bool[np.ndarray, " k"]:
     """Which ties a similarity brings within the tolerance, in the photo here and in the photo there."""
     moved = similarity.apply(ties.points[1]), similarity.inverse().apply(ties.points[0])
     good = np.ones(len(ties), bool)
@@ -203,7 +203,7 @@ def agree(ties: Ties, similarity: Similarity) -> Bool[np.ndarray, " k"]:
     return good
 
 
-def _sure(ties: Ties, inliers: Bool[np.ndarray, " k"]) -> bool:
+def _sure(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
     """Enough points, of enough of what the matches say, over the pictures and over several pairs of photos."""
     held = min(len(np.unique(ties.rows[inliers, side])) for side in (0, 1))
     share = held / max(1, min(len(np.unique(ties.rows[:, side])) for side in (0, 1)))
@@ -212,7 +212,7 @@ def _sure(ties: Ties, inliers: Bool[np.ndarray, " k"]) -> bool:
     return enough and links >= LEAST_LINKS and len(np.unique(ties.cells[inliers])) >= LEAST_CELLS
 
 
-def _foretells(ties: Ties, seed: int) -> bool:
+def _foretells(ties: TiePoints, seed: int) -> bool:
     """Whether the similarity of every second point explains the others nearly as well, and the other way round."""
     _, order = np.unique(ties.rows[:, 0], return_inverse=True)
     for odd in (0, 1):
@@ -231,7 +231,7 @@ def _united(
     here: Structure,
     other: pycolmap.Reconstruction,
     there: Structure,
-    verified: Verified,
+    verified: ViewGraph,
     similarity: Similarity,
     same: Int64[np.ndarray, "_ 2"],
 ) -> pycolmap.Reconstruction:

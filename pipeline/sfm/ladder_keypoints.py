@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.keypoints import extract, single_threaded_opencv
 from splatpipe.pipeline.sfm.ladder_pairs import take_verified
 from splatpipe.pipeline.sfm.matching import match_pairs
@@ -29,7 +29,7 @@ THREAD_SHARE = 0.5  # of the threads: a photo takes twice the memory (0.36 GB a 
 
 
 @dataclass(frozen=True)
-class Strengthened:
+class ExtendedDatabase:
     """A database that has grown.
 
     Attributes:
@@ -44,13 +44,13 @@ class Strengthened:
 
 
 def strengthen(
-    capture: Capture,
-    found: Found,
+    capture: MappingInput,
+    found: MappingResult,
     photos: Sequence[int],
     pairs: Sequence[Pair],
     seed: int,
     report: Reporter,
-) -> Strengthened:
+) -> ExtendedDatabase:
     """Find new keypoints in some photos, and match them among these.
 
     New ones are matched with new ones only: an old and a new keypoint of one spot have nearly the same descriptor, and
@@ -97,4 +97,4 @@ def strengthen(
     take_verified(work, target, starts)
     for path in (fresh, work):
         path.unlink()
-    return Strengthened(target, np.concatenate(parts), added)
+    return ExtendedDatabase(target, np.concatenate(parts), added)

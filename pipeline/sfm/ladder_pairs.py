@@ -1,6 +1,6 @@
 """More pairs of photos for a finished model: which to try, and their verified matches in a database that has grown.
 
-Photos are under COLMAP's numbers here, as in ``Verified``.
+Photos are under COLMAP's numbers here, as in ``ViewGraph``.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
-from splatpipe.pipeline.sfm.capture import Capture
+from splatpipe.pipeline.sfm.capture import MappingInput
 from splatpipe.pipeline.sfm.matching import match_pairs
 from splatpipe.pipeline.sfm.pairs import Pair
 from splatpipe.pipeline.sfm.structure import Structure, poses_of, read_structure
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 SAMPLE = 64  # points of a photo that are looked for in the others
 LEAST_POINTS = 8  # of a photo; fewer tell nothing about what it shows
@@ -31,7 +31,7 @@ NEAREST = 60  # photos that are looked at for each, by what they look at: the co
 
 
 def propose_pairs(
-    model: pycolmap.Reconstruction, verified: Verified, count: int, avoided: Collection[Pair] = ()
+    model: pycolmap.Reconstruction, verified: ViewGraph, count: int, avoided: Collection[Pair] = ()
 ) -> list[Pair]:
     """Pairs of placed photos that, by the model, show the same thing and yet have no verified matches.
 
@@ -142,7 +142,7 @@ def _seen_alike(
     return np.asarray(inside & alike)
 
 
-def match_more(capture: Capture, base: Path, pairs: Sequence[Pair], seed: int, report: Reporter) -> Path:
+def match_more(capture: MappingInput, base: Path, pairs: Sequence[Pair], seed: int, report: Reporter) -> Path:
     """Match and verify more pairs with the keypoints of ``capture.features``.
 
     Args:

@@ -8,7 +8,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.ladder_poses import partners_of
 from splatpipe.pipeline.sfm.layout import make_layout
 from splatpipe.pipeline.sfm.matching import look_alike
@@ -21,7 +21,7 @@ Ranked = dict[int, list[int]]
 LOOKED_AT = 100  # of a ranking; nobody asks for more
 
 
-def rank_partners(capture: Capture, found: Found, left: Collection[int], seed: int) -> Ranked:
+def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[int], seed: int) -> Ranked:
     """The likeliest of each kind of hint in turn: placed photos, or photos of another model than their own.
 
     Args:
@@ -46,7 +46,7 @@ def rank_partners(capture: Capture, found: Found, left: Collection[int], seed: i
     return ranked
 
 
-def by_matches(found: Found, left: Collection[int], placed: Collection[int]) -> Ranked:
+def by_matches(found: MappingResult, left: Collection[int], placed: Collection[int]) -> Ranked:
     """Those with verified matches, the most of them first."""
     ranked = {}
     for photo in sorted(left):
@@ -55,7 +55,7 @@ def by_matches(found: Found, left: Collection[int], placed: Collection[int]) -> 
     return ranked
 
 
-def by_model(found: Found, left: Collection[int], placed: Collection[int]) -> Ranked:
+def by_model(found: MappingResult, left: Collection[int], placed: Collection[int]) -> Ranked:
     """Those that share points with placed photos with which the photo has verified matches."""
     tracks = read_structure(found.model).tracks
     rows: dict[int, list[int]] = {}

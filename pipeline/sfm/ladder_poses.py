@@ -15,7 +15,7 @@ import pycolmap
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 ERROR = 0.003  # of the longer side, within which a point has to lie: COLMAP's 12 pixels of a photo of 4,000
 LEAST_ERROR_PX = 4.0  # of small photos: keypoints of a coarse scale err by pixels
@@ -30,7 +30,7 @@ LEAST_PARTNERS = 2  # placed photos: one alone may show a twin of the place
 
 
 @dataclass(frozen=True)
-class Sightings:
+class PoseCorrespondences:
     """What a photo's verified matches with placed photos say it sees.
 
     Attributes:
@@ -48,7 +48,7 @@ class Sightings:
 
 
 @dataclass(frozen=True)
-class Placement:
+class PoseEstimate:
     """Where a photo was taken.
 
     Attributes:
@@ -64,7 +64,7 @@ class Placement:
     share: float
 
 
-def sightings(verified: Verified, rows: Mapping[int, Int64[np.ndarray, " _"]], number: int) -> Sightings:
+def sightings(verified: ViewGraph, rows: Mapping[int, Int64[np.ndarray, " _"]], number: int) -> PoseCorrespondences:
     """Gather what leads from a photo's keypoints to points.
 
     Args:
@@ -79,10 +79,10 @@ def sightings(verified: Verified, rows: Mapping[int, Int64[np.ndarray, " _"]], n
             for keypoint, point in zip(mine[points >= 0].tolist(), points[points >= 0].tolist(), strict=True):
                 found.setdefault((keypoint, point), partner)
     entries = np.array([(*pair, found[pair]) for pair in sorted(found)], np.int64).reshape(-1, 3)
-    return Sightings(entries[:, 0], entries[:, 1], entries[:, 2])
+    return PoseCorrespondences(entries[:, 0], entries[:, 1], entries[:, 2])
 
 
-def partners_of(verified: Verified, number: int) -> list[tuple[int, Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]]]:
+def partners_of(verified: ViewGraph, number: int) -> list[tuple[int, Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]]]:
     """Photos that share verified matches with one: their number, its keypoints, theirs; by number."""
     found = []
     for (i, j), matches in verified.matches.items():
@@ -93,13 +93,13 @@ def partners_of(verified: Verified, number: int) -> list[tuple[int, Int64[np.nda
 
 
 def place(
-    seen: Sightings,
+    seen: PoseCorrespondences,
     keypoints: Float32[np.ndarray, "n 2"],
     points: Float64[np.ndarray, "m 3"],
     camera: pycolmap.Camera,
     calibrated: bool,
     seed: int,
-) -> Placement | None:
+) -> PoseEstimate | None:
     """The pose of a photo; None where it is not sure.
 
     Args:
@@ -130,7 +130,7 @@ def place(
         return None
     taken = dict(zip(seen.keypoints[inliers][::-1].tolist(), seen.rows[inliers][::-1].tolist(), strict=True))
     observations = sorted({row: (keypoint, row) for keypoint, row in sorted(taken.items(), reverse=True)}.values())
-    return Placement(pose, camera, observations, share)
+    return PoseEstimate(pose, camera, observations, share)
 
 
 def _enough(held: int, share: float) -> bool:

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.upright import display_from_stored, enu_from_gimbal
 from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.sfm.footprints import Views
+from splatpipe.pipeline.sfm.footprints import StatedPoses
 from splatpipe.pipeline.sfm.pairs import LOCATED_SHARE, Layout
 
 LEVELLING_SIGMA_M = 1.0  # altitudes that are as good tell how high flights took off against each other
@@ -61,7 +61,7 @@ def half_sizes(features: Path, names: Sequence[str]) -> Float64[np.ndarray, "n 2
 
 def make_views(
     photos: Sequence[Photo], positions: Sequence[dict[str, JSON]], half_size: Float64[np.ndarray, "n 2"]
-) -> Views | None:
+) -> StatedPoses | None:
     """How photos were taken; None unless it is known of most, by positions, angles and heights above take-off.
 
     The height is the barometer's: a receiver's altitude errs by metres between photos, unless it is RTK's.
@@ -88,7 +88,7 @@ def make_views(
     rotations = np.full((len(photos), 3, 3), np.nan)
     rotations[index] = enu_from_gimbal(angles[0], angles[1], angles[2]) @ turns
     noise = float(np.median([entry["sigma_horizontal_m"] for entry in entries])) * WITHIN_FLIGHT
-    return Views(centres, rotations, half_size, ground, noise)
+    return StatedPoses(centres, rotations, half_size, ground, noise)
 
 
 def _ground_m(entries: Sequence[dict[str, JSON]], height: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:

@@ -98,7 +98,7 @@ class LensFreedom:
 
 
 @dataclass(frozen=True)
-class Solved:
+class LensAdjustment:
     """An adjusted model.
 
     Attributes:
@@ -111,7 +111,9 @@ class Solved:
     covariances: Mapping[int, Float64[np.ndarray, "_ _"]]
 
 
-def adjust_lenses(model: pycolmap.Reconstruction, freedoms: Mapping[int, LensFreedom], doubt: bool = False) -> Solved:
+def adjust_lenses(
+    model: pycolmap.Reconstruction, freedoms: Mapping[int, LensFreedom], doubt: bool = False
+) -> LensAdjustment:
     """Adjust poses, points and what is free of the lenses, in place, all features alike; scale and place stay.
 
     Args:
@@ -144,7 +146,7 @@ def adjust_lenses(model: pycolmap.Reconstruction, freedoms: Mapping[int, LensFre
         params = np.array(model.cameras[number].params)
         params[1] = params[0] * ratio  # to the last bit
         model.cameras[number].params = params
-    return Solved(model, covariances)
+    return LensAdjustment(model, covariances)
 
 
 def _ratio(camera: pycolmap.Camera) -> float:

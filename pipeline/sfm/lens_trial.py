@@ -12,11 +12,11 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.sfm.focal import UNOBSERVED
-from splatpipe.pipeline.sfm.held_out import Tracks, improves, predicted_errors, rows_by_camera
+from splatpipe.pipeline.sfm.held_out import TrackObservations, improves, predicted_errors, rows_by_camera
 from splatpipe.pipeline.sfm.lens_adjustment import (
     BASE,
+    LensAdjustment,
     LensFreedom,
-    Solved,
     adjust_lenses,
     corner_effects,
     corner_sigma_px,
@@ -66,11 +66,11 @@ class LensState:
     stated: str = ""
 
 
-class Trial:
+class LensTrial:
     """Adjustments of the tracks that decide; the best so far, and how well it predicts the tracks that are held out."""
 
     def __init__(
-        self, model: pycolmap.Reconstruction, tracks: Tracks, states: Mapping[int, LensState], seed: int
+        self, model: pycolmap.Reconstruction, tracks: TrackObservations, states: Mapping[int, LensState], seed: int
     ) -> None:
         """Begin with the simple lenses, adjusted to the same tracks as all that follow.
 
@@ -185,7 +185,7 @@ class Trial:
         self._keep(solved, errors, wanted, kept)
 
     def _doubt(
-        self, number: int, names: tuple[str, ...], solved: Solved, state: LensState
+        self, number: int, names: tuple[str, ...], solved: LensAdjustment, state: LensState
     ) -> tuple[float, float, float]:
         """What a group does at the corner, its standard deviation there, pixels; that of the focal length, relative."""
         camera, covariance = solved.model.cameras[number], solved.covariances.get(number)
@@ -223,7 +223,7 @@ class Trial:
 
     def _solve(
         self, model: pycolmap.Reconstruction, wanted: Mapping[int, LensState], doubt: bool = False
-    ) -> tuple[Solved, Float64[np.ndarray, " n"]]:
+    ) -> tuple[LensAdjustment, Float64[np.ndarray, " n"]]:
         freedoms = {**self._freedoms(), **{number: state.freedom for number, state in wanted.items()}}
         solved = adjust_lenses(model, freedoms, doubt)
         return solved, predicted_errors(solved.model, self._tracks)
@@ -238,7 +238,7 @@ class Trial:
 
     def _keep(
         self,
-        solved: Solved,
+        solved: LensAdjustment,
         errors: Float64[np.ndarray, " n"],
         wanted: Mapping[int, LensState],
         kept: Mapping[int, bool],

@@ -23,9 +23,9 @@ from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.sfm.held_out import LEAST_VIEWS, of_photos, tracks_of
 from splatpipe.pipeline.sfm.lens_adjustment import BASE, LensFreedom, adjust_lenses, weak_prior
 from splatpipe.pipeline.sfm.lens_model import StatedLens, apart_px, is_known, named_params, narrow, set_lens, widen
-from splatpipe.pipeline.sfm.lens_trial import LensState, Trial
+from splatpipe.pipeline.sfm.lens_trial import LensState, LensTrial
 from splatpipe.pipeline.sfm.retriangulation import MOST_ERROR_PX, retriangulate
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 LEAST_PHOTOS = 8  # of a camera: fewer cannot tell its lens from their poses
 LEAST_TRACKS = 400  # that decide; fewer tell nothing
@@ -46,7 +46,7 @@ LEAST_A_PHOTO = 20  # of those that are adjusted: six unknowns want more than th
 
 
 def calibrate(
-    model: pycolmap.Reconstruction, verified: Verified, stated: Mapping[int, StatedLens], how: str, seed: int = 0
+    model: pycolmap.Reconstruction, verified: ViewGraph, stated: Mapping[int, StatedLens], how: str, seed: int = 0
 ) -> tuple[pycolmap.Reconstruction, tuple[JSON, ...]]:
     """Free what the photos show of their lenses.
 
@@ -72,7 +72,7 @@ def calibrate(
     if not usable and not any(state.freedom.free for state in states.values()):
         return model, _rows(model, model, states)
     tracks = of_photos(tracks_of(model, np.sort(held_out)), set(within.reg_image_ids()))
-    trial = Trial(within, tracks, states, seed)
+    trial = LensTrial(within, tracks, states, seed)
     trial.take_stated(usable, held=how == "held")
     trial.free_steps()
     trial.try_fisheye()
@@ -83,7 +83,7 @@ def calibrate(
 
 
 def _with_held(
-    model: pycolmap.Reconstruction, verified: Verified, stated: Mapping[int, StatedLens], seed: int
+    model: pycolmap.Reconstruction, verified: ViewGraph, stated: Mapping[int, StatedLens], seed: int
 ) -> tuple[pycolmap.Reconstruction, tuple[JSON, ...]]:
     """The model with its stated lenses as they are, where there are too few tracks to hold any against them."""
     lensed = _only(model, set(model.points3D))
@@ -157,7 +157,7 @@ def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstr
 
 def _finished(
     model: pycolmap.Reconstruction,
-    verified: Verified,
+    verified: ViewGraph,
     lensed: pycolmap.Reconstruction,
     states: Mapping[int, LensState],
     seed: int,

@@ -16,7 +16,7 @@ import pycolmap
 from splatpipe.pipeline.engine.parallel import watched
 from splatpipe.pipeline.sfm.completion import complete
 from splatpipe.pipeline.sfm.reduction import best_keypoints, write_reduced
-from splatpipe.pipeline.sfm.verified import read_verified
+from splatpipe.pipeline.sfm.view_graph import read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
 Tell: TypeAlias = Callable[[int, int, str], None]

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.sfm.footprints import Views, overlaps
+from splatpipe.pipeline.sfm.footprints import StatedPoses, overlaps
 
 Pair = tuple[int, int]
 Costs = Callable[[int], Float64[np.ndarray, " n"]]
@@ -51,7 +51,7 @@ class Layout:
     positions_m: Float64[np.ndarray, "n 3"]
     sigmas_m: Float64[np.ndarray, " n"]
     directions: Float64[np.ndarray, "n 3"]
-    views: Views | None = None
+    views: StatedPoses | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -160,7 +160,7 @@ def _spatial(layout: Layout, neighbours: int, look_alike: Callable[[], Costs]) -
     return connect(pairs, len(layout), alike)
 
 
-def _overlapping(views: Views, neighbours: int) -> set[Pair]:
+def _overlapping(views: StatedPoses, neighbours: int) -> set[Pair]:
     """Each photo with those whose footprints overlap its own most; more of them for views of walls."""
     wide = math.ceil(WIDER * neighbours)
     partners: dict[int, list[tuple[float, Pair]]] = {}

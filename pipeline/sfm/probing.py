@@ -14,10 +14,10 @@ import pycolmap
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.sfm.agreement import compare
-from splatpipe.pipeline.sfm.capture import Capture
+from splatpipe.pipeline.sfm.capture import MappingInput
 from splatpipe.pipeline.sfm.judging import contradicting
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs, tried_pairs
-from splatpipe.pipeline.sfm.verified import Verified, read_verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
 PROBES = 24  # pairs: a few seconds' work, and enough for a share of them to mean something
 PROVEN = (3, 0.1)  # contradicting probes, and their share of those that hold: more than look-alikes give, 0 to 0.05
@@ -26,7 +26,7 @@ FILL = 6  # pairs a photo that a thin graph gets
 
 
 @dataclass(frozen=True)
-class Probes:
+class ProbeResult:
     """What new pairs said.
 
     Attributes:
@@ -38,7 +38,7 @@ class Probes:
     """
 
     database: Path
-    verified: Verified
+    verified: ViewGraph
     tried: int
     held: int
     contradicting: int
@@ -49,7 +49,7 @@ class Probes:
         return self.contradicting >= max(PROVEN[0], PROVEN[1] * self.held)
 
 
-def pairs_a_photo(model: pycolmap.Reconstruction, verified: Verified) -> float:
+def pairs_a_photo(model: pycolmap.Reconstruction, verified: ViewGraph) -> float:
     """Verified pairs of a placed photo with other placed ones, on average."""
     placed = set(model.reg_image_ids())
     inside = sum(i in placed and j in placed for i, j in verified.matches)
@@ -57,13 +57,13 @@ def pairs_a_photo(model: pycolmap.Reconstruction, verified: Verified) -> float:
 
 
 def probe(
-    capture: Capture,
+    capture: MappingInput,
     model: pycolmap.Reconstruction,
-    graph: tuple[Path, Verified],
+    graph: tuple[Path, ViewGraph],
     count: int,
     seed: int,
     report: Reporter,
-) -> Probes:
+) -> ProbeResult:
     """Match pairs that a model says show the same thing, and hold the model against them.
 
     Args:
@@ -77,11 +77,11 @@ def probe(
     database, verified = graph
     pairs = propose_pairs(model, verified, count, capture.tried | tried_pairs(database))
     if not pairs:
-        return Probes(database, verified, 0, 0, 0)
+        return ProbeResult(database, verified, 0, 0, 0)
     grown = match_more(capture, database, pairs, seed, report)
     after = read_verified(grown)
     agreement = compare(model, after)
     known = set(verified.matches)
     new = np.array([(int(i), int(j)) not in known for i, j in agreement.pairs], bool)
     against = contradicting(agreement) & new
-    return Probes(grown, after, len(pairs), int(new.sum()), int(against.sum()))
+    return ProbeResult(grown, after, len(pairs), int(new.sum()), int(against.sum()))

@@ -35,7 +35,7 @@ CONFIDENCE = 0.999
 
 
 @dataclass(frozen=True)
-class Glimpse:
+class QuickFeatures:
     """What is kept of a photo.
 
     Attributes:
@@ -68,7 +68,7 @@ class Glimpse:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class InlierMatches:
     """Rows of keypoints of two photos that agree on a two-view geometry: of the first, of the second."""
 
     first: Int64[np.ndarray, " m"]
@@ -78,10 +78,10 @@ class Agreement:
         return len(self.first)
 
 
-NOTHING = Agreement(np.zeros(0, np.int64), np.zeros(0, np.int64))
+NOTHING = InlierMatches(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-def glimpse(photo: CheckedPhoto) -> Glimpse:
+def glimpse(photo: CheckedPhoto) -> QuickFeatures:
     """Read a photo, find its largest keypoints at low resolution, and measure detail and brightness around them.
 
     Raises:
@@ -102,7 +102,7 @@ def glimpse(photo: CheckedPhoto) -> Glimpse:
     full = np.array([photo.width / small.shape[1], photo.height / small.shape[0]])
     seen = places * np.array([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
     sums = np.maximum(values.sum(axis=1, keepdims=True), 1e-6)
-    return Glimpse(
+    return QuickFeatures(
         places=places * full,
         sizes=np.array([keypoint.size for keypoint in found], np.float64) * float(full.mean()),
         angles_deg=np.array([keypoint.angle for keypoint in found], np.float64),
@@ -116,14 +116,14 @@ def glimpse(photo: CheckedPhoto) -> Glimpse:
     )
 
 
-def match_glimpses(glimpses: Sequence[Glimpse], pairs: Iterable[Pair], threads: int) -> dict[Pair, Agreement]:
+def match_glimpses(glimpses: Sequence[QuickFeatures], pairs: Iterable[Pair], threads: int) -> dict[Pair, InlierMatches]:
     """Match pairs of photos; each with what agrees, nothing included."""
     listed = sorted(set(pairs))
     found = ordered_map(lambda pair: agreement(glimpses[pair[0]], glimpses[pair[1]]), listed, threads)
     return dict(zip(listed, found, strict=True))
 
 
-def agreement(first: Glimpse, second: Glimpse) -> Agreement:
+def agreement(first: QuickFeatures, second: QuickFeatures) -> InlierMatches:
     """Keypoints of two photos that are mutually nearest and agree on a fundamental matrix."""
     rows, columns = _mutual(first.descriptors, second.descriptors)
     if len(rows) < LEAST_MATCHES:
@@ -137,7 +137,7 @@ def agreement(first: Glimpse, second: Glimpse) -> Agreement:
     good = np.flatnonzero(mask.ravel())
     if len(good) < max(LEAST_MATCHES, LEAST_SHARE * len(rows)):
         return NOTHING
-    return Agreement(rows[good], columns[good])
+    return InlierMatches(rows[good], columns[good])
 
 
 def _mutual(

@@ -12,14 +12,14 @@ import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Reporter
-from splatpipe.pipeline.sfm.capture import Capture, Found
+from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.sfm.judging import Judgement, judge
 from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.probing import FILL, PROBES, THIN, pairs_a_photo, probe
-from splatpipe.pipeline.sfm.verified import Verified, read_verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]
@@ -34,7 +34,7 @@ ROUNDS = 2  # of new pairs
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class MappingAttempt:
     """What one way of mapping gave.
 
     Attributes:
@@ -62,14 +62,14 @@ class Answer:
 class Reconstructor:
     """Maps a capture, perhaps more than once, and keeps a row of each try."""
 
-    def __init__(self, capture: Capture, config: SparseConfig, report: Reporter) -> None:
+    def __init__(self, capture: MappingInput, config: SparseConfig, report: Reporter) -> None:
         self.capture, self.config, self.report = capture, config, report
         self.database = capture.database
         self.verified = read_verified(capture.database)
-        self.tried: list[Answer] = []
+        self.tried: list[MappingAttempt] = []
         self.notes: dict[int, str] = {}
 
-    def map(self, mapper: Mapper, how: str, **options: bool) -> Answer:
+    def map(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:
         """Map one way, and judge."""
         began = time.process_time()
         wide = coarseness(self.verified.cameras.values())
@@ -82,18 +82,18 @@ class Reconstructor:
         models = [model for model in work(self.database, self.capture.scratch, chosen, tell) if _has_points(model)]
         tell(len(self.verified.names), len(self.verified.names), "placing photos")
         judgement = judge(models[0], self.verified, self.capture.cameras) if models else None
-        answer = Answer(how, mapper, chosen, models, judgement, time.process_time() - began)
+        answer = MappingAttempt(how, mapper, chosen, models, judgement, time.process_time() - began)
         self.tried.append(answer)
         return answer
 
-    def rows(self, chosen: Answer) -> tuple[JSON, ...]:
+    def rows(self, chosen: MappingAttempt) -> tuple[JSON, ...]:
         """What was tried, for ``models.json``."""
         return tuple(
             {**_row(answer), "chosen": answer is chosen, "why": self.notes.get(id(answer), "")} for answer in self.tried
         )
 
 
-def reconstruct(capture: Capture, config: SparseConfig, report: Reporter) -> Found:
+def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -> MappingResult:
     """Find the cameras.
 
     Args:
@@ -112,7 +112,7 @@ def reconstruct(capture: Capture, config: SparseConfig, report: Reporter) -> Fou
     _check_enough(answer.placed, config, len(work.verified.names))
     if config.mapper == "auto":
         answer = _with_new_pairs(work, answer)
-    return Found(
+    return MappingResult(
         answer.models[0],
         tuple(answer.models[1:]),
         work.database,
@@ -122,7 +122,7 @@ def reconstruct(capture: Capture, config: SparseConfig, report: Reporter) -> Fou
     )
 
 
-def _best(work: Reconstructor) -> Answer:
+def _best(work: Reconstructor) -> MappingAttempt:
     """The better answer of the mappers that the configuration allows."""
     mapper: Mapper = "global" if work.config.mapper == "global" else "incremental"
     best = _with_held_focal(work, work.map(mapper, mapper))
@@ -137,7 +137,7 @@ def _best(work: Reconstructor) -> Answer:
     return best
 
 
-def _doubts(answer: Answer, total: int, verified: Verified) -> list[str]:
+def _doubts(answer: MappingAttempt, total: int, verified: ViewGraph) -> list[str]:
     """Why to map the other way, too."""
     if answer.judgement is None:
         return ["no photo was placed"]
@@ -152,7 +152,7 @@ def _doubts(answer: Answer, total: int, verified: Verified) -> list[str]:
     return found
 
 
-def _better(first: Answer, second: Answer) -> Answer:
+def _better(first: MappingAttempt, second: MappingAttempt) -> MappingAttempt:
     """Of two answers; the first unless the second is clearly better."""
     if second.judgement is None or first.judgement is None:
         return first if second.judgement is None else second
@@ -162,7 +162,7 @@ def _better(first: Answer, second: Answer) -> Answer:
     return second if second.judgement.score > first.judgement.score + CLEARLY else first
 
 
-def _with_new_pairs(work: Reconstructor, answer: Answer) -> Answer:
+def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """The answer, or where it foretold wrongly or the graph is thin a better one from a graph with more pairs."""
     for _ in range(ROUNDS):
         model = answer.models[0]
@@ -189,13 +189,13 @@ def _with_new_pairs(work: Reconstructor, answer: Answer) -> Answer:
     return answer
 
 
-def _unsure(answer: Answer, verified: Verified) -> bool:
+def _unsure(answer: MappingAttempt, verified: ViewGraph) -> bool:
     """Whether nothing but the matches themselves tells that a model is right."""
     known = all(verified.cameras[number].has_prior_focal_length for number in _used(answer.models[0]))
     return not known or (answer.judgement is not None and answer.judgement.level != "good")
 
 
-def _judged_again(work: Reconstructor, answer: Answer) -> Answer:
+def _judged_again(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """The same models, held against the graph as it is now."""
     judgement = judge(answer.models[0], work.verified, work.capture.cameras)
     fresh = replace(answer, judgement=judgement)
@@ -204,7 +204,7 @@ def _judged_again(work: Reconstructor, answer: Answer) -> Answer:
     return fresh
 
 
-def _with_held_focal(work: Reconstructor, answer: Answer) -> Answer:
+def _with_held_focal(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """The answer, or where the photos cannot tell the focal length one near that of the metadata.
 
     If they cannot, the one that is held explains the matches just as well.
@@ -224,7 +224,7 @@ def _with_held_focal(work: Reconstructor, answer: Answer) -> Answer:
     return held if held.judgement.score >= answer.judgement.score - CLEARLY else answer
 
 
-def _row(answer: Answer) -> dict[str, JSON]:
+def _row(answer: MappingAttempt) -> dict[str, JSON]:
     row: dict[str, JSON] = {
         "mapper": answer.mapper,
         "how": answer.how,

@@ -13,13 +13,13 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Int64
 
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 GRID = 8  # cells along either side of a photo; its keypoints are taken cell by cell
 PAIR_FLOOR = 60  # matches that every pair keeps if it has them: twice what COLMAP places a photo by
 
 
-def best_keypoints(verified: Verified, wanted: int) -> dict[int, Bool[np.ndarray, " n"]]:
+def best_keypoints(verified: ViewGraph, wanted: int) -> dict[int, Bool[np.ndarray, " n"]]:
     """Which keypoints of each photo mapping starts from.
 
     Photo after photo, in the order of their numbers: those that are in already because they match one of an earlier
@@ -51,7 +51,7 @@ def best_keypoints(verified: Verified, wanted: int) -> dict[int, Bool[np.ndarray
 
 
 def _edges(
-    verified: Verified, starts: dict[int, int]
+    verified: ViewGraph, starts: dict[int, int]
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
     """Both ends of each verified match among all keypoints, photo after photo, and the number of its pair."""
     pairs = sorted(verified.matches)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pycolmap
 
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 MOST_ERROR_PX = 4.0  # COLMAP's own limits of mapping
 LEAST_ANGLE_DEG = 1.5
 
 
-def retriangulate(model: pycolmap.Reconstruction, verified: Verified, seed: int) -> None:
+def retriangulate(model: pycolmap.Reconstruction, verified: ViewGraph, seed: int) -> None:
     """Bring verified matches into a model, in place, as far as its cameras explain them; what they do not goes.
 
     Args:

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 Track = list[tuple[int, int]]
 """Photo and keypoint of each observation, sorted."""
@@ -56,7 +56,7 @@ def read_structure(model: pycolmap.Reconstruction) -> Structure:
 def make_model(
     cameras: Iterable[pycolmap.Camera],
     poses: Mapping[int, pycolmap.Rigid3d],
-    verified: Verified,
+    verified: ViewGraph,
     structure: Structure,
 ) -> pycolmap.Reconstruction:
     """A model whose photos have all keypoints of a view graph, which may have grown since.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Before:
+class GaussiansInFront:
     """Gaussians whose centres hang before what a photo sees.
 
     Attributes:
@@ -33,7 +33,7 @@ class Before:
 
 def centres_before(
     means: Float64[Tensor, "n 3"], usable: Bool[Tensor, " n"], photo: PhotoBounds, share: float, cells_a_side: int
-) -> Before:
+) -> GaussiansInFront:
     """Which centres hang before a photo's bounds, as ``free_space._judge`` asks on the CPU.
 
     Args:
@@ -58,7 +58,7 @@ def centres_before(
     away = (means[rows] - torch.from_numpy(camera.centre()).to(means.device)).square().sum(dim=1).sqrt()
     close = (z < photo.near) & (away < photo.near)
     found = (rows[front], z[front], limits[front], rows[close])
-    return Before(*(part.cpu().numpy() for part in found))
+    return GaussiansInFront(*(part.cpu().numpy() for part in found))
 
 
 def _along(means: Float64[Tensor, "n 3"], row: Float64[np.ndarray, " 4"]) -> Float64[Tensor, " n"]:

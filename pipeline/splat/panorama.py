@@ -47,15 +47,15 @@ class Panorama:
         """
         return self.look(camera).behind(self.colours, background)
 
-    def look(self, camera: Camera) -> Look:
+    def look(self, camera: Camera) -> PanoramaView:
         """Where a camera's nodes look, for colours of this panorama's cells."""
         if self.colours.device.type == "cpu":
-            return gathered_look(camera, self.up, self.colours)
-        return multiplied_look(camera, self.up, self.colours)
+            return gather_view(camera, self.up, self.colours)
+        return matrix_view(camera, self.up, self.colours)
 
     def at(self, rays: Float64[np.ndarray, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
         """The colours in some directions of any length."""
-        return Gathered.of_rays(rays, self.up, self.colours).mixed(self.colours).reshape(rays.shape)
+        return GatherLookup.of_rays(rays, self.up, self.colours).mixed(self.colours).reshape(rays.shape)
 
     def to(self, device: torch.device) -> Panorama:
         """The same with its colours on a device; no leaf of autograd any more where they have to move."""
@@ -71,7 +71,7 @@ class Lookup(Protocol):
 
 
 @dataclass(frozen=True)
-class Look:
+class PanoramaView:
     """Where a camera's nodes look.
 
     Attributes:
@@ -107,7 +107,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Gathered:
+class GatherLookup:
     """Four cells a direction, fetched by their numbers: little work, for a CPU.
 
     Attributes:
@@ -119,10 +119,10 @@ class Gathered:
     weights: Float[Tensor, "n 4 1"]
 
     @staticmethod
-    def of_rays(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"], like: Tensor) -> Gathered:
+    def of_rays(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"], like: Tensor) -> GatherLookup:
         """Those around some directions; weights in another tensor's type and on its device."""
         cells, weights = (torch.from_numpy(array).to(like.device) for array in cells_of(rays.reshape(-1, 3), up))
-        return Gathered(cells, weights.to(like.dtype)[:, :, None])
+        return GatherLookup(cells, weights.to(like.dtype)[:, :, None])
 
     def mixed(self, colours: Float[Tensor, "cells 3"]) -> Float[Tensor, "n 3"]:
         """The directions' colours."""
@@ -130,7 +130,7 @@ class Gathered:
 
 
 @dataclass(frozen=True)
-class Multiplied:
+class MatrixLookup:
     """All cells with weights that are mostly zero, by products of matrices: their backward pass adds in a fixed order
     on a GPU, too, where numbers that fetch would add in any or be sorted first.
 
@@ -149,14 +149,14 @@ class Multiplied:
         return (self.by_row[:, :, None] * along).sum(dim=1)
 
 
-def gathered_look(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> Look:
+def gather_view(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> PanoramaView:
     """A camera's look at a panorama with that pole, in another tensor's type."""
     nodes = directions(camera, STEP_PX)
     share = torch.from_numpy(cover(nodes, up)).to(like.dtype)[:, :, None]
-    return Look(camera, share, Gathered.of_rays(nodes, up, like))
+    return PanoramaView(camera, share, GatherLookup.of_rays(nodes, up, like))
 
 
-def multiplied_look(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> Look:
+def matrix_view(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> PanoramaView:
     """The same, all of it made on the other tensor's device: the host does nothing that grows with the photo."""
     device, dtype = like.device, like.dtype
     east, north = horizontal_axes(up)
@@ -174,10 +174,10 @@ def multiplied_look(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor)
     across = (column - torch.arange(COLUMNS, device=device)).abs()
     by_column = (1.0 - torch.minimum(across, COLUMNS - across)).clamp(min=0.0)
     by_row = (1.0 - (row - torch.arange(ROWS, device=device)).abs()).clamp(min=0.0)
-    return Look(camera, share.clamp(0.0, 1.0).to(dtype)[:, :, None], Multiplied(by_row, by_column))
+    return PanoramaView(camera, share.clamp(0.0, 1.0).to(dtype)[:, :, None], MatrixLookup(by_row, by_column))
 
 
-def laid_over(
+def composite_over(
     colour: Float[Tensor, "h w 3"],
     alpha: Float[Tensor, "h w"],
     background: tuple[float, float, float],

@@ -30,7 +30,7 @@ _Z_UP_FROM: Mapping[Axes, tuple[tuple[float, ...], ...]] = {
 
 
 @dataclass(frozen=True)
-class Place:
+class SplatOrigin:
     """Where a splat's zero lies on the earth; its axes, turned to z up, are east, north, up there.
 
     Attributes:
@@ -65,7 +65,7 @@ class SceneFacts:
     axes: Axes = "z up"
     antialias: bool = False
     metres: bool = False
-    place: Place | None = None
+    place: SplatOrigin | None = None
     edits: tuple[Mapping[str, Any], ...] = ()
 
     def record(self) -> str:
@@ -107,12 +107,12 @@ def _facts(value: Mapping[str, Any]) -> SceneFacts:
     return facts
 
 
-def _place(value: Mapping[str, Any]) -> Place:
+def _place(value: Mapping[str, Any]) -> SplatOrigin:
     latitude, longitude, height_m = (float(value[name]) for name in ("latitude", "longitude", "height_m"))
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and math.isfinite(height_m)):
         raise ValueError("nowhere on the earth")
     vertical_datum, crs = (str(value[name])[:_MOST_TEXT] for name in ("vertical_datum", "crs"))
-    return Place(latitude, longitude, height_m, vertical_datum, crs, value["approximate_crs"] is True)
+    return SplatOrigin(latitude, longitude, height_m, vertical_datum, crs, value["approximate_crs"] is True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,7 +100,7 @@ class SkyMask:
 
 
 @dataclass(frozen=True)
-class Votes:
+class SkyVotes:
     """The cells of the grid of directions that a photo sees, and those of them that are sky to it."""
 
     seen: Int64[np.ndarray, " s"]
@@ -124,7 +124,7 @@ def find_skies(
         threads: That load and search.
     """
 
-    def search(index: int) -> tuple[SkyMask, Votes, bool]:
+    def search(index: int) -> tuple[SkyMask, SkyVotes, bool]:
         seen = photo(index)
         if seen.drawn is not None:
             return SkyMask.packed(seen.drawn), votes_of(seen.camera, seen.drawn, up), True
@@ -177,7 +177,7 @@ def roofed(
     return result
 
 
-def is_open(votes: Sequence[Votes]) -> bool:
+def is_open(votes: Sequence[SkyVotes]) -> bool:
     """Whether enough of what a capture shows above the horizon is sky: outdoors nearly all is, in a room it is not.
 
     A few bright patches among hundreds of photos are walls, windows and lamps.
@@ -253,15 +253,15 @@ def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
     return np.asarray(x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2])
 
 
-def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarray, " 3"]) -> Votes:
+def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarray, " 3"]) -> SkyVotes:
     """What a photo says about directions: a cell is sky where most of what the photo sees of it is."""
     cell = direction_cells(camera, up)
     cells = 2 * DIRECTION_ROWS * DIRECTION_ROWS
     count = np.bincount(cell.ravel(), minlength=cells)
-    return Votes(np.flatnonzero(count), np.flatnonzero(2 * np.bincount(cell[mask], minlength=cells) > count))
+    return SkyVotes(np.flatnonzero(count), np.flatnonzero(2 * np.bincount(cell[mask], minlength=cells) > count))
 
 
-def agreed(votes: Sequence[Votes]) -> list[bool]:
+def agreed(votes: Sequence[SkyVotes]) -> list[bool]:
     """Whether each photo's sky is one; False where the others that look the same way see something else there."""
     seen, sky = np.zeros((2, 2 * DIRECTION_ROWS * DIRECTION_ROWS))
     for vote in votes:

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.photo_set import PhotoSet, place_of
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, PosedDepthMap
 
 SIDE = 8  # voxels of a block: a surface fills smaller blocks better than open3d's usual 16
 BAND = 3.0  # voxels on either side of a surface that know how far off it is
@@ -24,7 +24,7 @@ Keys = Int64[np.ndarray, " n"]
 Box = Float64[np.ndarray, "2 3"]  # least and largest east, north, up, metres: the part of the world that counts
 
 
-def depths_in(box: Box, found: DepthMap) -> Float32[np.ndarray, "h w"]:
+def depths_in(box: Box, found: PosedDepthMap) -> Float32[np.ndarray, "h w"]:
     """Depths of a photo that others confirm and that lie in a box; 0 elsewhere."""
     sure = (found.confidence >= LEAST_CONFIRMED) & (found.depth > 0.0)
     row, column = np.nonzero(sure)
@@ -35,7 +35,7 @@ def depths_in(box: Box, found: DepthMap) -> Float32[np.ndarray, "h w"]:
     return depth
 
 
-def _places(found: DepthMap, row: np.ndarray, column: np.ndarray) -> Float64[np.ndarray, "3 n"]:
+def _places(found: PosedDepthMap, row: np.ndarray, column: np.ndarray) -> Float64[np.ndarray, "3 n"]:
     return place_of(found.camera, row, column, 1.0 / found.depth[row, column].astype(np.float64))
 
 
@@ -83,10 +83,10 @@ def surface_blocks(photos: PhotoSet, box: Box, voxel_m: float, most: int, thread
 
 
 def _seen_keys(photos: PhotoSet, box: Box, voxel_m: float, number: int) -> Keys:
-    return seen_blocks(box, voxel_m, photos.depth_map(number))
+    return visible_blocks(box, voxel_m, photos.depth_map(number))
 
 
-def seen_blocks(box: Box, voxel_m: float, found: DepthMap) -> Keys:
+def visible_blocks(box: Box, voxel_m: float, found: PosedDepthMap) -> Keys:
     """Keys of the blocks in which a photo sees a surface, or the band around it, in order."""
     depth = depths_in(box, found)
     row, column = np.nonzero(depth[::EVERY, ::EVERY])

@@ -20,8 +20,8 @@ from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.point_cloud import UNDATED, CloudChunk, CloudFrame, write_cloud
 from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
 from splatpipe.pipeline.surface.run_sources import RunSurface
-from splatpipe.pipeline.surface.site import Site
-from splatpipe.pipeline.surface.sources import Relief
+from splatpipe.pipeline.surface.site_extent import SiteExtent
+from splatpipe.pipeline.surface.sources import HeightRange
 from splatpipe.pipeline.surface.tiles import Tile, tiled
 
 SIDE = 1024  # cells of a part of the plan, in which each photo is read once: some 2 million points; 2048 took 3.2 GB
@@ -41,7 +41,7 @@ class CloudTask:
     """
 
     surface: RunSurface
-    site: Site
+    site: SiteExtent
     spacing_m: float
     threads: int
 
@@ -64,7 +64,7 @@ def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict
         MachineError: if the disk is full.
     """
     grid = make_grid(task.surface.frame, task.site.box, task.spacing_m)
-    lattice, relief = _lattice(task), Relief(task.site.low_m, task.site.high_m)
+    lattice, relief = _lattice(task), HeightRange(task.site.low_m, task.site.high_m)
     work.mkdir(exist_ok=True)
     parts = [part for part in tiled(lattice.height, lattice.width, SIDE) if _tiles(task, lattice, part)]
     photos = None
@@ -96,7 +96,7 @@ def _tiles(task: CloudTask, lattice: Lattice, part: Tile) -> list[Tile]:
     return found
 
 
-def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, Relief], part: Tile) -> CloudChunk:
+def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, HeightRange], part: Tile) -> CloudChunk:
     """The cloud of a part of the plan."""
     tiles = _tiles(task, space[0], part)
     points = joined(list(ordered_map(partial(tile_cloud, photos, *space), tiles, task.threads)))
@@ -108,7 +108,7 @@ def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, Relief], part
     return CloudChunk(positions, colours[known], normals.astype(np.float32), points.confidence)
 
 
-def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: Relief, tile: Tile) -> FusedPoints:
+def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: HeightRange, tile: Tile) -> FusedPoints:
     """The points of one tile, by cell and height: one for each cube of a cell's side at most."""
     wide = tile.grown(MARGIN)
     points = fused(photos.parts_in(lattice, wide, relief), lattice, wide, relief)

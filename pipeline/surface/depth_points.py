@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, dot, look_at, place_of, turned
-from splatpipe.pipeline.surface.sources import Relief
+from splatpipe.pipeline.surface.photo_set import DepthPart, SurfacePieces, dot, look_at, place_of, turned
+from splatpipe.pipeline.surface.sources import HeightRange
 from splatpipe.pipeline.surface.tiles import Tile
 
 SAME_PX = 10.0  # depths that bend by more than so many pixels' widths are not one surface
@@ -27,7 +27,7 @@ class DepthPoints:
     """
 
     number: int
-    pieces: Facing
+    pieces: SurfacePieces
     footprint: Float64[np.ndarray, " n"]
 
     def select(self, rows: np.ndarray | slice) -> DepthPoints:
@@ -35,7 +35,7 @@ class DepthPoints:
         return DepthPoints(self.number, self.pieces.select(rows), self.footprint[rows])
 
 
-def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: Relief) -> DepthPoints:
+def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: HeightRange) -> DepthPoints:
     """What a photo's depths show in a tile, pixel by pixel, walls and all; without lone pixels.
 
     Args:
@@ -52,7 +52,7 @@ def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: Relief) 
     for reach in REACHES[1:]:
         rest = np.flatnonzero(~known)
         normal[:, rest], known[rest] = picture_normals(part, row[rest], column[rest], reach)
-    pieces = Facing(xyz, normal)
+    pieces = SurfacePieces(xyz, normal)
     footprint = look_at(part.camera, pieces).footprint
     seen = np.flatnonzero(known & np.isfinite(footprint))
     return DepthPoints(part.number, pieces.select(seen), footprint[seen])

@@ -81,7 +81,7 @@ class Dots:
 
 
 @dataclass(frozen=True)
-class Placed:
+class DrawingPicture:
     """A picture at true size.
 
     Attributes:
@@ -116,7 +116,7 @@ class Drawing:
     scale: int
     strokes: Sequence[Stroke]
     labels: Sequence[Label]
-    picture: Placed | None = None
+    picture: DrawingPicture | None = None
     dots: Dots | None = None
 
     def box(self) -> tuple[Place2, Place2]:

@@ -17,12 +17,12 @@ from splatpipe.pipeline.surface.contour_files import write_dxf, write_geojson
 from splatpipe.pipeline.surface.contours import trace_contours
 from splatpipe.pipeline.surface.geotiff import CONFIDENCE, HEIGHTS, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
-from splatpipe.pipeline.surface.heights import TILE, Capture, surface_heights
+from splatpipe.pipeline.surface.heights import TILE, HeightInput, surface_heights
 from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.sheet import GridSheet, grid_sheets
 from splatpipe.pipeline.surface.sheet_work import Arrays, SheetWork
-from splatpipe.pipeline.surface.site import Site
-from splatpipe.pipeline.surface.sources import Shelf
+from splatpipe.pipeline.surface.site_extent import SiteExtent
+from splatpipe.pipeline.surface.sources import LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 
 HELD_BYTES = 512 << 20  # of depths in memory
@@ -42,12 +42,12 @@ class DsmTask:
     """
 
     surface: RunSurface
-    site: Site
+    site: SiteExtent
     cell_m: float
     threads: int
 
 
-def height_range(site: Site, grid: Grid) -> tuple[float, float]:
+def height_range(site: SiteExtent, grid: Grid) -> tuple[float, float]:
     """Between which heights a site lies, the CRS's unit."""
     mapped = grid.crs_from_local(
         np.array([[e, n, up] for e in site.box[:, 0] for n in site.box[:, 1] for up in site.box[:, 2]])
@@ -77,7 +77,7 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
 
     def heights(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
         sources = [sheet.sheet.moved_depths(source) for source in task.surface.depths]
-        capture = Capture(sources, sheet.sheet.lattice, sheet.sheet.relief, Shelf(HELD_BYTES))
+        capture = HeightInput(sources, sheet.sheet.lattice, sheet.sheet.relief, LruCache(HELD_BYTES))
         for part in surface_heights(capture, tiles, task.threads):
             sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))
             confidence = np.stack([part.photos, np.minimum(sigma, MOST_MILLIMETRES)], axis=-1).astype(np.uint16)
@@ -103,7 +103,7 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
     }
 
 
-def _seen(site: Site, sheet: GridSheet, tile: Tile) -> bool:
+def _seen(site: SiteExtent, sheet: GridSheet, tile: Tile) -> bool:
     """Whether enough photos see any of a tile."""
     corners = sheet.sheet.lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
     local = sheet.sheet.local(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]

@@ -17,13 +17,13 @@ from jaxtyping import Float32, Float64, UInt8
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.heights import TILE as HEIGHTS_TILE
-from splatpipe.pipeline.surface.heights import Capture, surface_heights
+from splatpipe.pipeline.surface.heights import HeightInput, surface_heights
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.levels import Levels
-from splatpipe.pipeline.surface.orthophoto import TILE, Album, orthophotos
+from splatpipe.pipeline.surface.orthophoto import TILE, OrthoInput, orthophotos
+from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sheet import Sheet
-from splatpipe.pipeline.surface.sources import DepthMap, Relief, Shelf
+from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PosedDepthMap
 from splatpipe.pipeline.surface.walls import Wall
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sills and cornices; balconies do not
@@ -82,11 +82,11 @@ def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
     from_local[:3, 3] = [-wall.along @ wall.left, 0.0, -wall.facing @ wall.left]
     over = width * cell_m - wall.length_m, height * cell_m - (wall.high_m - wall.low_m)
     lattice = Lattice(-over[0] / 2.0, wall.high_m + over[1] / 2.0, cell_m, width, height)
-    return Sheet(from_local, lattice, Relief(-BEHIND_M, BEFORE_M))
+    return Sheet(from_local, lattice, HeightRange(-BEHIND_M, BEFORE_M))
 
 
 @dataclass(frozen=True, eq=False)
-class Photos:
+class ElevationPhotos:
     """What elevations are drawn from.
 
     Attributes:
@@ -96,11 +96,11 @@ class Photos:
     """
 
     sources: Sequence[PhotoSource]
-    levels: Levels
+    levels: PhotoGains
     threads: int
 
 
-def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress) -> Elevation:
+def draw_elevation(wall: Wall, cell_m: float, photos: ElevationPhotos, progress: Progress) -> Elevation:
     """Draw a wall; the same bits for any number of threads.
 
     Args:
@@ -119,16 +119,18 @@ def draw_elevation(wall: Wall, cell_m: float, photos: Photos, progress: Progress
     shape = sheet.lattice.height, sheet.lattice.width
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     colour = np.zeros((*shape, 4), np.uint8)
-    shelf: Shelf[DepthMap] = Shelf(SHELF_BYTES)
+    shelf: LruCache[PosedDepthMap] = LruCache(SHELF_BYTES)
     known = [source.depths for source in sources if source.depths is not None]
-    capture = Capture(known, sheet.lattice, sheet.relief, shelf, upright=True)
+    capture = HeightInput(known, sheet.lattice, sheet.relief, shelf, upright=True)
     for done, part in enumerate(surface_heights(capture, depths_tiles, photos.threads), 1):
         cut = part.tile.slices
         depth[cut], sigma[cut] = part.height, part.sigma
         progress(done, total)
     depth = without_specks(depth)
     surface = HeightField(sheet.lattice, depth)
-    album = Album(sources, surface, sheet.lattice, sheet.relief, levels, Shelf(SHELF_BYTES), Shelf(SHELF_BYTES))
+    album = OrthoInput(
+        sources, surface, sheet.lattice, sheet.relief, levels, LruCache(SHELF_BYTES), LruCache(SHELF_BYTES)
+    )
     for done, drawn in enumerate(orthophotos(album, colour_tiles, photos.threads), len(depths_tiles) + 1):
         cut = drawn.tile.slices
         colour[(*cut, slice(0, 3))] = drawn.colour
@@ -151,7 +153,7 @@ def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h 
     return result
 
 
-def _before(sheet: Sheet, photos: Photos) -> tuple[list[PhotoSource], Levels]:
+def _before(sheet: Sheet, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
     """Photos that stand before a wall, in its sheet's frame, with their levels."""
     rows = [
         row for row, source in enumerate(photos.sources) if sheet.place(source.camera.centre())[2] > sheet.relief.high_m

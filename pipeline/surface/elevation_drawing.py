@@ -11,8 +11,8 @@ from splatpipe.pipeline.surface.drawing import (
     OUTLINE,
     PROJECTIONS,
     Drawing,
+    DrawingPicture,
     Label,
-    Placed,
     Stroke,
     caption,
     plot_scale,
@@ -55,7 +55,7 @@ def elevation_drawing(elevation: Elevation, crs: MapCrs, zero_m: float, picture:
     )
     title = caption(f"Façade {wall.name}", about, 0.0, low, scale)
     bottom = lattice.north_m + zero_m - height_m
-    placed = Placed(picture, lattice.east_m, bottom, width_m, height_m, (lattice.width, lattice.height))
+    placed = DrawingPicture(picture, lattice.east_m, bottom, width_m, height_m, (lattice.width, lattice.height))
     return Drawing(scale, [*strokes, *levels, *bar], [*marks, *lengths, *title], placed)
 
 

@@ -14,9 +14,9 @@ from jaxtyping import Float64, Int64
 from scipy.sparse.linalg import LinearOperator, cg
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.levels import SHADES, Levels, across
+from splatpipe.pipeline.surface.photo_gains import SHADES, PhotoGains, across
 from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, linear, loaded, sampled
-from splatpipe.pipeline.surface.sight import Points, place_in, sight
+from splatpipe.pipeline.surface.point_visibility import Points, place_in, sight
 
 COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
 MOST_GAIN = 2.0  # and one over it: more is not exposure
@@ -35,7 +35,7 @@ Numbers = Int64[np.ndarray, " k"]
 
 def exposure_levels(
     sources: Sequence[PhotoSource], places: Float64[np.ndarray, "m 3"], cell_m: float, threads: int
-) -> Levels:
+) -> PhotoGains:
     """By how much each photo's light is to be multiplied so that photos agree where they see the same.
 
     Least squares of the logarithms over places that two photos see at least, robust (Huber's weights), about the mean
@@ -48,13 +48,13 @@ def exposure_levels(
         threads: Photos at a time.
     """
     if not sources:
-        return Levels.plain(0)
+        return PhotoGains.plain(0)
     rows = list(ordered_map(partial(_light, places, cell_m), sources, threads))
     photo = np.repeat(np.arange(len(rows)), [len(there) for there, _, _ in rows])
     place, light, shades = (np.concatenate(column) for column in zip(*rows, strict=True))
     shared = np.bincount(place, minlength=len(places))[place] >= 2
     if not shared.any():
-        return Levels.plain(len(sources))
+        return PhotoGains.plain(len(sources))
     photo, place, light = photo[shared], place[shared], light[shared]
     terms = np.column_stack([np.ones(len(photo)), shades[shared]])
     rest = np.array([REST, *([REST_SHADE] * SHADES)])
@@ -62,7 +62,7 @@ def exposure_levels(
     factors = np.stack([_levelled(each, terms, rest, numbers, len(sources)) for each in light.T], axis=-1)
     gain = np.clip(np.exp(factors[:, 0]), 1.0 / MOST_GAIN, MOST_GAIN)
     shading = np.clip(factors[:, 1:], -MOST_SHADE, MOST_SHADE)
-    return Levels(np.round(gain, DIGITS), np.round(shading, DIGITS))
+    return PhotoGains(np.round(gain, DIGITS), np.round(shading, DIGITS))
 
 
 def _light(

@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.drawing_files import write_dxf_drawing, write_svg_drawing
-from splatpipe.pipeline.surface.elevation import Elevation, Photos, draw_elevation
+from splatpipe.pipeline.surface.elevation import Elevation, ElevationPhotos, draw_elevation
 from splatpipe.pipeline.surface.elevation_drawing import elevation_drawing
 from splatpipe.pipeline.surface.elevation_files import (
     elevation_facts,
@@ -85,7 +85,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         write_facades(out / LIST, [], crs)
         return []
     places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
-    photos = Photos(sources, exposure_levels(sources, places, 2.0 * pixel_m, task.threads), task.threads)
+    photos = ElevationPhotos(sources, exposure_levels(sources, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
     for number, wall in enumerate(walls):
 

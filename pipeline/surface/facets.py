@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
 
 BLOCKS_A_PHOTO = 20_000  # of pixels, that a plane is laid through each: 20 cm of a wall in photos of a GSD of 3 cm
 LEAST_BLOCK = 6  # pixels a side: a smaller one's slope is noise
@@ -64,7 +64,7 @@ def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
     return every.select(every.pixels_m <= COARSEST * np.median(every.pixels_m)) if len(every) else every
 
 
-def facets_of(found: DepthMap) -> Facets:
+def facets_of(found: PosedDepthMap) -> Facets:
     """Upright facets of one photo: least squares through its inverse depths, block by block.
 
     Inverse depth is linear in a plane's pixels: w = n · (x, y, 1) for the plane n · X = 1.
@@ -76,7 +76,7 @@ def facets_of(found: DepthMap) -> Facets:
     return _joined(parts)
 
 
-def _strip_facets(found: DepthMap, top: int, rows: int, side: int) -> Facets:
+def _strip_facets(found: PosedDepthMap, top: int, rows: int, side: int) -> Facets:
     """Those of some rows of the photo."""
     camera, strip = found.camera, np.s_[top : top + rows]
     depth = found.depth[strip].astype(np.float64)

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.surface.depth_points import REACHES, DepthPoints, depth_points, picture_normals
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_set import DepthPart, Facing, Look, dot, look_at, place_of
-from splatpipe.pipeline.surface.sources import Relief
+from splatpipe.pipeline.surface.photo_set import DepthPart, SurfacePieces, SurfaceView, dot, look_at, place_of
+from splatpipe.pipeline.surface.sources import HeightRange
 from splatpipe.pipeline.surface.tiles import Tile
 
 FINER = 0.9  # of a point's footprint: a photo with less than that has the place instead; beyond it both may
@@ -39,7 +39,7 @@ class FusedPoints:
         confidence: How many photos besides that one see it.
     """
 
-    pieces: Facing
+    pieces: SurfacePieces
     footprint: Float64[np.ndarray, " n"]
     confidence: UInt8[np.ndarray, " n"]
 
@@ -51,7 +51,7 @@ class FusedPoints:
         return FusedPoints(self.pieces.select(rows), self.footprint[rows], self.confidence[rows])
 
 
-def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: Relief) -> FusedPoints:
+def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: HeightRange) -> FusedPoints:
     """The cloud of a tile, photo by photo; its points may have left the tile by a little.
 
     Args:
@@ -94,11 +94,11 @@ def finest_of_cubes(
 
 def joined(found: Sequence[FusedPoints]) -> FusedPoints:
     """Several clouds one after the other."""
-    none = FusedPoints(Facing(np.zeros((3, 0)), np.zeros((3, 0))), np.zeros(0), np.zeros(0, np.uint8))
+    none = FusedPoints(SurfacePieces(np.zeros((3, 0)), np.zeros((3, 0))), np.zeros(0), np.zeros(0, np.uint8))
     every = [none, *found]
     xyz, normal = (np.concatenate([getattr(each.pieces, name) for each in every], axis=1) for name in ("xyz", "normal"))
     footprint = np.concatenate([each.footprint for each in every])
-    return FusedPoints(Facing(xyz, normal), footprint, np.concatenate([each.confidence for each in every]))
+    return FusedPoints(SurfacePieces(xyz, normal), footprint, np.concatenate([each.confidence for each in every]))
 
 
 def _by_distance(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile) -> list[DepthPart]:
@@ -149,7 +149,7 @@ def _agreed(points: DepthPoints, parts: Sequence[DepthPart]) -> FusedPoints:
     along = offset[:, 0] * normal[0] + offset[:, 1] * normal[1] + offset[:, 2] * normal[2]
     footprint = points.footprint[kept]
     shift = _robust_mean(along, opinion.weight[:, kept].astype(np.float64), footprint)
-    pieces = Facing(points.pieces.xyz[:, kept] + normal * shift, normal)
+    pieces = SurfacePieces(points.pieces.xyz[:, kept] + normal * shift, normal)
     return FusedPoints(pieces, footprint, np.minimum(count[kept] - 1, MOST).astype(np.uint8))
 
 
@@ -182,7 +182,7 @@ def _heard(
 
 
 def _place_and_normal(
-    pieces: Facing, part: DepthPart, look: Look, seen: Bool[np.ndarray, " n"]
+    pieces: SurfacePieces, part: DepthPart, look: SurfaceView, seen: Bool[np.ndarray, " n"]
 ) -> tuple[Float64[np.ndarray, "3 k"], Float64[np.ndarray, "3 k"]]:
     """From points to the pixels that show them in another photo, and these pixels' normals; zero where unknown.
 

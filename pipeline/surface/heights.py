@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.holes import filled
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sight import Sight, sight
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.point_visibility import PointVisibility, sight
+from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, PosedDepthMap, photos_seeing
 from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.surface.votes import HALF, Layer, Votes, undecided
+from splatpipe.pipeline.surface.votes import HALF, HeightVotes, Layer, undecided
 
 TILE = 256  # cells a side
 LEAST_PHOTOS = 3  # that see a place
@@ -49,7 +49,7 @@ class Heights:
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
+class HeightInput:
     """All that the surface model is made from.
 
     Attributes:
@@ -62,8 +62,8 @@ class Capture:
 
     sources: Sequence[DepthSource]
     lattice: Lattice
-    relief: Relief
-    shelf: Shelf[DepthMap]
+    relief: HeightRange
+    shelf: LruCache[PosedDepthMap]
     upright: bool = False
 
     @property
@@ -76,12 +76,12 @@ class Capture:
         """Cells around a tile that its holes look at."""
         return NEAR + self.far + 1
 
-    def depths(self, number: int) -> DepthMap:
+    def depths(self, number: int) -> PosedDepthMap:
         """A photo's depths, loaded if they are not at hand."""
         return self.shelf.get(number, self.sources[number].loaded)
 
 
-def surface_heights(capture: Capture, tiles: Sequence[Tile], threads: int) -> Iterator[Heights]:
+def surface_heights(capture: HeightInput, tiles: Sequence[Tile], threads: int) -> Iterator[Heights]:
     """Heights of tiles, in their order: the same bits for any number of threads, and however cells are tiled.
 
     Args:
@@ -95,7 +95,7 @@ def surface_heights(capture: Capture, tiles: Sequence[Tile], threads: int) -> It
     return ordered_map(partial(tile_heights, capture), tiles, threads)
 
 
-def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Heights:
+def tile_heights(capture: HeightInput, tile: Tile, most: int = MOST_VOTES) -> Heights:
     """Heights of one tile.
 
     Args:
@@ -104,10 +104,10 @@ def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Height
         most: Cells times photos at once; larger ones are made in parts.
     """
     wide = tile.grown(capture.margin)
-    seen = seen_by([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
+    seen = photos_seeing([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
     if len(seen) * wide.cells > most and tile.cells > LEAST_CELLS:
         return _joined(tile, [tile_heights(capture, half, most) for half in tile.halves()])
-    votes = Votes(capture.lattice, wide, capture.relief)
+    votes = HeightVotes(capture.lattice, wide, capture.relief)
     for number, window in seen:
         votes.add(capture.depths(number), window)
     found = votes.layers()
@@ -135,7 +135,7 @@ def tile_heights(capture: Capture, tile: Tile, most: int = MOST_VOTES) -> Height
 
 
 def _filled(
-    capture: Capture, tile: Tile, height: Float64[np.ndarray, " c"], numbers: Sequence[int]
+    capture: HeightInput, tile: Tile, height: Float64[np.ndarray, " c"], numbers: Sequence[int]
 ) -> tuple[Float64[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
     """A tile's heights with small holes filled, and larger ones where enough photos may see that; and which are new."""
     shape, cell_m = (tile.height, tile.width), capture.lattice.cell_m
@@ -148,7 +148,7 @@ def _filled(
 
 
 def _may_see(
-    capture: Capture,
+    capture: HeightInput,
     tile: Tile,
     asked: Int64[np.ndarray, " a"],
     height: Float64[np.ndarray, " a"],
@@ -162,12 +162,12 @@ def _may_see(
 
 
 def _views(
-    capture: Capture,
+    capture: HeightInput,
     tile: Tile,
     asked: Int64[np.ndarray, " a"],
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
-) -> Iterator[tuple[int, Sight]]:
+) -> Iterator[tuple[int, PointVisibility]]:
     """What each photo says of places in some of a tile's cells, layer by layer, with the layer's number."""
     east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
     for number in reversed(numbers) if asked.size else ():  # the last ones are still at hand
@@ -188,7 +188,9 @@ def _empty(tile: Tile) -> Heights:
     return Heights(tile, nothing, nothing.copy(), np.zeros((tile.height, tile.width), np.uint8))
 
 
-def _chosen(capture: Capture, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]) -> Float64[np.ndarray, " c"]:
+def _chosen(
+    capture: HeightInput, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]
+) -> Float64[np.ndarray, " c"]:
     """Of the surfaces in each cell the highest that too few photos look through; nan where none is.
 
     Where there are several, one that covers half of the cell at least comes before others.
@@ -206,7 +208,7 @@ def _chosen(capture: Capture, tile: Tile, found: Sequence[Layer], numbers: Seque
 
 
 def _balance(
-    capture: Capture,
+    capture: HeightInput,
     tile: Tile,
     asked: Int64[np.ndarray, " a"],
     heights: Float64[np.ndarray, "l a"],

@@ -20,16 +20,16 @@ from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.known_cells import KnownCells, known_cells
-from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.mosaic import MARGIN
-from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, Album, orthophotos
+from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, OrthoInput, orthophotos
+from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.pixel_file import pixels_on_disk
 from splatpipe.pipeline.surface.run_sources import RunSurface
 from splatpipe.pipeline.surface.sheet import GridSheet, grid_sheets
 from splatpipe.pipeline.surface.sheet_work import Arrays, SheetWork
-from splatpipe.pipeline.surface.site import Site
-from splatpipe.pipeline.surface.sources import Shelf
+from splatpipe.pipeline.surface.site_extent import SiteExtent
+from splatpipe.pipeline.surface.sources import LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 
 PIXEL_BYTES = 1 << 30  # of decoded photos in memory; all together lie on the disk where they are more
@@ -50,7 +50,7 @@ class OrthoTask:
     """
 
     surface: RunSurface
-    site: Site
+    site: SiteExtent
     dsm: Path
     dsm_cell_m: float
     gsd_m: float
@@ -81,7 +81,7 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
     work.mkdir(exist_ok=True)
     with pixels_on_disk(task.surface.photos, work, PIXEL_BYTES) as photos:
         levels = exposure_levels(photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
-        making.run(partial(_colours, task, heights, _Pictures(photos, levels, Shelf(PIXEL_BYTES))))
+        making.run(partial(_colours, task, heights, _Pictures(photos, levels, LruCache(PIXEL_BYTES))))
     pixels = 0
     with raster_file(out / "ortho.tif", grid, COLOURS) as file:
         for part, arrays in making.finished():
@@ -100,11 +100,11 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """Photos whose pixels are at hand, as ``Album`` takes them."""
+    """Photos whose pixels are at hand, as ``OrthoInput`` takes them."""
 
     sources: Sequence[PhotoSource]
-    levels: Levels
-    pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]]
+    levels: PhotoGains
+    pixels: LruCache[UInt8[np.ndarray, "_ _ 3"]]
 
 
 def _colours(
@@ -114,7 +114,9 @@ def _colours(
     plane = sheet.sheet
     photos = [plane.moved_photo(photo) for photo in pictures.sources]
     surface = _surface(sheet, task.dsm, heights)
-    album = Album(photos, surface, plane.lattice, plane.relief, pictures.levels, pictures.pixels, Shelf(HELD_BYTES))
+    album = OrthoInput(
+        photos, surface, plane.lattice, plane.relief, pictures.levels, pictures.pixels, LruCache(HELD_BYTES)
+    )
     for part in orthophotos(album, tiles, task.threads):
         alpha = np.where(part.known, 255, 0).astype(np.uint8)
         yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}

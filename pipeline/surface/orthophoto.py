@@ -12,11 +12,11 @@ from jaxtyping import Bool, Int16, Int64, UInt8, UInt16
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.levels import Levels
 from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best, spread
+from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, loader, rated
-from splatpipe.pipeline.surface.sight import Points, contiguous, sight
-from splatpipe.pipeline.surface.sources import DepthMap, Relief, Shelf, seen_by
+from splatpipe.pipeline.surface.point_visibility import Points, contiguous, sight
+from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PosedDepthMap, photos_seeing
 from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells a side
@@ -45,7 +45,7 @@ class Orthophoto:
 
 
 @dataclass(frozen=True, eq=False)
-class Album:
+class OrthoInput:
     """All that an orthophoto is made from.
 
     Attributes:
@@ -61,13 +61,13 @@ class Album:
     sources: Sequence[PhotoSource]
     surface: HeightField
     lattice: Lattice
-    relief: Relief
-    levels: Levels
-    pixels: Shelf[UInt8[np.ndarray, "_ _ 3"]]
-    depths: Shelf[DepthMap]
+    relief: HeightRange
+    levels: PhotoGains
+    pixels: LruCache[UInt8[np.ndarray, "_ _ 3"]]
+    depths: LruCache[PosedDepthMap]
 
 
-def orthophotos(album: Album, tiles: Sequence[Tile], threads: int) -> Iterator[Orthophoto]:
+def orthophotos(album: OrthoInput, tiles: Sequence[Tile], threads: int) -> Iterator[Orthophoto]:
     """Tiles of the orthophoto, in their order: the same bits for any number of threads, and however cells are tiled.
 
     Args:
@@ -81,7 +81,7 @@ def orthophotos(album: Album, tiles: Sequence[Tile], threads: int) -> Iterator[O
     return ordered_map(partial(tile_orthophoto, album), tiles, threads)
 
 
-def tile_orthophoto(album: Album, tile: Tile, most: int = MOST_RATED) -> Orthophoto:
+def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MOST_RATED) -> Orthophoto:
     """One tile of the orthophoto.
 
     Args:
@@ -90,7 +90,7 @@ def tile_orthophoto(album: Album, tile: Tile, most: int = MOST_RATED) -> Orthoph
         most: Cells times photos at once; larger ones are made in parts.
     """
     wide = tile.grown(MARGIN + SPREAD)
-    windows = seen_by([source.camera for source in album.sources], album.lattice, wide, album.relief)
+    windows = photos_seeing([source.camera for source in album.sources], album.lattice, wide, album.relief)
     if len(windows) * wide.cells > most and tile.cells > LEAST_CELLS:
         return _joined(tile, [tile_orthophoto(album, half, most) for half in tile.halves()])
     east, north = np.moveaxis(album.lattice.centres(wide), -1, 0)
@@ -112,7 +112,7 @@ def tile_orthophoto(album: Album, tile: Tile, most: int = MOST_RATED) -> Orthoph
 
 
 def _rated(
-    album: Album, numbers: Sequence[int], points: Points
+    album: OrthoInput, numbers: Sequence[int], points: Points
 ) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, "n h w"], UInt16[np.ndarray, "n h w"]]:
     """Numbers of the photos that see any of the points, where they see them, and what it costs to be coloured by them.
 

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float64, UInt8, UInt16
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
-from splatpipe.pipeline.surface.sight import Points, contiguous
+from splatpipe.pipeline.surface.point_visibility import Points, contiguous
 from splatpipe.pipeline.surface.sources import DepthSource
 
 
 @dataclass(frozen=True, eq=False)
-class Lens:
+class DistortionGrid:
     """The way from a pinhole's pixels to those of the photo that it stands for.
 
     Distortion is smooth: it is sampled every few pixels, and straight between (within 0.001 px for lenses that drones
@@ -51,7 +51,7 @@ class PhotoSource:
     camera: Camera
     load: Callable[[], UInt8[np.ndarray, "h w 3"]]
     depths: DepthSource | None
-    lens: Lens | None = None
+    lens: DistortionGrid | None = None
 
     @property
     def size(self) -> tuple[int, int]:

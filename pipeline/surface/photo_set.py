@@ -10,10 +10,10 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.levels import Levels
+from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.sight import Place, Sight, place_in, sight
-from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief, Shelf, window_of
+from splatpipe.pipeline.surface.point_visibility import PhotoCoordinates, PointVisibility, place_in, sight
+from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PhotoWindow, PosedDepthMap, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 
 EVERY = 4  # pixels, of which one is looked at where heights are looked for
@@ -33,14 +33,14 @@ class PhotoSet:
     """
 
     sources: Sequence[PhotoSource]
-    levels: Levels
-    depths: Shelf[DepthMap]
+    levels: PhotoGains
+    depths: LruCache[PosedDepthMap]
 
     def with_depths(self) -> list[int]:
         """Numbers of the photos that have depths: the others say nothing of the surface."""
         return [number for number, source in enumerate(self.sources) if source.depths is not None]
 
-    def depth_map(self, number: int) -> DepthMap:
+    def depth_map(self, number: int) -> PosedDepthMap:
         """A photo's depths, loaded if they are not at hand.
 
         Raises:
@@ -50,7 +50,7 @@ class PhotoSet:
         assert source is not None
         return self.depths.get(number, source.loaded)
 
-    def parts_in(self, lattice: Lattice, tile: Tile, relief: Relief) -> list[DepthPart]:
+    def parts_in(self, lattice: Lattice, tile: Tile, relief: HeightRange) -> list[DepthPart]:
         """The parts of all photos' depths that may lie in a tile, between the heights that there are in it.
 
         Between a whole site's heights, a tile in the hills would be most of each photo.
@@ -65,11 +65,13 @@ class PhotoSet:
                 found.append(_part(number, whole, window))
         return found[::-1]
 
-    def _seeing(self, lattice: Lattice, tile: Tile, relief: Relief) -> list[int]:
+    def _seeing(self, lattice: Lattice, tile: Tile, relief: HeightRange) -> list[int]:
         cameras = [(number, source.depths.camera) for number, source in enumerate(self.sources) if source.depths]
         return [number for number, camera in cameras if window_of(camera, lattice, tile, relief) is not None]
 
-    def _heights_in(self, numbers: Sequence[int], lattice: Lattice, tile: Tile, relief: Relief) -> Relief | None:
+    def _heights_in(
+        self, numbers: Sequence[int], lattice: Lattice, tile: Tile, relief: HeightRange
+    ) -> HeightRange | None:
         """Between which heights two photos at least see something in a tile; None where nothing is."""
         photos = np.zeros(int((relief.high_m - relief.low_m) / LAYER_M) + 1, np.int64)
         for number in numbers:
@@ -83,10 +85,10 @@ class PhotoSet:
         if not layers.size:
             return None
         low, high = (relief.low_m + LAYER_M * float(edge) for edge in (layers[0] - 1, layers[-1] + 2))
-        return Relief(max(low, relief.low_m), min(high, relief.high_m))
+        return HeightRange(max(low, relief.low_m), min(high, relief.high_m))
 
 
-def _some_places(found: DepthMap, window: PhotoWindow) -> Float64[np.ndarray, "3 n"]:
+def _some_places(found: PosedDepthMap, window: PhotoWindow) -> Float64[np.ndarray, "3 n"]:
     """East, north, up of some of the depths in a window, evenly."""
     row, column = (
         grid.ravel() for grid in np.mgrid[window.top : window.bottom : EVERY, window.left : window.right : EVERY]
@@ -133,14 +135,14 @@ class DepthPart:
     confidence: UInt8[np.ndarray, "h w"]
 
 
-def _part(number: int, found: DepthMap, window: PhotoWindow) -> DepthPart:
+def _part(number: int, found: PosedDepthMap, window: PhotoWindow) -> DepthPart:
     cut = np.s_[window.top : window.bottom, window.left : window.right]
     camera = found.camera.cut(window.left, window.top, window.right - window.left, window.bottom - window.top)
     return DepthPart(number, camera, found.depth[cut].copy(), found.confidence[cut].copy())
 
 
 @dataclass(frozen=True, eq=False)
-class Facing:
+class SurfacePieces:
     """Small pieces of a surface.
 
     Attributes:
@@ -151,13 +153,13 @@ class Facing:
     xyz: Float64[np.ndarray, "3 n"]
     normal: Float64[np.ndarray, "3 n"]
 
-    def select(self, rows: np.ndarray | slice) -> Facing:
+    def select(self, rows: np.ndarray | slice) -> SurfacePieces:
         """Those of them."""
-        return Facing(self.xyz[:, rows], self.normal[:, rows])
+        return SurfacePieces(self.xyz[:, rows], self.normal[:, rows])
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class SurfaceView:
     """How a camera looks at pieces of a surface.
 
     Attributes:
@@ -166,17 +168,17 @@ class Look:
         footprint: How long a pixel is on the surface, metres; infinite where it sees them from behind or not at all.
     """
 
-    pieces: Facing
-    place: Place
+    pieces: SurfacePieces
+    place: PhotoCoordinates
     footprint: Float64[np.ndarray, " n"]
 
-    def sight(self, found: DepthMap, rows: np.ndarray | slice) -> Sight:
+    def sight(self, found: PosedDepthMap, rows: np.ndarray | slice) -> PointVisibility:
         """What the photo's depths, in whose grid the look is, say of some of the pieces."""
         east, north, up = self.pieces.xyz[:, rows]
         return sight(found, (east, north, up), 0.0, np.ascontiguousarray(self.place.sine[rows]))
 
 
-def look_at(camera: Camera, pieces: Facing) -> Look:
+def look_at(camera: Camera, pieces: SurfacePieces) -> SurfaceView:
     """Where pieces of a surface lie in a camera's picture, and how finely it sees them, each by itself."""
     place = place_in(camera, *pieces.xyz)
     towards = camera.centre()[:, None] - pieces.xyz
@@ -184,7 +186,7 @@ def look_at(camera: Camera, pieces: Facing) -> Look:
     cosine = dot(towards, pieces.normal) / np.maximum(away, 1e-9)
     seen = place.inside & (cosine > 0.0)
     pixel = place.depth / max(camera.fx, camera.fy) / np.maximum(cosine, LEAST_COSINE)
-    return Look(pieces, replace(place, sine=cosine), np.where(seen, pixel, np.inf))
+    return SurfaceView(pieces, replace(place, sine=cosine), np.where(seen, pixel, np.inf))
 
 
 def dot(a: Float64[np.ndarray, "3 n"], b: Float64[np.ndarray, "3 n"]) -> Float64[np.ndarray, " n"]:

@@ -43,7 +43,7 @@ def pixels_on_disk(sources: Sequence[PhotoSource], folder: Path, held_bytes: int
         return
     with tempfile.TemporaryFile(dir=folder, prefix="pixels-", buffering=0) as file:
         yield [
-            replace(source, load=_Slot(source, file.fileno(), start, threading.Lock()).load)
+            replace(source, load=_PhotoSlot(source, file.fileno(), start, threading.Lock()).load)
             for source, start in zip(sources, starts, strict=False)
         ]
 
@@ -55,7 +55,7 @@ def _pages(source: PhotoSource) -> int:
 
 
 @dataclass
-class _Slot:
+class _PhotoSlot:
     """A photo's place in the file.
 
     Attributes:

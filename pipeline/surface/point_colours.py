@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_levels
-from splatpipe.pipeline.surface.levels import Levels
+from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded
-from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet, look_at, place_of
-from splatpipe.pipeline.surface.sight import place_in
-from splatpipe.pipeline.surface.sources import DepthMap, Shelf
+from splatpipe.pipeline.surface.photo_set import PhotoSet, SurfacePieces, look_at, place_of
+from splatpipe.pipeline.surface.point_visibility import place_in
+from splatpipe.pipeline.surface.sources import LruCache, PosedDepthMap
 
 COARSE = 4  # power of the footprint that a photo's weight falls with: one half as fine counts a sixteenth
 MIXED = 0.01  # weight where a nearer surface lies in the next pixel of the depths: its colour may be mixed in
@@ -31,7 +31,7 @@ def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> Ph
         cell_m: How fine they are to colour something.
         threads: Photos at a time.
     """
-    photos = PhotoSet(sources, Levels.plain(len(sources)), Shelf(HELD_BYTES))
+    photos = PhotoSet(sources, PhotoGains.plain(len(sources)), LruCache(HELD_BYTES))
     numbers = photos.with_depths()
     most = -(-COMPARED_AT // max(len(numbers), 1))
     places = [_some_places(photos.depth_map(number), most) for number in numbers]
@@ -39,7 +39,7 @@ def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> Ph
     return replace(photos, levels=exposure_levels(sources, every, 2.0 * cell_m, threads))
 
 
-def _some_places(found: DepthMap, most: int) -> Float64[np.ndarray, "n 3"]:
+def _some_places(found: PosedDepthMap, most: int) -> Float64[np.ndarray, "n 3"]:
     """Some of what a photo shows, evenly."""
     height, width = found.depth.shape
     step = max(1, int((height * width / most) ** 0.5))
@@ -65,7 +65,7 @@ class _Offer:
 
 
 def point_colours(
-    photos: PhotoSet, pieces: Facing, cell_m: float, threads: int
+    photos: PhotoSet, pieces: SurfacePieces, cell_m: float, threads: int
 ) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """The mean colour of points in the photos that see them, and which are seen at all; black where not.
 
@@ -88,7 +88,7 @@ def point_colours(
     return np.clip(np.round(mean), 0, 255).astype(np.uint8), known
 
 
-def _offer(photos: PhotoSet, pieces: Facing, cell_m: float, number: int) -> _Offer:
+def _offer(photos: PhotoSet, pieces: SurfacePieces, cell_m: float, number: int) -> _Offer:
     seen = [
         (start + rows, weight)
         for start in range(0, pieces.xyz.shape[1], BATCH)
@@ -106,7 +106,7 @@ def _offer(photos: PhotoSet, pieces: Facing, cell_m: float, number: int) -> _Off
 
 
 def _seen(
-    photos: PhotoSet, number: int, pieces: Facing, cell_m: float
+    photos: PhotoSet, number: int, pieces: SurfacePieces, cell_m: float
 ) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
     """Rows of the points that a photo sees, and how much its colours count."""
     camera = photos.sources[number].camera

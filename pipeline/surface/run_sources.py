@@ -18,14 +18,14 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.mvs.depth_maps import KeptMap, kept_depth_maps
+from splatpipe.pipeline.mvs.depth_maps import DepthMapFile, kept_depth_maps
 from splatpipe.pipeline.mvs.filling import filled
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
-from splatpipe.pipeline.photos.undistortion import Placed, place, read_flown
-from splatpipe.pipeline.surface.photo_samples import Lens, PhotoSource
-from splatpipe.pipeline.surface.site import Site, load_site
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, MetricMap
+from splatpipe.pipeline.photos.undistortion import RegisteredPhoto, place, read_flown
+from splatpipe.pipeline.surface.photo_samples import DistortionGrid, PhotoSource
+from splatpipe.pipeline.surface.site_extent import SiteExtent, load_site
+from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, PosedDepthMap
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 
 LENS_STEP = 8.0  # pixels
@@ -79,7 +79,7 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
     return RunSurface(frame, read_world_area(boundary), boundary, tuple(depths.values()), tuple(photos), finer)
 
 
-def open_surveyed(wanted: bool, inputs: Inputs, report: Reporter) -> tuple[RunSurface, Site, float] | None:
+def open_surveyed(wanted: bool, inputs: Inputs, report: Reporter) -> tuple[RunSurface, SiteExtent, float] | None:
     """The same, with the site that `dsm` left and the side of its cells.
 
     None, which is told, where there is no surface model or nothing is wanted.
@@ -100,12 +100,14 @@ def open_surveyed(wanted: bool, inputs: Inputs, report: Reporter) -> tuple[RunSu
     return surface, *surveyed
 
 
-def metric_depths(maps: Sequence[KeptMap], local_from_model: Similarity) -> list[DepthSource]:
+def metric_depths(maps: Sequence[DepthMapFile], local_from_model: Similarity) -> list[DepthSource]:
     """Depth maps of the model's frame in local metres."""
     return [_in_metres(kept, None, local_from_model) for kept in maps]
 
 
-def _of_both(found: Sequence[KeptMap], rendered: Sequence[KeptMap]) -> dict[str, tuple[KeptMap, KeptMap | None]]:
+def _of_both(
+    found: Sequence[DepthMapFile], rendered: Sequence[DepthMapFile]
+) -> dict[str, tuple[DepthMapFile, DepthMapFile | None]]:
     """Each photo's depths by its name, and what fills their holes."""
     others = {kept.camera.name: kept for kept in rendered}
     if not found:
@@ -113,10 +115,10 @@ def _of_both(found: Sequence[KeptMap], rendered: Sequence[KeptMap]) -> dict[str,
     return {kept.camera.name: (kept, others.get(kept.camera.name)) for kept in found}
 
 
-def _in_metres(kept: KeptMap, filling: KeptMap | None, local_from_model: Similarity) -> DepthSource:
+def _in_metres(kept: DepthMapFile, filling: DepthMapFile | None, local_from_model: Similarity) -> DepthSource:
     camera = replace(kept.camera, cam_from_world=local_from_model.camera_pose(kept.camera.cam_from_world))
 
-    def load() -> DepthMap:
+    def load() -> PosedDepthMap:
         found = kept.load()
         if filling is not None:
             try:
@@ -129,7 +131,7 @@ def _in_metres(kept: KeptMap, filling: KeptMap | None, local_from_model: Similar
 
 
 def photo_sources(
-    placed: Sequence[Placed],
+    placed: Sequence[RegisteredPhoto],
     depths: Mapping[str, DepthSource],
     local_from_model: Similarity,
     folders: tuple[Path, Path],
@@ -142,7 +144,7 @@ def photo_sources(
         local_from_model: The frame's, in metres.
         folders: The part ``ingest.photos``, and the user's photo folder.
     """
-    lenses: dict[int, Lens] = {}
+    lenses: dict[int, DistortionGrid] = {}
     sources = []
     for view in placed:
         number = view.target.camera_id
@@ -160,11 +162,11 @@ def photo_sources(
     return sources
 
 
-def _lens(source: pycolmap.Camera, target: pycolmap.Camera) -> Lens:
+def _lens(source: pycolmap.Camera, target: pycolmap.Camera) -> DistortionGrid:
     columns = np.arange(0.0, target.width + LENS_STEP, LENS_STEP)
     rows = np.arange(0.0, target.height + LENS_STEP, LENS_STEP)
     pinhole: Float64[np.ndarray, "n 2"] = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     focal = [target.focal_length_x, target.focal_length_y]
     rays = (pinhole - [target.principal_point_x, target.principal_point_y]) / focal
     nodes = np.asarray(source.img_from_cam(np.column_stack([rays, np.ones(len(rays))])), np.float64)
-    return Lens(source.width, source.height, LENS_STEP, nodes.reshape(len(rows), len(columns), 2))
+    return DistortionGrid(source.width, source.height, LENS_STEP, nodes.reshape(len(rows), len(columns), 2))

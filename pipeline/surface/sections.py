@@ -18,7 +18,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.ground_scale import ground_metres
 from splatpipe.pipeline.surface.map_crs import MapCrs
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
 from splatpipe.pipeline.surface.surface_file import SurfaceFile
 
 SAMPLES_A_CELL = 2.0  # along the line, so that no cell that it crosses for some length is left out
@@ -107,7 +107,7 @@ def _points(
 
 def _photo_points(ends: Float64[np.ndarray, "2 3"], cell_m: float, source: DepthSource) -> Float64[np.ndarray, "k 2"]:
     """Those of one photo, no two in a cell."""
-    found: DepthMap = source.load()
+    found: PosedDepthMap = source.load()
     camera = found.camera
     way = (ends[1] - ends[0])[:2]
     length = float(np.linalg.norm(way))

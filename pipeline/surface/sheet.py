@@ -17,7 +17,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.grid import Grid
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.sources import DepthMap, DepthSource, MetricMap, Relief
+from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, MetricMap, PosedDepthMap
 from splatpipe.pipeline.surface.tiles import Tile, tiled
 
 SIDE = 2048  # cells of a sheet of the ground: four blocks of the files
@@ -35,7 +35,7 @@ class Sheet:
 
     from_local: Float64[np.ndarray, "4 4"]
     lattice: Lattice
-    relief: Relief
+    relief: HeightRange
 
     def place(self, local: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         """East, north, up (metres) in the sheet's frame."""
@@ -56,7 +56,7 @@ class Sheet:
         """Depths of a photo of the local frame in the sheet's."""
         camera = self.moved(source.camera)
 
-        def load() -> DepthMap:
+        def load() -> PosedDepthMap:
             found = source.load()
             return MetricMap(camera, found.depth, found.confidence)
 
@@ -140,4 +140,4 @@ def _sheet(grid: Grid, part: Tile, low: float, high: float) -> Sheet:
     from_local[:3, :3] = [east, np.cross(up, east), up]
     from_local[:3, 3] = -from_local[:3, :3] @ here
     lattice = Lattice(-part.width / 2.0 * cell_m, part.height / 2.0 * cell_m, cell_m, part.width, part.height)
-    return Sheet(from_local, lattice, Relief((low - middle) * unit_m, (high - middle) * unit_m))
+    return Sheet(from_local, lattice, HeightRange((low - middle) * unit_m, (high - middle) * unit_m))

@@ -22,7 +22,7 @@ REACH_PX = 4  # pixels around a tile in a photo: more than slopes and filters lo
 
 
 @runtime_checkable
-class DepthMap(Protocol):
+class PosedDepthMap(Protocol):
     """Depths of a photo: what `mvs` makes.
 
     Attributes:
@@ -41,7 +41,7 @@ class DepthMap(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MetricMap:
-    """A ``DepthMap`` in local metres, or in those of a sheet that things are drawn on."""
+    """A ``PosedDepthMap`` in local metres, or in those of a sheet that things are drawn on."""
 
     camera: Camera
     depth: Float32[np.ndarray, "h w"]
@@ -58,9 +58,9 @@ class DepthSource:
     """
 
     camera: Camera
-    load: Callable[[], DepthMap]
+    load: Callable[[], PosedDepthMap]
 
-    def loaded(self) -> tuple[DepthMap, int]:
+    def loaded(self) -> tuple[PosedDepthMap, int]:
         """The map and its size in memory, as a shelf wants it.
 
         Raises:
@@ -73,7 +73,7 @@ class DepthSource:
         return found, found.depth.nbytes + found.confidence.nbytes
 
 
-class Shelf(Generic[Loaded]):
+class LruCache(Generic[Loaded]):
     """What was loaded last, up to so many bytes; the last one stays, however large it is.
 
     Args:
@@ -108,7 +108,7 @@ class Shelf(Generic[Loaded]):
 
 
 @dataclass(frozen=True)
-class Relief:
+class HeightRange:
     """Between which heights the ground and all on it lie; what is outside counts as noise.
 
     Attributes:
@@ -141,7 +141,7 @@ class PhotoWindow:
     bottom: int
 
 
-def window_of(camera: Camera, lattice: Lattice, tile: Tile, relief: Relief) -> PhotoWindow | None:
+def window_of(camera: Camera, lattice: Lattice, tile: Tile, relief: HeightRange) -> PhotoWindow | None:
     """Where in a photo the cells of a tile may lie, whatever their heights; None where it cannot see them."""
     corners = _corners(lattice, tile, relief)
     rays = corners @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
@@ -162,7 +162,7 @@ def window_of(camera: Camera, lattice: Lattice, tile: Tile, relief: Relief) -> P
     return PhotoWindow(int(left), int(top), int(right), int(bottom)) if left < right and top < bottom else None
 
 
-def _corners(lattice: Lattice, tile: Tile, relief: Relief) -> Float64[np.ndarray, "8 3"]:
+def _corners(lattice: Lattice, tile: Tile, relief: HeightRange) -> Float64[np.ndarray, "8 3"]:
     """Of the box that the tile's cells lie in, and one more around."""
     columns = tile.column - 1, tile.column + tile.width + 1
     rows = tile.row - 1, tile.row + tile.height + 1
@@ -171,7 +171,9 @@ def _corners(lattice: Lattice, tile: Tile, relief: Relief) -> Float64[np.ndarray
     return np.array([[e, n, up] for up in (relief.low_m, relief.high_m) for n in norths for e in easts])
 
 
-def seen_by(cameras: Sequence[Camera], lattice: Lattice, tile: Tile, relief: Relief) -> list[tuple[int, PhotoWindow]]:
+def photos_seeing(
+    cameras: Sequence[Camera], lattice: Lattice, tile: Tile, relief: HeightRange
+) -> list[tuple[int, PhotoWindow]]:
     """Numbers of the photos that may see a tile, and where in them it lies."""
     windows = ((number, window_of(camera, lattice, tile, relief)) for number, camera in enumerate(cameras))
     return [(number, window) for number, window in windows if window is not None]

@@ -15,10 +15,10 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.surface.blocks import surface_blocks
 from splatpipe.pipeline.surface.mesh_files import write_mesh
-from splatpipe.pipeline.surface.photo_set import Facing, PhotoSet
+from splatpipe.pipeline.surface.photo_set import PhotoSet, SurfacePieces
 from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
 from splatpipe.pipeline.surface.run_sources import RunSurface
-from splatpipe.pipeline.surface.site import Site
+from splatpipe.pipeline.surface.site_extent import SiteExtent
 from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, without_crumbs
 from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
 
@@ -40,7 +40,7 @@ class MeshTask:
     """
 
     surface: RunSurface
-    site: Site
+    site: SiteExtent
     voxel_m: float
     most_triangles: int
     threads: int
@@ -135,7 +135,7 @@ def decimated(mesh: TriangleMesh, most: int) -> TriangleMesh:
 
 def vertex_colours(photos: PhotoSet, mesh: TriangleMesh, threads: int) -> UInt8[np.ndarray, "n 3"]:
     """Colours of a mesh's vertices from the photos; of what none sees, those of the nearest vertex that one does."""
-    pieces = Facing(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.normals().T))
+    pieces = SurfacePieces(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.normals().T))
     spacing_m = float(np.sqrt(mesh.areas().sum() / len(mesh.vertices)))
     colours, known = point_colours(photos, pieces, spacing_m, threads)
     return _spread(mesh, colours, known)

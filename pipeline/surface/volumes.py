@@ -138,7 +138,7 @@ def measure_volume(
     if not sum(_lengths(ring)[-1] for ring in ground.rings()) <= MOST_RIM * RIM_CELLS * surface.cell:
         raise SplatpipeError("The polygon's outline is far too long.", "Check its coordinates and its CRS.")
     plane = _base(ground, base, datum_sigma_m)
-    sums = _Sums.zero()
+    sums = _CutFillSums.zero()
     for part in _windows(ground):
         sums = sums.plus(_part(ground, plane, part))
     whole_m2 = ground.area.size() * ground.plan_m**2
@@ -237,7 +237,7 @@ def _windows(ground: _Ground) -> Iterator[Tile]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sums:
+class _CutFillSums:
     """Sums over cells, of cut and fill each.
 
     Attributes:
@@ -253,21 +253,21 @@ class _Sums:
     lever: Float64[np.ndarray, "2 3"]
 
     @staticmethod
-    def zero() -> _Sums:
-        return _Sums(0.0, np.zeros(2), np.zeros(2), np.zeros((2, 3)))
+    def zero() -> _CutFillSums:
+        return _CutFillSums(0.0, np.zeros(2), np.zeros(2), np.zeros((2, 3)))
 
-    def plus(self, other: _Sums) -> _Sums:
-        return _Sums(
+    def plus(self, other: _CutFillSums) -> _CutFillSums:
+        return _CutFillSums(
             self.known_m2 + other.known_m2, self.m3 + other.m3, self.noise + other.noise, self.lever + other.lever
         )
 
 
-def _part(ground: _Ground, base: Base, part: Tile) -> _Sums:
+def _part(ground: _Ground, base: Base, part: Tile) -> _CutFillSums:
     share = _shares(ground, part)
     height = ground.surface.heights(part) * ground.height_m
     known = (share > 0.0) & np.isfinite(height)
     if not known.any():
-        return _Sums.zero()
+        return _CutFillSums.zero()
     places = (ground.surface.lattice.centres(part)[known] - base.middle) * ground.plan_m
     terms = np.column_stack([np.ones(len(places)), places])
     over = height[known] - terms @ base.terms
@@ -275,7 +275,7 @@ def _part(ground: _Ground, base: Base, part: Tile) -> _Sums:
     noise = np.square(cells_m2 * _told(ground.surface.sigmas_m(part)[known], ground.cell_m)) * SHARED_AROUND
     above = over > 0.0
     sides = [cells_m2 * above, cells_m2 * ~above]
-    return _Sums(
+    return _CutFillSums(
         float(cells_m2.sum()),
         np.array([(side * np.abs(over)).sum() for side in sides]),
         np.array([(noise * (side > 0.0)).sum() for side in sides]),
@@ -309,7 +309,7 @@ def _flat(plan: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
     return np.column_stack([plan, np.zeros(len(plan))])
 
 
-def _amount(sums: _Sums, base: Base, side: int) -> Amount:
+def _amount(sums: _CutFillSums, base: Base, side: int) -> Amount:
     return Amount(float(sums.m3[side]), _sigma(float(sums.noise[side]), sums.lever[side], base))
 
 

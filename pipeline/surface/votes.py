@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int32
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sources import DepthMap, PhotoWindow, Relief
+from splatpipe.pipeline.surface.sources import HeightRange, PhotoWindow, PosedDepthMap
 from splatpipe.pipeline.surface.tiles import Tile
 
 HALF = 0.5  # of a cell that its surface covers, where there is another one below: else edges would grow outwards
@@ -52,7 +52,7 @@ class Fit:
     photos: Int32[np.ndarray, " c"]
 
 
-class Votes:
+class HeightVotes:
     """What photos found in a tile's cells; photos are to be added in one order.
 
     Args:
@@ -64,7 +64,7 @@ class Votes:
         ValueError: if the relief is higher than 13 km.
     """
 
-    def __init__(self, lattice: Lattice, tile: Tile, relief: Relief) -> None:
+    def __init__(self, lattice: Lattice, tile: Tile, relief: HeightRange) -> None:
         self._cells = tile.height * tile.width
         self._held = _native.CellVotes(
             (lattice.east_m, lattice.north_m, lattice.cell_m),
@@ -72,7 +72,7 @@ class Votes:
             (relief.low_m, relief.high_m),
         )
 
-    def add(self, found: DepthMap, window: PhotoWindow) -> None:
+    def add(self, found: PosedDepthMap, window: PhotoWindow) -> None:
         """A photo's votes: the same bits in any window, and in any tile.
 
         Args:

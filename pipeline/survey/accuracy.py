@@ -11,14 +11,14 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.local_survey import LocalSurvey
 from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.place import Site
 from splatpipe.pipeline.survey.residuals import accuracy_table
 from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, residual_px
 
 
 @dataclass(frozen=True)
-class Placed:
+class GeoreferencedModel:
     """A model in the world.
 
     Attributes:
@@ -37,7 +37,9 @@ def no_control() -> JSON:
     return {"points": []}
 
 
-def control_json(survey: Survey, site: Site, placed: Placed, photos: Mapping[str, Photo], mark_sigma_px: float) -> JSON:
+def control_json(
+    survey: Survey, site: LocalSurvey, placed: GeoreferencedModel, photos: Mapping[str, Photo], mark_sigma_px: float
+) -> JSON:
     """What ``control.json`` holds: every point of the survey, where it was found, and its marks; local metres.
 
     Residuals are what is estimated less what is surveyed; of pixels, what the model shows less the mark.
@@ -74,7 +76,11 @@ def control_json(survey: Survey, site: Site, placed: Placed, photos: Mapping[str
 
 
 def accuracy_json(
-    survey: Survey | None, site: Site | None, placed: Placed, gsd: float | None, uncertainty: JSON = None
+    survey: Survey | None,
+    site: LocalSurvey | None,
+    placed: GeoreferencedModel,
+    gsd: float | None,
+    uncertainty: JSON = None,
 ) -> JSON:
     """What ``accuracy.json`` holds: the errors of positions, control and check points apart; absent groups are null.
 

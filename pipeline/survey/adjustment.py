@@ -24,7 +24,7 @@ from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity, cross_matrix, fit_similarity
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
 from splatpipe.pipeline.sfm.lens_blocks import hold, keep_shape
-from splatpipe.pipeline.survey.place import Stations
+from splatpipe.pipeline.survey.local_survey import Stations
 
 LEAST_SIGMA_PX = 1.0  # of features: they err together, in one photo, by lens and shutter; control should not
 UNBOUND_M = 1e4  # sigma of a height that nobody measured
@@ -53,7 +53,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class ControlAdjustment:
     """What an adjustment found.
 
     Attributes:
@@ -91,7 +91,7 @@ def adjust(
     stations: tuple[Stations, Float64[np.ndarray, "n 3"], Sequence[int]],
     focal_priors: Mapping[int, float],
     lenses_held: bool = False,
-) -> Adjusted:
+) -> ControlAdjustment:
     """Adjust a model to control.
 
     Args:
@@ -137,7 +137,7 @@ def adjust(
     )
     model.update_point_3d_errors()
     usable = bool(solved.IsSolutionUsable()) and bool(np.isfinite(places).all())
-    return Adjusted(model, places, normed, offsets, sigma, focal_sigmas, tuple(held), usable)
+    return ControlAdjustment(model, places, normed, offsets, sigma, focal_sigmas, tuple(held), usable)
 
 
 def feature_sigma(model: pycolmap.Reconstruction) -> float:

@@ -12,7 +12,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.joint_fit import (
     JointFit,
-    Observed,
+    JointObservations,
     Priors,
     critical,
     find_blunders,
@@ -23,9 +23,9 @@ from splatpipe.pipeline.geometry.joint_fit import (
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic, utm_of
 from splatpipe.pipeline.survey.geodesy import ecef_from_geodetic
+from splatpipe.pipeline.survey.local_survey import LocalSurvey, Stations, locate_survey, observed_in
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.place import Site, Stations, locate_survey, observed_in
 from splatpipe.pipeline.survey.surveyed_points import Survey, SurveyPoint
 
 FAR_M = 2000.0  # from the photos: control that they are to show lies nearer
@@ -69,7 +69,7 @@ def require_near(survey: Survey, config: GeorefConfig, stations: Stations) -> Fl
 
 def name_blunders(
     survey: Survey,
-    site: Site,
+    site: LocalSurvey,
     model: SparseModel,
     start: tuple[Similarity, Priors],
     config: GeorefConfig,
@@ -104,7 +104,7 @@ def name_blunders(
 
 
 @dataclass(frozen=True)
-class _Off:
+class _Offset:
     """How far a point is from where it is surveyed: found less surveyed; NaN in height where that is not known."""
 
     enu: Float64[np.ndarray, " 3"]
@@ -118,19 +118,21 @@ class _Off:
         return ", ".join(part for part, value in zip(parts, self.enu, strict=True) if np.isfinite(value)) + " m"
 
 
-def offset_of(point: SurveyPoint, site: Site, index: int, similarity: Similarity) -> _Off:
+def offset_of(point: SurveyPoint, site: LocalSurvey, index: int, similarity: Similarity) -> _Offset:
     """Where a point is found less where it is surveyed."""
     assert point.found is not None
     off = similarity.apply(point.found.xyz[None])[0] - site.targets.enu[index]
-    return _Off(np.where(np.isfinite(site.targets.sigmas[index]), off, np.nan))
+    return _Offset(np.where(np.isfinite(site.targets.sigmas[index]), off, np.nan))
 
 
-def is_off(fit: JointFit, site: Site, point: SurveyPoint, index: int, least_m: float, config: GeorefConfig) -> bool:
+def is_off(
+    fit: JointFit, site: LocalSurvey, point: SurveyPoint, index: int, least_m: float, config: GeorefConfig
+) -> bool:
     """Whether a point that took no part in a fit contradicts it."""
     if point.found is None or fit.degrees == 0:
         return False
     mark = fit.similarity.scale * config.mark_sigma_px * np.sqrt(np.trace(point.found.covariance) / 3.0)
-    alone = Observed(
+    alone = JointObservations(
         point.found.xyz[None],
         site.targets.enu[index][None],
         np.hypot(site.targets.sigmas[index], mark)[None],
@@ -163,7 +165,7 @@ def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Report
         )
 
 
-def tell_weak(fit: JointFit, observed: Observed, model: SparseModel, report: Reporter) -> None:
+def tell_weak(fit: JointFit, observed: JointObservations, model: SparseModel, report: Reporter) -> None:
     """Warn of control that hardly tells where the model is away from it: few points, in one corner or on a line."""
     control = observed.sigmas[observed.is_control]
     if len(model.points) == 0 or len(control) == 0:
@@ -194,7 +196,7 @@ def gsd_m(survey: Survey, model: SparseModel, scale: float) -> float:
     return float(np.median(sizes)) if sizes else 0.0
 
 
-def _told_off(point: SurveyPoint, off: _Off, report: Reporter) -> SurveyPoint:
+def _told_off(point: SurveyPoint, off: _Offset, report: Reporter) -> SurveyPoint:
     if point.role == "check":
         report.warning(
             f"Check point {point.name} lies {off.length:.2f} m from where it is surveyed ({off}).",
@@ -209,7 +211,9 @@ def _told_off(point: SurveyPoint, off: _Off, report: Reporter) -> SurveyPoint:
     return point.left_out(f"it is {off.length:.2f} m off where the others and the photos have it")
 
 
-def _swapped(suspects: Sequence[int], survey: Survey, site: Site, similarity: Similarity) -> list[tuple[int, int]]:
+def _swapped(
+    suspects: Sequence[int], survey: Survey, site: LocalSurvey, similarity: Similarity
+) -> list[tuple[int, int]]:
     """Pairs of which each lies where the other is surveyed."""
     pairs: list[tuple[int, int]] = []
     taken: set[int] = set()
@@ -224,7 +228,7 @@ def _swapped(suspects: Sequence[int], survey: Survey, site: Site, similarity: Si
     return pairs
 
 
-def _gap(survey: Survey, site: Site, similarity: Similarity, found: int, surveyed: int) -> float:
+def _gap(survey: Survey, site: LocalSurvey, similarity: Similarity, found: int, surveyed: int) -> float:
     """How far the place of one point is from where another is surveyed."""
     place = survey.points[found].found
     assert place is not None

@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring
-from splatpipe.pipeline.survey.boundary_file import WGS84, Drawing, read_boundary
+from splatpipe.pipeline.survey.boundary_file import WGS84, BoundaryFile, read_boundary
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
 from splatpipe.pipeline.survey.frames import Frame
 
@@ -74,7 +74,7 @@ def lay_boundary(
     return {"boundary_m2": round(boundary.area.size(), 2), "boundary_points": round(boundary.share, 4)}
 
 
-def placed(drawing: Drawing, frame: Frame, points: Float64[np.ndarray, "n 3"]) -> Boundary:
+def placed(drawing: BoundaryFile, frame: Frame, points: Float64[np.ndarray, "n 3"]) -> Boundary:
     """Bring a boundary into the world frame.
 
     Args:
@@ -93,7 +93,7 @@ def placed(drawing: Drawing, frame: Frame, points: Float64[np.ndarray, "n 3"]) -
     return Boundary(area, degrees, float(inside.mean()))
 
 
-def placed_area(drawing: Drawing, frame: Frame) -> PlanArea:
+def placed_area(drawing: BoundaryFile, frame: Frame) -> PlanArea:
     """The polygons in the world frame, wherever they lie.
 
     Raises:
@@ -102,7 +102,7 @@ def placed_area(drawing: Drawing, frame: Frame) -> PlanArea:
     return _in_world(drawing, _crs_of(drawing, frame), frame, swapped=False)[0]
 
 
-def _crs_of(drawing: Drawing, frame: Frame) -> str:
+def _crs_of(drawing: BoundaryFile, frame: Frame) -> str:
     """What a file names, or WGS 84 by RFC 7946, or the run's CRS where the numbers are no degrees."""
     if frame.origin is None:
         raise SplatpipeError(
@@ -122,7 +122,9 @@ def _crs_of(drawing: Drawing, frame: Frame) -> str:
     )
 
 
-def _in_world(drawing: Drawing, crs: str, frame: Frame, swapped: bool) -> tuple[PlanArea, tuple[tuple[Ring, ...], ...]]:
+def _in_world(
+    drawing: BoundaryFile, crs: str, frame: Frame, swapped: bool
+) -> tuple[PlanArea, tuple[tuple[Ring, ...], ...]]:
     """The polygons in east and north, metres, and in longitude and latitude; coordinates ``swapped`` on the way."""
     assert frame.origin is not None
     every = np.concatenate([ring for polygon in drawing.polygons for ring in polygon])
@@ -141,7 +143,7 @@ def _in_world(drawing: Drawing, crs: str, frame: Frame, swapped: bool) -> tuple[
 
 
 def _elsewhere(
-    drawing: Drawing, crs: str, frame: Frame, points: Float64[np.ndarray, "n 3"], area: PlanArea
+    drawing: BoundaryFile, crs: str, frame: Frame, points: Float64[np.ndarray, "n 3"], area: PlanArea
 ) -> SplatpipeError:
     """Where a boundary lies that holds nothing of the model, and why that may be."""
     vertices = np.concatenate([ring for polygon in area.polygons for ring in polygon])
@@ -162,7 +164,7 @@ def _elsewhere(
     )
 
 
-def _tell(drawing: Drawing, boundary: Boundary, points: int, report: Reporter) -> None:
+def _tell(drawing: BoundaryFile, boundary: Boundary, points: int, report: Reporter) -> None:
     if drawing.crossing:
         x, y = drawing.crossing
         report.warning(

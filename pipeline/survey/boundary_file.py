@@ -39,7 +39,7 @@ _CRS84 = re.compile(
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
+class BoundaryFile:
     """What a boundary file holds.
 
     Attributes:
@@ -59,7 +59,7 @@ class Drawing:
     crossing: tuple[float, ...]
 
 
-def read_boundary(path: Path) -> Drawing:
+def read_boundary(path: Path) -> BoundaryFile:
     """Read a boundary.
 
     Args:
@@ -79,7 +79,7 @@ def read_boundary(path: Path) -> Drawing:
     polygons, names = tuple(polygon for polygon, _ in named), tuple(name for _, name in named)
     crossing = next((place for polygon in polygons for ring in polygon if (place := crossing_of(ring))), ())
     others = sum(geometry["type"] not in ("Polygon", "MultiPolygon") for geometry, _ in geometries)
-    return Drawing(path.name, polygons, names, _crs(value, path.name), others, crossing)
+    return BoundaryFile(path.name, polygons, names, _crs(value, path.name), others, crossing)
 
 
 class _BrokenError(ValueError):

@@ -24,7 +24,7 @@ WRONG = 3.0  # times the tolerance: a place that is known by its number is anoth
 
 
 @dataclass(frozen=True)
-class Overlay:
+class ConstellationMatch:
     """How places lie over points.
 
     Attributes:
@@ -42,7 +42,7 @@ class Overlay:
 
 def overlay(
     places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], known: Mapping[int, int]
-) -> Overlay | None:
+) -> ConstellationMatch | None:
     """Find which places are which points.
 
     Args:
@@ -71,7 +71,7 @@ def overlay(
         residuals = _distances(current.apply(places)[pairs[:, 0]], points[pairs[:, 1]])
         tolerance = min(TOLERANCE_M, max(LEAST_TOLERANCE_M, RESIDUALS * float(np.median(residuals))))
     pairs, residuals = _assigned(current.apply(places), points, tolerance)
-    return Overlay(pairs, residuals, tolerance, current) if len(pairs) >= LEAST_MATCHES else None
+    return ConstellationMatch(pairs, residuals, tolerance, current) if len(pairs) >= LEAST_MATCHES else None
 
 
 def _agreed(

@@ -13,17 +13,15 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.joint_fit import SIMILARITY, JointFit, fit_jointly
 from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.accuracy import Placed
-from splatpipe.pipeline.survey.adjustment import Adjusted, Target, adjust, can_adjust, moved_px
+from splatpipe.pipeline.survey.accuracy import GeoreferencedModel
+from splatpipe.pipeline.survey.adjustment import ControlAdjustment, Target, adjust, can_adjust, moved_px
 from splatpipe.pipeline.survey.blunders import name_blunders, require_near, tell_datum, tell_weak
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import SparseModel, model_of
-from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.place import (
+from splatpipe.pipeline.survey.local_survey import (
     MIN_CONTROL,
-    Site,
+    LocalSurvey,
     make_site,
     observed_in,
     require_fit,
@@ -31,6 +29,8 @@ from splatpipe.pipeline.survey.place import (
     stations_of,
     with_sigmas_times,
 )
+from splatpipe.pipeline.survey.model import SparseModel, model_of
+from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.surveyed_points import Survey, locate
 
 BENT_PX = 0.5  # what control has to move the photos' content by, root mean square, for the model to be worth bending
@@ -44,7 +44,7 @@ ROUNDS = 4  # of adjustment, each with the control that the one before showed to
 
 
 @dataclass(frozen=True)
-class Capture:
+class GeorefInput:
     """What georeferencing starts from.
 
     Attributes:
@@ -63,7 +63,7 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class ByControl:
+class ControlResult:
     """What control gives.
 
     Attributes:
@@ -79,8 +79,8 @@ class ByControl:
 
     frame: Frame
     survey: Survey
-    site: Site
-    placed: Placed
+    site: LocalSurvey
+    placed: GeoreferencedModel
     bent: pycolmap.Reconstruction | None
     moved_px: float | None
     sigma_factor: float
@@ -88,8 +88,8 @@ class ByControl:
 
 
 def place_by_control(
-    survey: Survey, capture: Capture, frame: Frame | None, config: GeorefConfig, report: Reporter
-) -> ByControl:
+    survey: Survey, capture: GeorefInput, frame: Frame | None, config: GeorefConfig, report: Reporter
+) -> ControlResult:
     """Georeference a model by its survey.
 
     Args:
@@ -114,8 +114,8 @@ def place_by_control(
     factor = fit.noise if fit.noise > QUIET else 1.0
     tell_datum(fit, survey, stations, report)
     tell_weak(fit, observed, model, report)
-    placed = Placed(model, fit.similarity, fit.offsets)
-    result = ByControl(_frame(frame, survey, site, fit, config), survey, site, placed, None, None, factor)
+    placed = GeoreferencedModel(model, fit.similarity, fit.offsets)
+    result = ControlResult(_frame(frame, survey, site, fit, config), survey, site, placed, None, None, factor)
     if config.adjust == "auto" and int(observed.is_control.sum()) >= MIN_CONTROL:
         if can_adjust(model.reconstruction):
             result = _adjusted(result, capture, config, report)
@@ -125,12 +125,12 @@ def place_by_control(
         observed = observed_in(site, result.survey, model, start[0].scale, config.mark_sigma_px)
         observed = with_sigmas_times(observed, result.sigma_factor)
         fit = fit_jointly(fit.similarity, observed, start[1])
-        placed = Placed(model, fit.similarity, fit.offsets)
+        placed = GeoreferencedModel(model, fit.similarity, fit.offsets)
         result = replace(result, placed=placed, frame=_frame(frame, result.survey, site, fit, config))
     return result
 
 
-def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, config: GeorefConfig) -> Frame:
+def _frame(frame: Frame | None, survey: Survey, site: LocalSurvey, fit: JointFit, config: GeorefConfig) -> Frame:
     control = survey.of_role("control")
     heights = any(point.surveyed.z is not None for point in control)
     vertical = survey.crs.vertical if heights else UNKNOWN if frame is None else frame.vertical_datum
@@ -148,16 +148,16 @@ def _frame(frame: Frame | None, survey: Survey, site: Site, fit: JointFit, confi
 
 
 @dataclass(frozen=True)
-class _Settled:
+class _TrustedAdjustment:
     """An adjustment with the control that it believes."""
 
     survey: Survey
-    done: Adjusted
+    done: ControlAdjustment
     factor: float
     noise: float
 
 
-def _settle(result: ByControl, capture: Capture, config: GeorefConfig, report: Reporter) -> _Settled:
+def _settle(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> _TrustedAdjustment:
     """Adjust until the control agrees: without a point that alone is off, else with larger sigmas."""
     best = _try(result.survey, 1.0, result, capture, config)
     for _ in range(ROUNDS):
@@ -177,16 +177,18 @@ def _settle(result: ByControl, capture: Capture, config: GeorefConfig, report: R
     return best
 
 
-def _try(survey: Survey, factor: float, result: ByControl, capture: Capture, config: GeorefConfig) -> _Settled:
+def _try(
+    survey: Survey, factor: float, result: ControlResult, capture: GeorefInput, config: GeorefConfig
+) -> _TrustedAdjustment:
     chosen = _chosen(survey)
     done = _adjust(survey, chosen, factor, result, capture, config)
     coordinates = np.array([3 if survey.points[k].surveyed.z is not None else 2 for k in chosen], dtype=np.int64)
-    return _Settled(survey, done, factor, _noise(done.normed, coordinates))
+    return _TrustedAdjustment(survey, done, factor, _noise(done.normed, coordinates))
 
 
 def _without_one(
-    settled: _Settled, result: ByControl, capture: Capture, config: GeorefConfig
-) -> tuple[int, float, _Settled] | None:
+    settled: _TrustedAdjustment, result: ControlResult, capture: GeorefInput, config: GeorefConfig
+) -> tuple[int, float, _TrustedAdjustment] | None:
     """The point without which the others agree, how far it is off then, and the adjustment; None if there is none."""
     chosen = _chosen(settled.survey)
     if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > CROWD:
@@ -206,7 +208,7 @@ def _without_one(
     return None
 
 
-def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report: Reporter) -> ByControl:
+def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> ControlResult:
     """The result with the model that an adjustment bends, where that moves what the photos show."""
     settled = _settle(result, capture, config, report)
     survey, done, factor = settled.survey, settled.done, settled.factor
@@ -238,11 +240,11 @@ def _adjusted(result: ByControl, capture: Capture, config: GeorefConfig, report:
         locate(point, model, capture.photos, config.mark_sigma_px) if point.found is not None else point
         for point in survey.points
     ]
-    placed = Placed(model, world_from_model, done.offsets)
+    placed = GeoreferencedModel(model, world_from_model, done.offsets)
     return replace(result, survey=survey.with_points(points), placed=placed, bent=bent)
 
 
-def _tell_lens(done: Adjusted, capture: Capture, report: Reporter) -> None:
+def _tell_lens(done: ControlAdjustment, capture: GeorefInput, report: Reporter) -> None:
     """Warn of focal lengths that nothing tells, and of those that control takes far from what the metadata say."""
     for number, camera in sorted(done.reconstruction.cameras.items()):
         prior = capture.focal_priors.get(number)
@@ -270,8 +272,13 @@ def _chosen(survey: Survey) -> list[int]:
 
 
 def _adjust(
-    survey: Survey, chosen: Sequence[int], factor: float, result: ByControl, capture: Capture, config: GeorefConfig
-) -> Adjusted:
+    survey: Survey,
+    chosen: Sequence[int],
+    factor: float,
+    result: ControlResult,
+    capture: GeorefInput,
+    config: GeorefConfig,
+) -> ControlAdjustment:
     model, site = capture.model, result.site
     targets = []
     for k in chosen:

@@ -22,9 +22,9 @@ from splatpipe.pipeline.survey.survey_text import (
     delimiter_of,
     find_columns,
     is_number,
+    line_errors,
     number_in,
     read_lines,
-    told_by_line,
     written_lines,
 )
 
@@ -161,7 +161,7 @@ def read_control_file(path: Path) -> ControlFile:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
     table = read_table(path)
-    with told_by_line(path, _KIND):
+    with line_errors(path, _KIND):
         return _assemble(table)
 
 
@@ -172,7 +172,7 @@ def read_points_file(path: Path) -> ControlFile:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
     table = read_table(path, _NEEDED_OF_POINTS)
-    with told_by_line(path, _POINTS):
+    with line_errors(path, _POINTS):
         return _assemble(table)
 
 
@@ -198,7 +198,7 @@ def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[s
     kind = _KIND if needed == _NEEDED else _POINTS
     written = written_lines(lines, path, kind)
     header = next((i for i, (_, line) in enumerate(written[:2]) if _is_header(line, needed)), None)
-    with told_by_line(path, kind):
+    with line_errors(path, kind):
         if header is None:
             crs, rows = _odm_rows(written)
         else:

@@ -42,7 +42,7 @@ __all__ = [
     "ELLIPSOIDAL",
     "UNKNOWN",
     "Crs",
-    "Located",
+    "GeodeticPoints",
     "Operation",
     "describe_vertical",
     "from_geodetic",
@@ -88,7 +88,7 @@ class Operation:
 
 
 @dataclass(frozen=True)
-class Located:
+class GeodeticPoints:
     """Points by latitude and longitude.
 
     Attributes:
@@ -129,7 +129,7 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
     return Operation(name, accuracy, best.definition, bool(group.best_available), note, best)
 
 
-def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool = False) -> Located:
+def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool = False) -> GeodeticPoints:
     """Latitude, longitude and height of points that are stated in a CRS.
 
     Args:
@@ -147,7 +147,7 @@ def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool 
     for point, place in zip(points, located, strict=True):
         if not np.isfinite(place[:2]).all():
             raise _not_there(crs, point)
-    return Located(located, operation)
+    return GeodeticPoints(located, operation)
 
 
 def geodetic_by(operation: Operation, crs: Crs, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from splatpipe.pipeline.survey.swapped_positions import Flight
+from splatpipe.pipeline.survey.swapped_positions import PositionEvidence
 
 LEAST_PHOTOS = 6
 LONG_STEP, LONG_PAUSE = 2.2, 2.5  # times the usual ones: two photos and more are missing
@@ -45,7 +45,7 @@ class MissingStrip:
     numbers: bool
 
 
-def find_missing(names: Sequence[str], flight: Flight) -> list[MissingStrip]:
+def find_missing(names: Sequence[str], flight: PositionEvidence) -> list[MissingStrip]:
     """Gaps along the way.
 
     Args:
@@ -99,7 +99,7 @@ def _as_fast(speed: float, usual: float, pauses: float) -> bool:
     return bool(SPEEDS[0] * usual < speed < SPEEDS[1] * usual and pauses > LONG_PAUSE)
 
 
-def _by_numbers(names: Sequence[str], numbers: Sequence[int] | None, flight: Flight) -> list[MissingStrip]:
+def _by_numbers(names: Sequence[str], numbers: Sequence[int] | None, flight: PositionEvidence) -> list[MissingStrip]:
     """Without positions: numbers that are left out, where the photos on both sides hardly match."""
     if numbers is None or len(names) < LEAST_PHOTOS:
         return []

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
-from splatpipe.pipeline.geometry.alignment import Correspondences, Shared, SimilarityFit, offset_step_sigmas
+from splatpipe.pipeline.geometry.alignment import Correspondences, SharedErrors, SimilarityFit, offset_step_sigmas
 from splatpipe.pipeline.survey.crs_names import UNKNOWN
 
 LEAST_PHOTOS = 3  # of a flight with an offset of its own; fewer say nothing about it
@@ -20,7 +20,7 @@ APART_SIGMAS = 3.0  # flights that differ by more do not differ by their receive
 UNBOUND_M = 1e4  # a standard deviation that binds nothing
 
 
-def shared_errors(records: Sequence[Mapping[str, Any]], sigmas: Float64[np.ndarray, "n 3"]) -> Shared | None:
+def shared_errors(records: Sequence[Mapping[str, Any]], sigmas: Float64[np.ndarray, "n 3"]) -> SharedErrors | None:
     """The flights of some positions, each with an offset of its own; None where there is one flight.
 
     Args:
@@ -39,7 +39,7 @@ def shared_errors(records: Sequence[Mapping[str, Any]], sigmas: Float64[np.ndarr
     group = np.full(len(records), -1, dtype=np.int64)
     for index, number in enumerate(large):
         group[flights == number] = index
-    return Shared(group, np.stack([np.median(sigmas[group == index], axis=0) for index in range(len(large))]))
+    return SharedErrors(group, np.stack([np.median(sigmas[group == index], axis=0) for index in range(len(large))]))
 
 
 def reference_flight(points: Correspondences) -> int:

@@ -66,7 +66,7 @@ def georeference(frame: Frame, box: Float64[np.ndarray, "2 3"]) -> dict[str, Any
     }
 
 
-def told_in_a_line(georeferenced: Mapping[str, Any]) -> str:
+def accuracy_line(georeferenced: Mapping[str, Any]) -> str:
     """In what CRS and by which operation, a sentence or two, of a `georef.json` that has an origin."""
     crs, operation = georeferenced["crs"], georeferenced["crs"]["operation"]
     accuracy = "of unknown accuracy" if operation["accuracy_m"] is None else f"good to {operation['accuracy_m']:g} m"

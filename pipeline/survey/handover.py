@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Place, SceneFacts
+from splatpipe.pipeline.splat.scene import SceneFacts, SplatOrigin
 from splatpipe.pipeline.survey.crs import utm_of
 from splatpipe.pipeline.survey.frames import Frame, Origin, Similarity
 from splatpipe.pipeline.survey.georeference import georeference
@@ -53,11 +53,11 @@ def facts_of(frame: Frame, antialias: bool) -> SceneFacts:
     if origin is not None:
         crs = frame.crs or utm_of(origin.latitude, origin.longitude).text
         where = (origin.latitude, origin.longitude, origin.height_m)
-        place = Place(*where, frame.vertical_datum, crs, frame.approximate_crs)
+        place = SplatOrigin(*where, frame.vertical_datum, crs, frame.approximate_crs)
     return SceneFacts("z up", antialias, frame.in_metres, place)
 
 
-def frame_of(place: Place) -> Frame:
+def frame_of(place: SplatOrigin) -> Frame:
     """The frame of a splat that lies there, turned to z up, as ``open_world`` takes it."""
     origin = Origin(place.latitude, place.longitude, place.height_m)
     return Frame(

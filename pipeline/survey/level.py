@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.geometry.alignment import DirectionPrior
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.geometry.upright import (
-    Upright,
+    UpEstimate,
     camera_axes,
     display_from_stored,
     enu_from_gimbal,
@@ -81,6 +81,6 @@ def gimbal_rotation(model: SparseModel, positions: Positions) -> Float64[np.ndar
     return rotation if spread <= GIMBAL_SPREAD_RAD else None
 
 
-def upright_cameras(model: SparseModel, positions: Positions) -> Upright:
+def upright_cameras(model: SparseModel, positions: Positions) -> UpEstimate:
     orientations = np.array([positions.orientations.get(name, 1) for name in model.names], dtype=np.int64)
     return up_from_cameras(camera_axes(model.cam_from_model, orientations), model.centres, model.points)

@@ -21,7 +21,7 @@ RAY_STEP = 1e-5  # of x/z: a hundredth of a pixel, for differences
 
 
 @dataclass(frozen=True)
-class View:
+class ModelView:
     """A photo in the model.
 
     Attributes:
@@ -75,7 +75,7 @@ class SparseModel:
     image_ids: tuple[int, ...]
     reconstruction: pycolmap.Reconstruction
 
-    def view(self, index: int, width: int) -> View:
+    def view(self, index: int, width: int) -> ModelView:
         """A photo's camera.
 
         Args:
@@ -84,7 +84,7 @@ class SparseModel:
         """
         image = self.reconstruction.images[self.image_ids[index]]
         camera = self.reconstruction.cameras[image.camera_id]
-        return View(camera, np.asarray(image.cam_from_world().matrix(), np.float64), camera.width / width)
+        return ModelView(camera, np.asarray(image.cam_from_world().matrix(), np.float64), camera.width / width)
 
     def gsd(self, scale: float) -> float | None:
         """Ground sampling distance in a world that is so many times larger: the median of the photos' medians."""

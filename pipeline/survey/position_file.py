@@ -22,9 +22,9 @@ from splatpipe.pipeline.survey.survey_text import (
     delimiter_of,
     find_columns,
     is_number,
+    line_errors,
     number_in,
     read_lines,
-    told_by_line,
     written_lines,
 )
 
@@ -101,7 +101,7 @@ def read_position_file(path: Path) -> PositionFile:
     lines = read_lines(path, KIND)
     written = written_lines(lines, path, KIND)
     header = next((at for at, (_, line) in enumerate(written[:2]) if _header(line)), None)
-    with told_by_line(path, KIND):
+    with line_errors(path, KIND):
         if header is None:
             crs, rows = _odm_rows(written)
         else:

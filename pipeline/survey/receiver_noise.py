@@ -169,7 +169,7 @@ def _told(
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _ResidualRows:
     """The linear problem: a row a coordinate, over its stated sigma; the last column is the residual.
 
     Attributes:
@@ -190,7 +190,7 @@ def _rows(
     before: Int64[np.ndarray, " n"],
     similarity: Similarity,
     offsets: Float64[np.ndarray, "g 3"],
-) -> _Rows:
+) -> _ResidualRows:
     jacobian = similarity_jacobian(similarity, points.source)
     residuals = similarity.apply(points.source) - points.without(offsets).target
     columns = [jacobian]
@@ -201,12 +201,12 @@ def _rows(
     follows = before >= 0
     past = np.where(follows[:, None, None], own[before], 0.0)
     width = own.shape[2]
-    return _Rows(
+    return _ResidualRows(
         own.reshape(-1, width), past.reshape(-1, width), np.repeat(follows, 3), np.tile(GROUP_OF_AXIS, len(points))
     )
 
 
-def _whitened(rows: _Rows, noise: ReceiverNoise) -> Float64[np.ndarray, "m p"]:
+def _whitened(rows: _ResidualRows, noise: ReceiverNoise) -> Float64[np.ndarray, "m p"]:
     """Rows whose errors are independent and of size 1."""
     correlation = np.where(rows.follows, noise.correlations[rows.group], 0.0)
     size = noise.factors[rows.group] * np.sqrt(1.0 - correlation**2)
@@ -261,7 +261,7 @@ class _Group:
         return np.asarray(self.first + carried / (1.0 - by**2))
 
 
-def _grouped(rows: _Rows, group: int) -> _Group:
+def _grouped(rows: _ResidualRows, group: int) -> _Group:
     mine, follows = rows.group == group, rows.follows
     first, own, past = rows.own[mine & ~follows], rows.own[mine & follows], rows.past[mine & follows]
     return _Group(first.T @ first, own.T @ own, own.T @ past, past.T @ past, int(mine.sum()), len(own))
@@ -278,7 +278,7 @@ def _tried(noise: ReceiverNoise, count: int, done: int) -> list[Float64[np.ndarr
 
 
 def _reml(
-    rows: _Rows, held: Float64[np.ndarray, "p p"], noise: ReceiverNoise, tried: list[Float64[np.ndarray, " _"]]
+    rows: _ResidualRows, held: Float64[np.ndarray, "p p"], noise: ReceiverNoise, tried: list[Float64[np.ndarray, " _"]]
 ) -> ReceiverNoise:
     """Restricted maximum likelihood at the residuals as they are, one group after the other."""
     groups = [_grouped(rows, group) for group in range(2)]

@@ -20,9 +20,9 @@ from splatpipe.pipeline.survey.survey_text import (
     TableKind,
     delimiter_of,
     find_columns,
+    line_errors,
     number_in,
     read_lines,
-    told_by_line,
     written_lines,
 )
 
@@ -64,7 +64,7 @@ class ScaleBar:
 
 
 @dataclass(frozen=True)
-class Scale:
+class ModelScale:
     """What bars say of a model's scale.
 
     Attributes:
@@ -87,7 +87,7 @@ def read_scale_bars(path: Path) -> tuple[ScaleBar, ...]:
         SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
     """
     written = written_lines(read_lines(path, _KIND), path, _KIND)
-    with told_by_line(path, _KIND):
+    with line_errors(path, _KIND):
         number, header = written[0]
         delimiter = delimiter_of(header)
         places = find_columns(_cells(number, header, delimiter), COLUMNS)
@@ -126,7 +126,7 @@ def _bar(number: int, cells: Sequence[str], places: Mapping[str, int]) -> ScaleB
     return ScaleBar(row["a"], row["b"], length, sigma)
 
 
-def scale_by(bars: Sequence[ScaleBar], places: Mapping[str, Float64[np.ndarray, " 3"]]) -> Scale | None:
+def scale_by(bars: Sequence[ScaleBar], places: Mapping[str, Float64[np.ndarray, " 3"]]) -> ModelScale | None:
     """The scale that bars give a model; None where none of them has both targets found.
 
     Args:
@@ -154,4 +154,4 @@ def scale_by(bars: Sequence[ScaleBar], places: Mapping[str, Float64[np.ndarray, 
     errors = np.full(len(bars), math.nan)
     errors[index] = [(found / each - 1.0) * bars[k].metres for each, k in zip(ratio, index, strict=True)]
     used = tuple(k for k, is_good in zip(index, good.tolist(), strict=True) if is_good)
-    return Scale(found, max(spread, float(weight.sum() ** -0.5)), used, tuple(errors.tolist()))
+    return ModelScale(found, max(spread, float(weight.sum() ** -0.5)), used, tuple(errors.tolist()))

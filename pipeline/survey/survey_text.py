@@ -84,7 +84,7 @@ def written_lines(lines: Sequence[tuple[int, str]], path: Path, kind: TableKind)
 
 
 @contextmanager
-def told_by_line(path: Path, kind: TableKind) -> Iterator[None]:
+def line_errors(path: Path, kind: TableKind) -> Iterator[None]:
     """Turn a ``LineError`` into the message for the user, which names the file and the line."""
     try:
         yield

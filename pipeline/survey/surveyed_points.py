@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.geometry.triangulation import Rays, Triangulated, triangulate
+from splatpipe.pipeline.geometry.triangulation import Rays, TriangulatedPoint, triangulate
 from splatpipe.pipeline.photos.names import NameFinder, some
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.control_file import ControlFile, SurveyedPoint, read_control_file
@@ -63,7 +63,7 @@ class SurveyPoint:
     role: Literal["control", "check", "left_out"]
     why: str
     sightings: tuple[Sighting, ...]
-    found: Triangulated | None = None
+    found: TriangulatedPoint | None = None
 
     @property
     def name(self) -> str:

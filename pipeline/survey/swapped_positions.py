@@ -25,7 +25,7 @@ MOST_PHOTOS = 3000  # all pairs of photos are looked at
 
 
 @dataclass(frozen=True)
-class Flight:
+class PositionEvidence:
     """What is known of the photos' places.
 
     Attributes:
@@ -44,7 +44,7 @@ class Flight:
         return np.asarray(known[np.argsort(self.times_s[known], kind="stable")], np.int64)
 
 
-def find_swapped(flight: Flight) -> list[Pair]:
+def find_swapped(flight: PositionEvidence) -> list[Pair]:
     """Pairs of photos (i, j), i < j, that very likely have each other's position, the clearest first."""
     located = np.flatnonzero(np.isfinite(flight.places_m).all(axis=1))
     if not 4 <= len(located) <= MOST_PHOTOS:

@@ -27,7 +27,7 @@ NUMBERS = re.compile(r"\d+")
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedPoints:
     """Where the survey has its points.
 
     Attributes:
@@ -81,7 +81,7 @@ def named_tracks(
     finds: Sequence[TargetFind],
     names: Sequence[str],
     scene: tuple[SparseModel, Mapping[str, Photo]],
-    expected: Expected | None,
+    expected: ExpectedPoints | None,
     seeds: Mapping[str, Float64[np.ndarray, " 3"]],
 ) -> TargetMarks:
     """Join targets with names.
@@ -112,7 +112,7 @@ def named_tracks(
 def _by_place(
     unnamed: Sequence[Track],
     by_number: Sequence[NamedTrack],
-    expected: Expected,
+    expected: ExpectedPoints,
     seeds: Mapping[str, Float64[np.ndarray, " 3"]],
 ) -> tuple[dict[str, int], set[str]]:
     """Targets by the points that lie where they are, and the names of those that have a number but lie elsewhere."""

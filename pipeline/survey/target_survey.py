@@ -18,10 +18,10 @@ from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.expected_places import expected_enu, free_enu
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.scale_bars import Scale, ScaleBar, scale_by
+from splatpipe.pipeline.survey.scale_bars import ModelScale, ScaleBar, scale_by
 from splatpipe.pipeline.survey.surveyed_points import Survey
 from splatpipe.pipeline.survey.target_finds import TargetFind, WantedTargets
-from splatpipe.pipeline.survey.target_marks import Expected, TargetMarks, named_tracks
+from splatpipe.pipeline.survey.target_marks import ExpectedPoints, TargetMarks, named_tracks
 
 SCALE_OFF = 3.0  # joint sigmas between the bars' scale and the frame's: worth a warning
 
@@ -66,14 +66,14 @@ class TargetSurvey:
             report.note(f"Targets not used: {', '.join(refused)}.")
         return found
 
-    def _expected(self, points: list[str]) -> Expected | None:
+    def _expected(self, points: list[str]) -> ExpectedPoints | None:
         if not points:
             return None
         try:
             if self.frame is None:
-                return Expected(tuple(points), free_enu(self.wanted, self.approximate_crs), None)
+                return ExpectedPoints(tuple(points), free_enu(self.wanted, self.approximate_crs), None)
             enu = expected_enu(self.wanted, self.frame, self.model, self.approximate_crs)
-            return Expected(tuple(points), enu, self.frame.world_from_model)
+            return ExpectedPoints(tuple(points), enu, self.frame.world_from_model)
         except SplatpipeError:  # of the CRS; it is told where control is placed
             return None
 
@@ -100,7 +100,7 @@ def marker_of(
 
 def scale_of(
     survey: TargetSurvey, found: TargetMarks, marked: Mapping[str, Float64[np.ndarray, " 3"]], report: Reporter
-) -> Scale | None:
+) -> ModelScale | None:
     """What the scale bars say of the model; warns of bars that contradict the others or were not found."""
     bars = survey.wanted.bars
     if not bars:
@@ -127,7 +127,7 @@ def scale_of(
     return scale
 
 
-def scaled(frame: Frame, scale: Scale) -> Frame:
+def scaled(frame: Frame, scale: ModelScale) -> Frame:
     """An arbitrary frame with the bars' metres."""
     factor = scale.metres_per_unit / frame.world_from_model.scale
     old = frame.world_from_model
@@ -137,7 +137,7 @@ def scaled(frame: Frame, scale: Scale) -> Frame:
     return replace(frame, world_from_model=similarity, metres=True, note=note + upright)
 
 
-def compare(frame: Frame, scale: Scale, report: Reporter) -> None:
+def compare(frame: Frame, scale: ModelScale, report: Reporter) -> None:
     """Say how far the frame's metres are the bars'."""
     ratio = frame.world_from_model.scale / scale.metres_per_unit - 1.0
     bars = f"{_counted(scale)} (good to {scale.sigma:.3%})"
@@ -148,7 +148,7 @@ def compare(frame: Frame, scale: Scale, report: Reporter) -> None:
         report.note(what)
 
 
-def scale_json(bars: Sequence[ScaleBar], scale: Scale | None, frame: Frame) -> dict[str, JSON]:
+def scale_json(bars: Sequence[ScaleBar], scale: ModelScale | None, frame: Frame) -> dict[str, JSON]:
     """What ``accuracy.json`` holds of scale bars; nothing where none gave a scale.
 
     Each bar's error is the length in the result less the stated one.
@@ -173,11 +173,11 @@ def scale_json(bars: Sequence[ScaleBar], scale: Scale | None, frame: Frame) -> d
     return {"scale": {"metric": True, "placed": placed, "sentence": told, "sigma": scale.sigma, "bars": rows}}
 
 
-def _counted(scale: Scale) -> str:
+def _counted(scale: ModelScale) -> str:
     return f"{len(scale.used)} scale bar{'' if len(scale.used) == 1 else 's'}"
 
 
-def scale_summary(scale: Scale | None) -> dict[str, JSON]:
+def scale_summary(scale: ModelScale | None) -> dict[str, JSON]:
     """Of the stage."""
     if scale is None:
         return {}

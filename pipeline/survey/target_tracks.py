@@ -41,16 +41,16 @@ class Track:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _PosedFinds:
     """Finds in photos that have a pose, with their rays."""
 
     finds: tuple[TargetFind, ...]
     rays: Rays
     tolerance_px: float
 
-    def only(self, chosen: Bool[np.ndarray, " n"]) -> _Seen:
+    def only(self, chosen: Bool[np.ndarray, " n"]) -> _PosedFinds:
         kept = tuple(find for find, keep in zip(self.finds, chosen.tolist(), strict=True) if keep)
-        return _Seen(kept, self.rays.only(chosen), self.tolerance_px)
+        return _PosedFinds(kept, self.rays.only(chosen), self.tolerance_px)
 
 
 def coded_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> list[Track]:
@@ -89,7 +89,7 @@ def unnamed_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mapp
     return tracks
 
 
-def _seen(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> _Seen | None:
+def _seen(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> _PosedFinds | None:
     index = {name: k for k, name in enumerate(model.names)}
     posed = [find for find in finds if find.photo in index and find.photo in photos]
     views = [model.view(index[find.photo], photos[find.photo].width) for find in posed]
@@ -101,10 +101,10 @@ def _seen(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, 
     poses = np.stack([views[k].cam_from_model for k in good])
     error = model.reconstruction.compute_mean_reprojection_error() / min(views[k].scale for k in good)
     found = Rays(poses, np.stack([rays[k] for k in good]), np.stack([pixels[k] for k in good]))
-    return _Seen(tuple(posed[k] for k in good), found, max(LEAST_TOLERANCE_PX, FIT_TOLERANCE * float(error)))
+    return _PosedFinds(tuple(posed[k] for k in good), found, max(LEAST_TOLERANCE_PX, FIT_TOLERANCE * float(error)))
 
 
-def _track(seen: _Seen, least: int) -> Track | None:
+def _track(seen: _PosedFinds, least: int) -> Track | None:
     """The target whose rays meet; None where too few photos' do."""
     found = triangulate(seen.rays, seen.tolerance_px)
     if found is None:
@@ -121,7 +121,7 @@ def _track(seen: _Seen, least: int) -> Track | None:
     return Track(chosen[0].kind, chosen[0].number, chosen, found.xyz)
 
 
-def _reach(seen: _Seen, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
+def _reach(seen: _PosedFinds, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
     """The least and largest depth that each find's photo lets expect."""
     depths: dict[str, tuple[float, float]] = {}
     for name, number in zip(model.names, model.image_ids, strict=True):
@@ -135,7 +135,7 @@ def _reach(seen: _Seen, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
 
 
 def _group(
-    seen: _Seen, seed: int, free: Bool[np.ndarray, " n"], reach: Float64[np.ndarray, "n 2"]
+    seen: _PosedFinds, seed: int, free: Bool[np.ndarray, " n"], reach: Float64[np.ndarray, "n 2"]
 ) -> Bool[np.ndarray, " n"]:
     """The finds that agree best on what a find shows: its ray meets others', and each meeting has its witnesses."""
     directions, centres = seen.rays.directions(), seen.rays.centres()

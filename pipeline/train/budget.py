@@ -15,13 +15,13 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.lengths import Footage, lengths
+from splatpipe.pipeline.train.lengths import PhotoSizes, lengths
 from splatpipe.pipeline.train.limits import FEWEST, LONGEST, worthwhile_iterations
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import footage_of
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 from splatpipe.pipeline.train.start import started
+from splatpipe.pipeline.train.windows import TrainingSize
 
 # Of these, up to COARSEST_MEGAPIXELS, none was compared by held-out quality: they are judgement, the reasons theirs.
 SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
@@ -101,7 +101,7 @@ def _terms(timing: Timing) -> npt.NDArray[np.float64]:
     return np.array([1.0, gaussians, pixels, gaussians * pixels, gaussians * timing.share])
 
 
-def forecast(speed: Speed, schedule: Schedule, initial: int, footage: Footage) -> float:
+def forecast(speed: Speed, schedule: Schedule, initial: int, footage: PhotoSizes) -> float:
     """Seconds that a training takes.
 
     Args:
@@ -123,7 +123,7 @@ def forecast(speed: Speed, schedule: Schedule, initial: int, footage: Footage) -
 
 
 @dataclass(frozen=True)
-class Task:
+class BudgetTask:
     """What is to be planned.
 
     Attributes:
@@ -149,10 +149,10 @@ class Task:
     @property
     def megapixels(self) -> float:
         """Most that photos may be trained at: their mean size in the dataset, or what the options allow."""
-        whole = 1e-6 * footage_of(self.sizes, None, 0).pixels(Look())
+        whole = 1e-6 * footage_of(self.sizes, None, 0).pixels(TrainingSize())
         return min(whole, self.config.max_megapixels or whole)
 
-    def footage(self, megapixels: float) -> Footage:
+    def footage(self, megapixels: float) -> PhotoSizes:
         """The photos at a size; at the largest one as the options have them."""
         most = self.config.max_megapixels or None
         return footage_of(self.sizes, most if megapixels >= self.megapixels else megapixels, self.window_pixels)
@@ -168,7 +168,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Choice:
+class BudgetChoice:
     """What meets the time.
 
     Attributes:
@@ -191,7 +191,7 @@ class Choice:
         return self.iterations if self.iterations >= LONGEST else int(POLISH * self.iterations)
 
 
-def choose(task: Task) -> Choice:
+def choose(task: BudgetTask) -> BudgetChoice:
     """Divide the time between the size of the photos, iterations and Gaussians.
 
     Photos grow to the dataset's size first, as long as ``wanted_iterations`` and room for the first growth fit: a size
@@ -216,7 +216,7 @@ def choose(task: Task) -> Choice:
     iterations = _largest(FEWEST, max(LONGEST, iterations), lambda count: _fits(task, size, cap, count))
     options = planned_options(task, size, cap, iterations)
     is_most = size >= task.megapixels and cap >= most
-    return Choice(options, iterations, task.left(cap), task.takes(options, size), is_most)
+    return BudgetChoice(options, iterations, task.left(cap), task.takes(options, size), is_most)
 
 
 def sizes(megapixels: float) -> list[float]:
@@ -229,13 +229,13 @@ def sizes(megapixels: float) -> list[float]:
     return [*ladder, megapixels]
 
 
-def wanted_iterations(task: Task, megapixels: float) -> int:
+def wanted_iterations(task: BudgetTask, megapixels: float) -> int:
     """Iterations that are worth more than larger photos or more Gaussians: every part is seen often enough."""
     least = worthwhile_iterations(task.seconds)
     return sum(count for _level, count in lengths(task.footage(megapixels), least))
 
 
-def planned_options(task: Task, megapixels: float, cap: int, iterations: int) -> TrainConfig:
+def planned_options(task: BudgetTask, megapixels: float, cap: int, iterations: int) -> TrainConfig:
     """The options of a planned training."""
     config, first = task.config, megapixels / 4.0 ** task.footage(megapixels).first_level
     halvings = int(max(0.0, math.log(first / COARSEST_MEGAPIXELS, 4)))
@@ -249,7 +249,7 @@ def planned_options(task: Task, megapixels: float, cap: int, iterations: int) ->
     return config.model_copy(update=planned)
 
 
-def _fits(task: Task, megapixels: float, cap: int, iterations: int) -> bool:
+def _fits(task: BudgetTask, megapixels: float, cap: int, iterations: int) -> bool:
     options = planned_options(task, megapixels, cap, iterations)
     return task.takes(options, megapixels) <= SCHEDULE_SHARE * task.left(cap)
 

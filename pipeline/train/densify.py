@@ -78,7 +78,7 @@ class DensitySchedule:
 
 
 @dataclass(frozen=True)
-class Growth:
+class DensifiedGaussians:
     """New rows for the model: which old Gaussian each is made from, and what differs.
 
     Attributes:
@@ -95,20 +95,20 @@ class Growth:
     log_scales: Float[Tensor, "m 3"]
     opacity_logits: Float[Tensor, " m"]
 
-    def select(self, rows: Bool[Tensor, " m"] | Int64[Tensor, " k"]) -> Growth:
+    def select(self, rows: Bool[Tensor, " m"] | Int64[Tensor, " k"]) -> DensifiedGaussians:
         """The rows of a mask or an index."""
-        return Growth(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return DensifiedGaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
-def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> Growth:
+def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> DensifiedGaussians:
     """The Gaussians of a mask, as they are."""
     source = torch.nonzero(rows).flatten()
     fresh = torch.zeros(len(source), dtype=torch.bool, device=source.device)
     kept = (gaussians.means, gaussians.log_scales, gaussians.opacity_logits)  # not the harmonics, most of the memory
-    return Growth(source, fresh, *(tensor[source] for tensor in kept))
+    return DensifiedGaussians(source, fresh, *(tensor[source] for tensor in kept))
 
 
-def along_curve(growth: Growth) -> Growth:
+def along_curve(growth: DensifiedGaussians) -> DensifiedGaussians:
     """The same rows in the order of their places on a Morton curve: what is near in space is near in memory.
 
     Threads of a CUDA device then read neighbouring memory, and a CPU what a window shows, row after row.
@@ -240,7 +240,7 @@ def grow(
     schedule: DensitySchedule,
     extent: float,
     iteration: int,
-) -> tuple[Growth, dict[str, int]]:
+) -> tuple[DensifiedGaussians, dict[str, int]]:
     """Clone the small and split the large Gaussians whose score asks for it.
 
     Those whose halved opacity would be under the pruning limit are left: both halves would go in the next step.
@@ -276,7 +276,7 @@ def grow(
     logits = gaussians.opacity_logits.clone()
     logits[chosen] = half_opacity(logits[chosen])
     counts = {"cloned": len(cloned), "split": len(split), "held_back": len(wanted) - len(chosen)}
-    return Growth(source, fresh, means, log_scales, logits[source]), counts
+    return DensifiedGaussians(source, fresh, means, log_scales, logits[source]), counts
 
 
 def half_opacity(logits: Float[Tensor, " k"]) -> Float[Tensor, " k"]:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.densify import DensitySchedule, DensityStatistics, Growth, grow, prune_mask
+from splatpipe.pipeline.train.densify import DensifiedGaussians, DensitySchedule, DensityStatistics, grow, prune_mask
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 
@@ -89,7 +89,7 @@ class Density:
         if schedule.prune_screen_px > 0.0:
             self.statistics.observe_radii(rendered.radii)
 
-    def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[Growth, dict[str, int]]:
+    def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[DensifiedGaussians, dict[str, int]]:
         """Prune, then clone or split the Gaussians of the largest mean score, up to the limit.
 
         Returns:

@@ -17,7 +17,7 @@ from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.draws import DROPOUT, uniform
 from splatpipe.pipeline.train.hooks import Technique
-from splatpipe.pipeline.train.schedule import Moment, Schedule
+from splatpipe.pipeline.train.schedule import Schedule, ScheduleStep
 
 DROPPED_LOGIT = -30.0  # an opacity of 1e-13: the projection culls it, so it costs nothing and learns nothing
 LARGEST_OPACITY = 0.999  # of the scaled ones, which a logit has to hold; the blending caps alpha at 0.99
@@ -43,7 +43,7 @@ def dropped(gaussians: Gaussians, schedule: Schedule, iteration: int) -> Gaussia
     if share == 0.0:
         return gaussians
     drawn = _drawn(schedule.seed, iteration, gaussians)
-    logits = _Dropped.apply(gaussians.opacity_logits, drawn >= share, share)  # type: ignore[no-untyped-call]
+    logits = _DropoutLogits.apply(gaussians.opacity_logits, drawn >= share, share)  # type: ignore[no-untyped-call]
     return replace(gaussians, opacity_logits=logits)
 
 
@@ -59,7 +59,7 @@ class Dropout(Technique):
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
 
-    def before_render(self, model: Gaussians, now: Moment) -> Gaussians:
+    def before_render(self, model: Gaussians, now: ScheduleStep) -> Gaussians:
         """The Gaussians without those left out."""
         return dropped(model, self._schedule, now.place)
 
@@ -73,7 +73,7 @@ def _drawn(seed: int, iteration: int, gaussians: Gaussians) -> Float64[Tensor, "
     return torch.from_numpy(uniform(seed, iteration, DROPOUT, np.arange(len(gaussians)))).to(device)
 
 
-class _Dropped(torch.autograd.Function):
+class _DropoutLogits(torch.autograd.Function):
     """Logits of σ / (1 - share) for those kept.
 
     Where the cap holds, the gradient is that of the opacity below it: the cap binds in the Gaussian's middle, and its

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatpipe.pipeline.train.history import History
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import Schedule, tail_of
 
 WINDOW_SHARE = 0.25  # of the iterations done: what the line is drawn through
@@ -73,7 +73,7 @@ def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
     return 1.0 - math.exp(slope * math.log(last / epochs[-1][0]))
 
 
-def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> bool:
+def is_flat(epochs: Sequence[tuple[int, float]], plan: TrainingPlan, iteration: int) -> bool:
     """Whether `stop_when_flat` ends the size that is trained on here, or the training after a tail that begins here.
 
     Args:
@@ -92,7 +92,7 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: Plan, iteration: int) -> 
     return expected_gain(recent, scheduled) < plan.options.stop_when_flat
 
 
-def end_epoch(history: History, plan: Plan, iteration: int, length: int) -> None:
+def end_epoch(history: History, plan: TrainingPlan, iteration: int, length: int) -> None:
     """Close an epoch, and note where its loss ends a size or begins the training's tail.
 
     Args:
@@ -111,7 +111,7 @@ def end_epoch(history: History, plan: Plan, iteration: int, length: int) -> None
         history.flat_at = iteration
 
 
-def ends_at(plan: Plan, flat_at: int) -> int:
+def ends_at(plan: TrainingPlan, flat_at: int) -> int:
     """The last iteration.
 
     Args:

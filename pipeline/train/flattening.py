@@ -21,18 +21,18 @@ from splatpipe.pipeline.render.rendering import Rendering, load_rendering
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
-from splatpipe.pipeline.train.distortion import Distortion
-from splatpipe.pipeline.train.evenness import Evenness
+from splatpipe.pipeline.train.distortion_loss import DistortionLoss
 from splatpipe.pipeline.train.exposure import Exposure, read_exposures
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS, Stretch
-from splatpipe.pipeline.train.looks import Look
-from splatpipe.pipeline.train.loop import CHECKPOINT, Course, go_through
+from splatpipe.pipeline.train.loop import CHECKPOINT, TrainingSetup, go_through
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, make_plan
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.rates import Rates
 from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.train.smoothness_loss import SmoothnessLoss
 from splatpipe.pipeline.train.techniques import Techniques, make_techniques
 from splatpipe.pipeline.train.visits import PhotoVisits, Visits
+from splatpipe.pipeline.train.windows import TrainingSize
 
 VISITS = 8  # of every photo
 LEAST_ITERATIONS = 300  # where photos are few
@@ -94,7 +94,7 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
     return read_splat(path)
 
 
-def _course(trained: TrainedParts, device: Device, threads: int) -> Course:
+def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetup:
     """What the copy goes through."""
     views, split = load_views(trained.dataset), load_split(trained.split)
     exposures = read_exposures(trained.exposures, "train")
@@ -105,7 +105,7 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> Course:
     trained_on = [view for view in views if view.camera.name in kept]
     sky = _sky(trained, trained_on, threads)
 
-    def visits(looks: Sequence[Look]) -> Visits:
+    def visits(looks: Sequence[TrainingSize]) -> Visits:
         return PhotoVisits([view.camera for view in trained_on], looks, options.seed, plan.megapixels)
 
     def techniques() -> Techniques:
@@ -114,9 +114,9 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> Course:
             given = Exposure.given({name: exposures[name] for name in plan.train_views})
             given.move_to(device.tensors)
             made = made.with_given(given)
-        return Techniques((*made, Distortion(SPREAD_WEIGHT, 0, about_median=True), Evenness(EVENNESS_WEIGHT)))
+        return Techniques((*made, DistortionLoss(SPREAD_WEIGHT, 0, about_median=True), SmoothnessLoss(EVENNESS_WEIGHT)))
 
-    return Course(plan, device, trained_on, visits, techniques, start=lambda: gaussians)
+    return TrainingSetup(plan, device, trained_on, visits, techniques, start=lambda: gaussians)
 
 
 def _sky(trained: TrainedParts, views: Sequence[View], threads: int) -> SkyModel | None:
@@ -150,7 +150,7 @@ def options_of(gaussians: Gaussians, rendering: Rendering, has_exposures: bool) 
 
 def flattening_plan(
     options: TrainConfig, views: Sequence[View], split: Split, gaussians: int, window_pixels: int
-) -> Plan:
+) -> TrainingPlan:
     """What the copy is trained with.
 
     Args:

@@ -14,7 +14,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import DensitySchedule
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 
@@ -32,7 +32,7 @@ class Shot:
     photo: TrainingPhoto
     rendered: Render
     settings: RenderOptions
-    now: Moment
+    now: ScheduleStep
 
 
 class Technique:
@@ -49,11 +49,11 @@ class Technique:
     def move_to(self, device: torch.device) -> None:
         """Take what is kept as tensors to where the model is trained; before the first iteration."""
 
-    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
         """How to render, e.g. with depths."""
         return settings
 
-    def before_render(self, model: Gaussians, now: Moment) -> Gaussians:
+    def before_render(self, model: Gaussians, now: ScheduleStep) -> Gaussians:
         """The model as it is rendered in this iteration."""
         return model
 

@@ -15,15 +15,15 @@ from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.train.flatness import end_epoch, ends_at
 from splatpipe.pipeline.train.hooks import Shot
 from splatpipe.pipeline.train.memory import over_memory
-from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.plan import TrainingPlan
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 SSIM_WEIGHT = 0.2  # share of 1 - SSIM in the loss, the rest is L1: published
 
 
-def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+def iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
     """Render, compare, step the parameters, then density control where it is due.
 
     Args:
@@ -41,7 +41,7 @@ def iterate(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
     close(state, plan, photo, now)
 
 
-def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> None:
+def learn(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: ScheduleStep) -> None:
     """Render, compare, step; what that makes is gone afterwards, for density control wants the memory.
 
     Args:
@@ -77,7 +77,7 @@ def learn(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
     state.history.add_loss(photometric.detach())
 
 
-def render_options(plan: Plan, now: Moment, magnitudes: bool) -> rasterizer.RenderOptions:
+def render_options(plan: TrainingPlan, now: ScheduleStep, magnitudes: bool) -> rasterizer.RenderOptions:
     """How an iteration renders; with ``magnitudes`` of the screen gradient where density control looks on."""
     return rasterizer.RenderOptions(
         sh_degree=now.sh_degree,
@@ -89,7 +89,7 @@ def render_options(plan: Plan, now: Moment, magnitudes: bool) -> rasterizer.Rend
     )
 
 
-def close(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> None:
+def close(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: ScheduleStep) -> None:
     """Count the iteration, and note what followed from it: the memory's end of growth, a flat loss, the curve."""
     history = state.history
     if not history.growth_ended and plan.schedule.density.is_step(now.iteration):
@@ -103,7 +103,7 @@ def close(state: TrainState, plan: Plan, photo: TrainingPhoto, now: Moment) -> N
     history.end_iteration(now.iteration, is_last, curve_facts(state, plan, photo))
 
 
-def curve_facts(state: TrainState, plan: Plan, photo: TrainingPhoto) -> dict[str, int]:
+def curve_facts(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> dict[str, int]:
     """What a point of the history's curve says besides the loss."""
     return {
         "gaussians": len(state.gaussians),

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
-from splatpipe.pipeline.train.looks import Look, windows_of
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.windows import TrainingSize, windows_of
 
 # Judgement, but for what docs/lengths.md says of them.
 WHOLE_VISITS = 20  # of a photo at the size at which it is seen whole, at least
@@ -49,13 +49,13 @@ class Stretch:
     until: int
 
     @property
-    def look(self) -> Look:
+    def look(self) -> TrainingSize:
         """The same for one iteration."""
-        return Look(self.level, self.window_pixels)
+        return TrainingSize(self.level, self.window_pixels)
 
 
 @dataclass(frozen=True)
-class Footage:
+class PhotoSizes:
     """Photos as they are trained on.
 
     Attributes:
@@ -93,16 +93,16 @@ class Footage:
         """Most pixels of a window, at a level; 0 where all photos fit in whole."""
         return 0 if self.parts(level) == self.photos else self.window_pixels
 
-    def pixels(self, look: Look) -> float:
+    def pixels(self, look: TrainingSize) -> float:
         """Of a photo that an iteration looks at, on average."""
         whole = sum(width * height * count for width, height, count in self.sizes) / 4.0**look.level
         return whole / (self.parts(look.level) if look.window_pixels else self.photos)
 
-    def share(self, look: Look) -> float:
+    def share(self, look: TrainingSize) -> float:
         """Of a photo's pixels at that level, that an iteration looks at."""
         return self.photos / self.parts(look.level) if look.window_pixels else 1.0
 
-    def largest(self, look: Look) -> int:
+    def largest(self, look: TrainingSize) -> int:
         """Pixels of the largest window, without its margins."""
         return max(_cut(w >> look.level, h >> look.level, look.window_pixels)[1] for w, h, _count in self.sizes)
 
@@ -118,7 +118,7 @@ Length = tuple[int, int]
 """A level and its iterations."""
 
 
-def lengths(footage: Footage, least: int, finest: int = 0) -> list[Length]:
+def lengths(footage: PhotoSizes, least: int, finest: int = 0) -> list[Length]:
     """Iterations at each level, the first one first.
 
     Args:
@@ -134,7 +134,7 @@ def lengths(footage: Footage, least: int, finest: int = 0) -> list[Length]:
     return [(first, whole), *finer, (finest, max(PART_VISITS * footage.parts(finest), least - whole))]
 
 
-def divided(footage: Footage, least: int, iterations: int) -> list[Length]:
+def divided(footage: PhotoSizes, least: int, iterations: int) -> list[Length]:
     """So many iterations: fewer than those of ``lengths`` divided like them, more of them at the finest size.
 
     A size that comes too short is left out.
@@ -157,7 +157,7 @@ def divided(footage: Footage, least: int, iterations: int) -> list[Length]:
     return [(level, end - start) for (level, _), start, end in zip(wanted, [0, *ends], ends, strict=False)]
 
 
-def lengths_of(config: TrainConfig, footage: Footage) -> list[Length]:
+def lengths_of(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
     """Iterations at each size of the photos, those of the options or what they ask for, the first one first."""
     if config.iterations == "auto":
         return lengths(footage, config.least_iterations)
@@ -170,7 +170,7 @@ def growth_until(each: Sequence[Length]) -> int:
     return sum(earlier for _level, earlier in before) + int(UNTIL * count)
 
 
-def stretches(footage: Footage, each: Sequence[Length], coarse_levels: int = 0) -> tuple[Stretch, ...]:
+def stretches(footage: PhotoSizes, each: Sequence[Length], coarse_levels: int = 0) -> tuple[Stretch, ...]:
     """The same as what iterations look at.
 
     Args:

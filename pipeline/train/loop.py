@@ -26,11 +26,10 @@ from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
 from splatpipe.pipeline.train.iteration import curve_facts, iterate
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, load_or_write_plan, make_plan
-from splatpipe.pipeline.train.planning import Scene, under_budgets
+from splatpipe.pipeline.train.plan import TrainingPlan, load_or_write_plan, make_plan
+from splatpipe.pipeline.train.planning import PlanningInput, under_budgets
 from splatpipe.pipeline.train.shortage import iterate_within_memory
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.start import read_start
@@ -38,6 +37,7 @@ from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
 from splatpipe.pipeline.train.visits import PhotoVisits, Visits
+from splatpipe.pipeline.train.windows import TrainingSize
 
 CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
@@ -47,7 +47,7 @@ CUDA_REPORT_EVERY = 50  # the same where telling the loss waits for the device
 
 
 @dataclass(frozen=True)
-class Course:
+class TrainingSetup:
     """What a training goes through.
 
     Attributes:
@@ -60,10 +60,10 @@ class Course:
         frozen: Makes those that are drawn besides and stay as they are; None for none.
     """
 
-    plan: Plan
+    plan: TrainingPlan
     device: Device
     views: Sequence[View]
-    visits: Callable[[Sequence[Look]], Visits]
+    visits: Callable[[Sequence[TrainingSize]], Visits]
     techniques: Callable[[], Techniques]
     start: Callable[[], Gaussians]
     frozen: Callable[[], Gaussians | None] = lambda: None
@@ -74,7 +74,7 @@ class Course:
         return None if frozen is None else frozen.to(self.device.tensors)
 
 
-Fit = Callable[[Plan, Scene, Step, Reporter], Plan]
+Fit = Callable[[TrainingPlan, PlanningInput, Step, Reporter], TrainingPlan]
 """Fits a plan to its scene, before the first iteration."""
 
 
@@ -114,12 +114,12 @@ def train_whole(
     kept = set(split.train)
     trained_on = [view for view in views if view.camera.name in kept]
     free = make_plan(config, views, split, len(start.gaussians), WINDOW_PIXELS[device.name])
-    scene = Scene(config, start, trained_on, len(free.test_views), inputs.machine, device)
+    scene = PlanningInput(config, start, trained_on, len(free.test_views), inputs.machine, device)
 
-    def step(state: TrainState, plan: Plan, photo: TrainingPhoto) -> None:
+    def step(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         iterate_within_memory(iterate, state, plan, photo, report)
 
-    def make() -> Plan:
+    def make() -> TrainingPlan:
         decided = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
         return fit(free.of(decided), replace(scene, config=decided, sky=sky), step, report)
 
@@ -131,11 +131,11 @@ def train_whole(
         if budgeted(plan) or plan.options.iterations == "auto":
             report.note(plan.described())
 
-        def visits(looks: Sequence[Look]) -> Visits:
+        def visits(looks: Sequence[TrainingSize]) -> Visits:
             cameras = [view.camera for view in trained_on]
             return PhotoVisits(cameras, looks, plan.options.seed, plan.megapixels)
 
-        course = Course(
+        course = TrainingSetup(
             plan,
             device,
             trained_on,
@@ -151,7 +151,7 @@ def train_whole(
     return state, {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
 
 
-def go_through(course: Course, out: Path, report: Reporter) -> TrainState:
+def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState:
     """Train from the start, or from the checkpoint that a killed run left, to the end.
 
     Args:
@@ -167,7 +167,7 @@ def go_through(course: Course, out: Path, report: Reporter) -> TrainState:
     first, history, seconds = 1, History(), 0.0
     if state is not None:
         first, history, seconds = state.iteration + 1, state.history, state.seconds
-    clock, visits = Clock(seconds), course.visits(looks_of(plan, history))
+    clock, visits = Clock(seconds), course.visits(training_sizes(plan, history))
     with PhotoStream(course.views, visits, first, out).to(device.tensors) as photos:
         photos.tell(report)
         photos.fill(report)  # before there is a model, if it is not there already: both want memory
@@ -188,7 +188,7 @@ def write_side_models(out: Path, techniques: Techniques) -> None:
     (out / "exposures.json").write_text(exposures_json(techniques.find(Exposure)), encoding="utf-8")
 
 
-def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
+def summary_of(state: TrainState, plan: TrainingPlan) -> dict[str, JSON]:
     """What the stage says of a training that is done."""
     found: dict[str, JSON] = {
         "iterations": state.iteration,
@@ -208,7 +208,7 @@ def summary_of(state: TrainState, plan: Plan) -> dict[str, JSON]:
     return found | state.techniques.summary()
 
 
-def looks_of(plan: Plan, history: History) -> list[Look]:
+def training_sizes(plan: TrainingPlan, history: History) -> list[TrainingSize]:
     """What every iteration looks at, as far as is known by now.
 
     Args:
@@ -219,7 +219,7 @@ def looks_of(plan: Plan, history: History) -> list[Look]:
     return now.schedule.looks_to(ends_at(now, history.flat_at))
 
 
-def budgeted(plan: Plan) -> bool:
+def budgeted(plan: TrainingPlan) -> bool:
     """Whether a budget had a say in the plan, so that people want to see it."""
     return bool(plan.options.time_budget_s or plan.options.max_memory_bytes)
 
@@ -240,7 +240,7 @@ class Clock:
         """Spent so far."""
         return time.monotonic() - self._began
 
-    def is_up(self, plan: Plan) -> bool:
+    def is_up(self, plan: TrainingPlan) -> bool:
         """Whether a time budget is spent."""
         return 0.0 < plan.train_seconds <= self.seconds()
 
@@ -269,7 +269,7 @@ class Training:
     """
 
     state: TrainState
-    course: Course
+    course: TrainingSetup
     path: Path
     clock: Clock
 
@@ -278,7 +278,7 @@ class Training:
         save_checkpoint(self.path, self.course.plan.digest(), self.state.checkpoint(self.course.device.kernels))
 
     @property
-    def now(self) -> Plan:
+    def now(self) -> TrainingPlan:
         """The plan, as it is by now."""
         return self.course.plan.after(self.state.history.sizes_ended)
 
@@ -293,7 +293,7 @@ class Training:
         return self.state.iteration % every == 0 or self.state.iteration == self.last
 
 
-def resume(path: Path, course: Course, report: Reporter) -> TrainState | None:
+def resume(path: Path, course: TrainingSetup, report: Reporter) -> TrainState | None:
     """The state that a killed run left, or None; a broken one is told and ignored.
 
     Args:
@@ -336,7 +336,7 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
                 tell_growth_ended(state, plan, report)
             if state.iteration in state.history.sizes_ended[-1:]:
                 plan = training.now
-                visits = training.course.visits(looks_of(training.course.plan, state.history))
+                visits = training.course.visits(training_sizes(training.course.plan, state.history))
                 photos.go_on(visits, state.iteration + 1)
                 tell_larger_photos(state, plan, report)
             if interrupt.requested:
@@ -356,7 +356,7 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
         raise KeyboardInterrupt
 
 
-def tell_growth_ended(state: TrainState, plan: Plan, report: Reporter) -> None:
+def tell_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
     """Warn that memory keeps the model from growing."""
     limited = plan.options.max_memory_bytes > 0
     report.warning(
@@ -367,14 +367,14 @@ def tell_growth_ended(state: TrainState, plan: Plan, report: Reporter) -> None:
     )
 
 
-def tell_larger_photos(state: TrainState, plan: Plan, report: Reporter) -> None:
+def tell_larger_photos(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
     """Say that a size ended before its time, and what that leaves to do."""
     report.note(
         f"flat after {state.iteration:,} iterations: goes on with larger photos, to {plan.schedule.iterations:,} in all"
     )
 
 
-def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporter) -> None:
+def end_now(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter) -> None:
     """Close the history of a training whose time is up, and say where that cut the schedule."""
     state.history.end_iteration(state.iteration, True, curve_facts(state, plan, photo))
     tell(state, plan, report)
@@ -385,7 +385,7 @@ def end_now(state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporte
         )
 
 
-def tell(state: TrainState, plan: Plan, report: Reporter) -> None:
+def tell(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
     """Report how far the training is."""
     planned = min(plan.schedule.iterations, ends_at(plan, state.history.flat_at))
     report.progress(state.iteration, max(state.iteration, planned), "training", "iterations")

@@ -17,7 +17,7 @@ from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.splat import metrics
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import Schedule
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.state import TrainState
@@ -35,11 +35,11 @@ WINDOW_SIDE = 2  # times smaller are the sides of the windows that are timed
 SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a surface shared out (0.5)
 STREAM = 7  # of the jitter's random numbers; the pilot is thrown away, so nothing depends on them
 
-Step = Callable[[TrainState, Plan, TrainingPhoto], None]
+Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 
 
 @dataclass(frozen=True)
-class Measured:
+class MachineSpeed:
     """This machine on this scene.
 
     Attributes:
@@ -54,7 +54,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Effort:
+class MeasuringBudget:
     """What may be spent on measuring, and what for.
 
     Attributes:
@@ -67,7 +67,7 @@ class Effort:
 
 
 @dataclass(frozen=True)
-class Subject:
+class TimedScene:
     """What is trained for a moment.
 
     Attributes:
@@ -83,7 +83,7 @@ class Subject:
     sky: SkyModel | None = None
 
 
-def measure(plan: Plan, subject: Subject, step: Step, effort: Effort) -> Measured:
+def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: MeasuringBudget) -> MachineSpeed:
     """Time real iterations at two sizes, on windows of the larger one, and at two numbers of Gaussians.
 
     Args:
@@ -114,7 +114,7 @@ def measure(plan: Plan, subject: Subject, step: Step, effort: Effort) -> Measure
             timings += [_timed(state, trial, photo, step, device) for photo in photos]
         if time.monotonic() - began > effort.most_s:
             break
-    return Measured(fit_speed(timings), decode_s, evaluate_s)
+    return MachineSpeed(fit_speed(timings), decode_s, evaluate_s)
 
 
 def pilot_schedule(schedule: Schedule) -> Schedule:
@@ -141,14 +141,14 @@ def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
     return model
 
 
-def _pilot_state(start: Gaussians, trial: Plan, subject: Subject) -> TrainState:
+def _pilot_state(start: Gaussians, trial: TrainingPlan, subject: TimedScene) -> TrainState:
     state = TrainState.begin(start, trial, make_techniques(trial, subject.sky, device=subject.device.tensors))
     state.iteration = PILOT_ITERATION
     return state
 
 
 def _warm_up(
-    states: Sequence[TrainState], trial: Plan, photos: Sequence[TrainingPhoto], step: Step, until: float
+    states: Sequence[TrainState], trial: TrainingPlan, photos: Sequence[TrainingPhoto], step: Step, until: float
 ) -> None:
     """Train each state a little: opacities and sizes that have left their start cost more than those there."""
     for number in range(WARM_UP_ITERATIONS):
@@ -181,7 +181,7 @@ def middle_of(photo: TrainingPhoto) -> TrainingPhoto:
     return TrainingPhoto(camera.cut(left, top, width, height), colour, mask, photo.is_empty, None, share)
 
 
-def _timed(state: TrainState, trial: Plan, photo: TrainingPhoto, step: Step, device: Device) -> Timing:
+def _timed(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto, step: Step, device: Device) -> Timing:
     device.wait()
     began = time.monotonic()
     step(state, trial, photo)
@@ -191,7 +191,7 @@ def _timed(state: TrainState, trial: Plan, photo: TrainingPhoto, step: Step, dev
     return Timing(len(state.gaussians), pixels, max(seconds, 1e-6), pixels / (whole.width * whole.height))
 
 
-def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Plan) -> float:
+def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: TrainingPlan) -> float:
     """What a held-out view takes a megapixel: a render, every measure, the pictures as PNG."""
     began = time.monotonic()
     with torch.no_grad():

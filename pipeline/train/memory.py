@@ -19,13 +19,13 @@ from splatpipe.pipeline.train.limits import (
     window_within,
 )
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 
 RESIDENT_STEP = 16_000_000  # what the process has is rounded up to it: a few pages more or less change no plan
 GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
 
 
-def within_memory(plan: Plan, sparse: int, report: Reporter, on_cuda: bool = False) -> Plan:
+def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bool = False) -> TrainingPlan:
     """The plan with windows and a cap on Gaussians that keep the process, or a device's tensors, within its limit.
 
     Args:

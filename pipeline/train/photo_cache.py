@@ -17,13 +17,13 @@ import numpy.typing as npt
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
-from splatpipe.pipeline.train.looks import Frame
+from splatpipe.pipeline.train.windows import PixelRectangle
 
 SHARE_OF_FREE = 0.5  # of the disk's free space at most: checkpoints and the model need room too
 
 
 @dataclass(frozen=True)
-class _Slot:
+class _CachedPhoto:
     offset: int
     camera: Camera
     has_mask: bool
@@ -54,7 +54,7 @@ class PhotoCache:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._slots: dict[tuple[int, int], _Slot] = {}
+        self._slots: dict[tuple[int, int], _CachedPhoto] = {}
         self._end = 0
         with self._explained():
             self.room_bytes = int(SHARE_OF_FREE * shutil.disk_usage(folder).free)
@@ -77,7 +77,7 @@ class PhotoCache:
             MachineError: if the disk is full nevertheless, or fails.
         """
         counted = camera.width * camera.height if mask is None else int(np.count_nonzero(mask))
-        slot = _Slot(self._end, camera, mask is not None, counted)
+        slot = _CachedPhoto(self._end, camera, mask is not None, counted)
         if not self.has_room(camera, slot.has_mask):
             return
         with self._explained():
@@ -99,7 +99,7 @@ class PhotoCache:
         """How many pixels of a stored photo count."""
         return self._slots[key].counted
 
-    def get(self, key: tuple[int, int], frame: Frame) -> tuple[Pixels, Mask | None]:
+    def get(self, key: tuple[int, int], frame: PixelRectangle) -> tuple[Pixels, Mask | None]:
         """A window of a stored photo.
 
         The arrays are the file itself, of which its rows alone are mapped, not to be written to; with the last of them
@@ -120,7 +120,7 @@ class PhotoCache:
             return colour, None
         return colour, self._rows(slot.offset + 3 * width * height, frame, width).view(np.bool_)[:, columns]
 
-    def _rows(self, offset: int, frame: Frame, row_bytes: int) -> npt.NDArray[np.uint8]:
+    def _rows(self, offset: int, frame: PixelRectangle, row_bytes: int) -> npt.NDArray[np.uint8]:
         """A frame's rows of the plane that begins at a place in the file."""
         begin = offset + frame.top * row_bytes
         before = begin % mmap.ALLOCATIONGRANULARITY

@@ -18,10 +18,10 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.camera import Camera, reduced_size
 from splatpipe.pipeline.photos.dataset import Split, View
 from splatpipe.pipeline.render.rendering import Rendering
-from splatpipe.pipeline.train.lengths import WINDOW_PIXELS, Footage, Stretch
-from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.train.lengths import WINDOW_PIXELS, PhotoSizes, Stretch
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
+from splatpipe.pipeline.train.windows import TrainingSize
 
 PLAN_FORMAT = 4
 EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
@@ -29,7 +29,7 @@ NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """What a training does, resolved.
 
     Attributes:
@@ -89,7 +89,7 @@ class Plan:
         """sha256 of ``to_json``: names the plan in its checkpoints."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
-    def of(self, options: TrainConfig) -> Plan:
+    def of(self, options: TrainConfig) -> TrainingPlan:
         """The same training with other options, and what follows from them."""
         sizes = self.sizes or ((1, 1, len(self.train_views)),)
         limit = options.max_megapixels or None
@@ -103,14 +103,14 @@ class Plan:
             schedule=schedule,
             last_iteration=schedule.iterations,
             megapixels=limit,
-            train_megapixels=round(1e-6 * footage.pixels(Look(schedule.finest.level)), 4),
+            train_megapixels=round(1e-6 * footage.pixels(TrainingSize(schedule.finest.level)), 4),
         )
 
-    def within_windows(self, pixels: int) -> Plan:
+    def within_windows(self, pixels: int) -> TrainingPlan:
         """The same training with windows of at most so many pixels."""
         return replace(self, window_pixels=pixels).of(self.options)
 
-    def after(self, sizes_ended: Sequence[int]) -> Plan:
+    def after(self, sizes_ended: Sequence[int]) -> TrainingPlan:
         """The plan once sizes ended before their time: the finest has what they spare, counted by pixels.
 
         Args:
@@ -124,13 +124,13 @@ class Plan:
         return replace(self, schedule=schedule, last_iteration=self.last_iteration - spared) if sizes_ended else self
 
     @property
-    def footage(self) -> Footage:
+    def footage(self) -> PhotoSizes:
         """The photos as they are trained on."""
         return footage_of(self.sizes or ((1, 1, len(self.train_views)),), self.megapixels, self.window_pixels)
 
     def _told_sizes(self) -> tuple[list[str], tuple[Stretch, ...]]:
         stretches, footage = self.schedule.stretches, self.footage
-        whole = [1e-6 * footage.pixels(Look(stretch.level)) for stretch in stretches]
+        whole = [1e-6 * footage.pixels(TrainingSize(stretch.level)) for stretch in stretches]
         windows = [" in windows" if stretch.window_pixels else "" for stretch in stretches]
         return [f"{size:.2f} MP{window}" for size, window in zip(whole, windows, strict=True)], stretches
 
@@ -152,7 +152,7 @@ class Plan:
     def _told_size(self) -> str:
         """Of the photos, from the first size to the last, and of the windows on it."""
         footage, finest = self.footage, self.schedule.finest
-        first = 1e-6 * footage.pixels(Look(self.schedule.stretches[0].level))
+        first = 1e-6 * footage.pixels(TrainingSize(self.schedule.stretches[0].level))
         told = f"{self.train_megapixels:.2f} MP"
         if len(self.schedule.stretches) > 1:
             told = f"{first:.2f} to {told}"
@@ -161,7 +161,7 @@ class Plan:
         return told
 
     @staticmethod
-    def from_json(text: str) -> Plan:
+    def from_json(text: str) -> TrainingPlan:
         """Read ``to_json``'s text back.
 
         Raises:
@@ -176,7 +176,7 @@ class Plan:
             fields["sizes"] = tuple(tuple(size) for size in fields["sizes"])
             fields["train_views"] = tuple(fields["train_views"])
             fields["test_views"] = tuple(fields["test_views"])
-            return Plan(**fields)
+            return TrainingPlan(**fields)
         except (KeyError, TypeError) as error:
             raise ValueError(f"not a plan: {error}") from error
 
@@ -204,7 +204,7 @@ def sizes_of(cameras: Sequence[Camera]) -> tuple[tuple[int, int, int], ...]:
     return tuple((*size, counted[size]) for size in sorted(counted))
 
 
-def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window_pixels: int) -> Footage:
+def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window_pixels: int) -> PhotoSizes:
     """Photos as they are trained on.
 
     Args:
@@ -213,14 +213,14 @@ def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window
         window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
     """
     if most is None:
-        return Footage(tuple(sizes), window_pixels)
+        return PhotoSizes(tuple(sizes), window_pixels)
     reduced = tuple((*reduced_size(width, height, most), count) for width, height, count in sizes)
-    return Footage(reduced, window_pixels)
+    return PhotoSizes(reduced, window_pixels)
 
 
 def make_plan(
     config: TrainConfig, views: Sequence[View], split: Split, gaussians: int, window_pixels: int = WINDOW_PIXELS["cpu"]
-) -> Plan:
+) -> TrainingPlan:
     """Resolve a training's plan.
 
     Args:
@@ -241,7 +241,7 @@ def make_plan(
             f"All {len(cameras)} cameras stand in one place, so the scene has no size.",
             hint="Take the photos from different places, and hold out fewer of them.",
         )
-    plan = Plan(
+    plan = TrainingPlan(
         options=config,
         schedule=resolve_schedule(config),
         extent=extent,
@@ -257,7 +257,7 @@ def make_plan(
     return plan.of(config)
 
 
-def load_or_write_plan(path: Path, make: Callable[[], Plan]) -> Plan:
+def load_or_write_plan(path: Path, make: Callable[[], TrainingPlan]) -> TrainingPlan:
     """The plan already at ``path``, or a new one, written there before anything is trained.
 
     The folder belongs to one key of configuration and inputs, so a plan in it is of this training.
@@ -267,7 +267,7 @@ def load_or_write_plan(path: Path, make: Callable[[], Plan]) -> Plan:
         make: Makes one; called only where there is none, for it may measure for a while.
     """
     try:
-        return Plan.from_json(path.read_text(encoding="utf-8"))
+        return TrainingPlan.from_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         fresh = make()
         write_durably(path, fresh.to_json())

@@ -13,16 +13,16 @@ from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster.device import Device, cpu, free_bytes
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
-from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, Task, choose
+from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, BudgetTask, choose
 from splatpipe.pipeline.train.limits import FIRST_ITERATIONS, device_bytes_per_gaussian, worthwhile_iterations
-from splatpipe.pipeline.train.looks import Look
-from splatpipe.pipeline.train.measure import Effort, Measured, Step, Subject, measure
+from splatpipe.pipeline.train.measure import MachineSpeed, MeasuringBudget, Step, TimedScene, measure
 from splatpipe.pipeline.train.memory import within_memory
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan import Plan, footage_of
+from splatpipe.pipeline.train.plan import TrainingPlan, footage_of
 from splatpipe.pipeline.train.shortage import HINT
 from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.start import Start, started
+from splatpipe.pipeline.train.start import InitialGaussians, started
+from splatpipe.pipeline.train.windows import TrainingSize
 
 MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
 MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
@@ -36,7 +36,7 @@ EXPORT_SECONDS = 5.5  # the last stages whatever the size: digests, the report w
 
 
 @dataclass(frozen=True)
-class Scene:
+class PlanningInput:
     """What is trained.
 
     Attributes:
@@ -50,7 +50,7 @@ class Scene:
     """
 
     config: TrainConfig
-    start: Start
+    start: InitialGaussians
     trained_on: Sequence[View]
     held_out: int
     machine: Machine
@@ -58,7 +58,7 @@ class Scene:
     sky: SkyModel | None = None
 
 
-def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
+def under_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
     """Fit a plan to the budgets of its options, and its initial Gaussians to the cap.
 
     Args:
@@ -78,18 +78,18 @@ def under_budgets(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Pla
     return replace(plan, initial_gaussians=started(start.sparse, start.dense, plan.options.max_gaussians))
 
 
-def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
+def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
     """The plan that fills what is left of the time budget when the last stages have their share."""
     budget, began = plan.options.time_budget_s, time.monotonic()
     if 0.0 < scene.machine.began_s < began:
         began = scene.machine.began_s
     before = time.monotonic() - began
-    effort = Effort(
+    effort = MeasuringBudget(
         min(MEASURE_SECONDS, MEASURE_SHARE * budget),
         max(LEAST_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
     )
     trial = pilot(plan, scene)
-    subject = Subject(scene.start.within(trial.options.max_gaussians), scene.trained_on, scene.device, scene.sky)
+    subject = TimedScene(scene.start.within(trial.options.max_gaussians), scene.trained_on, scene.device, scene.sky)
     try:
         measured = measure(trial, subject, step, effort)
     except torch.OutOfMemoryError as error:
@@ -114,7 +114,7 @@ def within_time(plan: Plan, scene: Scene, step: Step, report: Reporter) -> Plan:
     )
 
 
-def pilot(plan: Plan, scene: Scene) -> Plan:
+def pilot(plan: TrainingPlan, scene: PlanningInput) -> TrainingPlan:
     """The plan of a short training with a cap near which the budget's may lie, to be measured at.
 
     Args:
@@ -130,13 +130,13 @@ def pilot(plan: Plan, scene: Scene) -> Plan:
     return plan.of(scene.config.model_copy(update=short))
 
 
-def _task(plan: Plan, scene: Scene, measured: Measured, left: float) -> Task:
+def _task(plan: TrainingPlan, scene: PlanningInput, measured: MachineSpeed, left: float) -> BudgetTask:
     options = scene.config.model_copy(update={"max_gaussians": plan.options.max_gaussians})
     least = LEAST_SHARE * options.time_budget_s
     views = scene.held_out + (FILM_VIEWS if options.time_budget_s >= FILM_FROM_BUDGET_S else 0)
-    looked_at = 1e-6 * footage_of(plan.sizes, JUDGED_MEGAPIXELS, 0).pixels(Look())  # whatever is trained
+    looked_at = 1e-6 * footage_of(plan.sizes, JUDGED_MEGAPIXELS, 0).pixels(TrainingSize())  # whatever is trained
     after = EXPORT_SECONDS + views * measured.evaluate_s * looked_at
-    return Task(
+    return BudgetTask(
         config=options,
         sparse=scene.start.sparse,
         dense=scene.start.dense,

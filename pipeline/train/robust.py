@@ -28,10 +28,10 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.neighbour_cameras import NeighbourCameras
 from splatpipe.pipeline.train.photo_cells import PhotoCells
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.witnesses import Witnesses
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them
 LEAST_CELL_PX = 4  # smaller photos have fewer: a cell has to average out detail
@@ -58,7 +58,7 @@ def share_at(robust: float, begin: int, iteration: int) -> float:
     return robust * min(1.0, max(0.0, iteration / begin - 1.0))
 
 
-class Robust(Technique):
+class RobustMask(Technique):
     """What is known of every photo's residuals, and what follows for its pixels.
 
     Args:
@@ -81,13 +81,13 @@ class Robust(Technique):
         self.scores = torch.full((len(names), GRID, GRID), UNKNOWN)
         self.threshold = torch.full((1,), torch.inf)
         self.left_out = torch.zeros(len(names))
-        self.witnesses: Witnesses | None = None
+        self.witnesses: NeighbourCameras | None = None
         self._before: tuple[int, Tensor, Tensor] | None = None  # this iteration's row, and what it had until then
 
     def watch(self, cameras: Iterable[Camera]) -> None:
         """Say where the photos were taken, of any size; without it nothing is contradicted, so nothing left out."""
         ordered = sorted(cameras, key=lambda camera: self._row[camera.name])
-        self.witnesses = Witnesses.of(ordered, MOST_WITNESSES) if ordered else None
+        self.witnesses = NeighbourCameras.of(ordered, MOST_WITNESSES) if ordered else None
 
     def move_to(self, device: torch.device) -> None:
         """Take all to where photos are looked at."""
@@ -95,7 +95,7 @@ class Robust(Technique):
         self.left_out = self.left_out.to(device)
         self.witnesses = None if self.witnesses is None else self.witnesses.to(device)
 
-    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
         """With depths, by which the photos' places are compared."""
         self._before = None
         return replace(settings, depth=True)

@@ -8,10 +8,10 @@ from typing import Any
 
 from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
 from splatpipe.pipeline.train.draws import BACKGROUND, uniform
-from splatpipe.pipeline.train.lengths import UNTIL, Footage, Length, Stretch, growth_until, lengths_of, stretches
-from splatpipe.pipeline.train.looks import Look
+from splatpipe.pipeline.train.lengths import UNTIL, Length, PhotoSizes, Stretch, growth_until, lengths_of, stretches
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
+from splatpipe.pipeline.train.windows import TrainingSize
 
 FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
 FEW_DROPOUT = 0.2
@@ -22,7 +22,7 @@ BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the
 RESET_VISITS = 15  # of every photo between two resets at least: the same, on the captures of that method
 TAIL_SHARE = 0.1  # of the iterations done when the loss is flat: what the rest of the schedule is compressed into
 
-UNKNOWN = Footage(((1, 1, MANY_PHOTOS),))
+UNKNOWN = PhotoSizes(((1, 1, MANY_PHOTOS),))
 """Photos that fit into a window and are neither few nor many."""
 
 RGB = tuple[float, float, float]
@@ -30,7 +30,7 @@ BACKGROUNDS: dict[str, RGB | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1
 
 
 @dataclass(frozen=True)
-class Moment:
+class ScheduleStep:
     """What the schedule says of one iteration.
 
     Attributes:
@@ -96,7 +96,7 @@ class Schedule:
         behind = fields["background"]
         return Schedule(**{**fields, **parts, "background": None if behind is None else tuple(behind)})
 
-    def at(self, iteration: int, flat_at: int = 0) -> Moment:
+    def at(self, iteration: int, flat_at: int = 0) -> ScheduleStep:
         """What holds in an iteration.
 
         Args:
@@ -105,7 +105,7 @@ class Schedule:
         """
         place = self.place(iteration, flat_at)
         share = min(1.0, place / self.iterations)
-        return Moment(
+        return ScheduleStep(
             iteration=iteration,
             place=place,
             share=share,
@@ -126,7 +126,7 @@ class Schedule:
         """The degree trained at an iteration (from 1): one more every ``sh_every``."""
         return min(self.sh_degree, iteration // self.sh_every)
 
-    def look_at(self, iteration: int) -> Look:
+    def look_at(self, iteration: int) -> TrainingSize:
         """What an iteration (from 1) looks at of its photo."""
         return self.stretches[self.stretch_at(iteration)].look
 
@@ -158,12 +158,12 @@ class Schedule:
         )
         return replace(self, iterations=total, stretches=tuple(changed), density=density)
 
-    def looks_to(self, last: int) -> list[Look]:
+    def looks_to(self, last: int) -> list[TrainingSize]:
         """``look_at`` for every iteration up to the last."""
         return [self.look_at(iteration) for iteration in range(1, last + 1)]
 
     @property
-    def finest(self) -> Look:
+    def finest(self) -> TrainingSize:
         """What iterations look at in the end."""
         return self.stretches[-1].look
 
@@ -189,7 +189,7 @@ def share_of_few(photos: int) -> float:
     return min(1.0, max(0.0, (MANY_PHOTOS - photos) / (MANY_PHOTOS - FEW_PHOTOS)))
 
 
-def resolve_schedule(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedule:
+def resolve_schedule(config: TrainConfig, footage: PhotoSizes = UNKNOWN) -> Schedule:
     """The published schedule, changed for short runs, few photos and many.
 
     Args:
@@ -199,7 +199,7 @@ def resolve_schedule(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedul
     return schedule_of(config, footage, lengths_of(config, footage))
 
 
-def schedule_of(config: TrainConfig, footage: Footage, each: list[Length]) -> Schedule:
+def schedule_of(config: TrainConfig, footage: PhotoSizes, each: list[Length]) -> Schedule:
     """The same for sizes and iterations that are given.
 
     Args:
@@ -238,7 +238,7 @@ class Pace:
     photos: int
 
     @staticmethod
-    def of(config: TrainConfig, footage: Footage) -> Pace:
+    def of(config: TrainConfig, footage: PhotoSizes) -> Pace:
         """That of a training; one whose length was given keeps the published lengths, whatever the photos."""
         if config.iterations == "auto":
             return Pace(config.least_iterations, footage.photos)

@@ -16,17 +16,19 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.train.budget import FEWEST_GAUSSIANS
-from splatpipe.pipeline.train.plan import Plan
+from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 KEPT_SHARE = 0.9  # of the Gaussians each time, the most opaque: what is lost is what shows least
 HINT = "Lower train.max_megapixels or train.max_gaussians, or close what else uses the graphics card."
 
-Step = Callable[[TrainState, Plan, TrainingPhoto], None]
+Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 
 
-def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto, report: Reporter) -> None:
+def iterate_within_memory(
+    step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter
+) -> None:
     """An iteration, begun again with less where the device's memory is too small for it.
 
     Args:
@@ -55,7 +57,7 @@ def iterate_within_memory(step: Step, state: TrainState, plan: Plan, photo: Trai
         )
 
 
-def _fits(step: Step, state: TrainState, plan: Plan, photo: TrainingPhoto) -> bool:
+def _fits(step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> bool:
     steps, count = state.adam.step_count, len(state.gaussians)
     model = weakref.ref(state.gaussians)  # density control wants the old one's memory
     try:

@@ -29,7 +29,7 @@ from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
 from splatpipe.pipeline.train.draws import ELSEWHERE
 from splatpipe.pipeline.train.hooks import Shot, Technique
-from splatpipe.pipeline.train.seen_sky import PhotoSkies, SeenSky
+from splatpipe.pipeline.train.photo_sky import PhotoSkies, PhotoSky
 from splatpipe.pipeline.train.side import SideModel
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
@@ -69,7 +69,7 @@ class SkyModel(SideModel, Technique):
         super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
         self.panorama = Panorama(up, self.tensors[_COLOURS])
         self._skies = PhotoSkies(masks)
-        self._seen: SeenSky | None = None  # of the photo that is trained on
+        self._seen: PhotoSky | None = None  # of the photo that is trained on
 
     def copied(self) -> SkyModel:
         """The same with tensors of its own; the masks, which nothing changes, are shared."""
@@ -147,7 +147,7 @@ class SkyModel(SideModel, Technique):
         return {"sky_photos": self.photos}
 
     def composite(
-        self, rendered: Render, camera: Camera, seen: SeenSky | None, background: RGB, elsewhere: RGB
+        self, rendered: Render, camera: Camera, seen: PhotoSky | None, background: RGB, elsewhere: RGB
     ) -> Float[Tensor, "h w 3"]:
         """The render as the photo shows it: before the sky where that may be seen, before ``elsewhere`` where not.
 
@@ -167,7 +167,7 @@ class SkyModel(SideModel, Technique):
         return laid_over_nodes(rendered.colour, rendered.alpha, nodes, how)
 
     def loss(
-        self, alpha: Float[Tensor, "h w"], seen: SeenSky | None, inside: tuple[slice, slice] = EVERYWHERE
+        self, alpha: Float[Tensor, "h w"], seen: PhotoSky | None, inside: tuple[slice, slice] = EVERYWHERE
     ) -> Float[Tensor, ""]:
         """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness.
 
@@ -181,7 +181,7 @@ class SkyModel(SideModel, Technique):
             return loss
         return loss + OPACITY_WEIGHT * torch.where(seen.mask, alpha, 0.0)[inside].mean()
 
-    def seen(self, camera: Camera) -> SeenSky | None:
+    def seen(self, camera: Camera) -> PhotoSky | None:
         """The sky of a training photo at the size of ``camera``; None where it shows none."""
         return self._skies.seen(camera)
 

@@ -15,7 +15,7 @@ START_SHARE = 0.5  # of the cap, that the start may fill with dense points: the 
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialGaussians:
     """The initial Gaussians.
 
     Attributes:
@@ -62,11 +62,11 @@ def started(sparse: int, dense: int, cap: int) -> int:
     return min(cap, sparse + min(dense, room))
 
 
-def read_start(path: Path) -> Start:
+def read_start(path: Path) -> InitialGaussians:
     """Read what `initialize` left.
 
     Raises:
         SplatpipeError: if it is no splat.
     """
     gaussians = read_splat(path)
-    return Start(gaussians, sparse_count(read_splat_header(path).comments, len(gaussians)))
+    return InitialGaussians(gaussians, sparse_count(read_splat_header(path).comments, len(gaussians)))

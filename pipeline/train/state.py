@@ -20,8 +20,8 @@ from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint, HostArrays
 from splatpipe.pipeline.train.densify import (
     RESET_OPACITY,
+    DensifiedGaussians,
     DensityEvent,
-    Growth,
     along_curve,
     reset_opacity,
     room_at,
@@ -31,8 +31,8 @@ from splatpipe.pipeline.train.density import Density, DensityStep
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.memory import within_room
 from splatpipe.pipeline.train.paces import by_distance
-from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.plan import TrainingPlan
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.techniques import Techniques
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
@@ -70,7 +70,9 @@ class TrainState:
     whole: Gaussians | None = None
 
     @staticmethod
-    def begin(start: Gaussians, plan: Plan, techniques: Techniques, frozen: Gaussians | None = None) -> TrainState:
+    def begin(
+        start: Gaussians, plan: TrainingPlan, techniques: Techniques, frozen: Gaussians | None = None
+    ) -> TrainState:
         """The state before the first iteration.
 
         Args:
@@ -89,7 +91,11 @@ class TrainState:
 
     @staticmethod
     def of(
-        gaussians: Gaussians, plan: Plan, history: History, techniques: Techniques, frozen: Gaussians | None = None
+        gaussians: Gaussians,
+        plan: TrainingPlan,
+        history: History,
+        techniques: Techniques,
+        frozen: Gaussians | None = None,
     ) -> TrainState:
         """Gaussians with everything that the plan wants beside them, nothing of it trained."""
         density = Density(len(gaussians), plan.options.density == "absolute", gaussians.means.device)
@@ -123,7 +129,7 @@ class TrainState:
         zero = torch.zeros(1, 2, device=self.gaussians.means.device)
         return zero.expand(len(self.drawn), 2).requires_grad_()  # nobody reads its values
 
-    def step(self, gradient_rows: Bool[Tensor, " n"], now: Moment, plan: Plan, camera: Camera) -> None:
+    def step(self, gradient_rows: Bool[Tensor, " n"], now: ScheduleStep, plan: TrainingPlan, camera: Camera) -> None:
         """Step the parameters against their gradients, which are dropped; those that ``buffers`` hold, too.
 
         Args:
@@ -168,7 +174,7 @@ class TrainState:
         self._drop_gradients()
         self.techniques.begin_again()
 
-    def control_density(self, plan: Plan, iteration: int) -> None:
+    def control_density(self, plan: TrainingPlan, iteration: int) -> None:
         """Grow, prune and reset where this iteration is one for it; only prune and reset once growth has ended.
 
         Args:
@@ -191,7 +197,7 @@ class TrainState:
                 self.adam.zero_state(names=("opacity_logits",))
                 self.history.resets.append(iteration)
 
-    def _densify(self, plan: Plan, limit: int, iteration: int) -> None:
+    def _densify(self, plan: TrainingPlan, limit: int, iteration: int) -> None:
         """Give the model the rows that density control chooses, at most ``limit`` where it adds any."""
         free_frames()  # of another size by the end of this, and memory is tight meanwhile
         try:
@@ -202,7 +208,7 @@ class TrainState:
         self._become(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
 
-    def _growth(self, plan: Plan, limit: int, iteration: int) -> tuple[Growth, dict[str, int]]:
+    def _growth(self, plan: TrainingPlan, limit: int, iteration: int) -> tuple[DensifiedGaussians, dict[str, int]]:
         """The rows that density control chooses, and its counts; nothing is changed."""
         gaussians = self.gaussians.detach()
         gone = self.techniques.unwanted(gaussians, iteration)
@@ -235,7 +241,7 @@ class TrainState:
         self._become(unchanged(self.gaussians.detach(), ~gone))
         self.history.add_density(DensityEvent(iteration, 0, 0, int(gone.sum()), 0, gaussians=len(self.gaussians)))
 
-    def _become(self, growth: Growth) -> None:
+    def _become(self, growth: DensifiedGaussians) -> None:
         """Take the rows of a growth, with their moments; one tensor after the other, for memory is tight."""
         self.buffers = GradientBuffers()
         frozen = None if self.whole is None else self.whole.detach().after(len(self.gaussians)).clone()
@@ -278,7 +284,7 @@ class TrainState:
     @staticmethod
     def restore(
         checkpoint: Checkpoint,
-        plan: Plan,
+        plan: TrainingPlan,
         techniques: Techniques,
         device: torch.device = CPU,
         frozen: Gaussians | None = None,

@@ -17,10 +17,10 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_view, reduced_views
-from splatpipe.pipeline.train.looks import Frame, Look
 from splatpipe.pipeline.train.photo_cache import PhotoCache, stored_bytes
 from splatpipe.pipeline.train.upload import Upload, Uploader
 from splatpipe.pipeline.train.visits import PhotoVisits, Visit, Visits
+from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize
 
 EVERYWHERE = (slice(None), slice(None))  # rows and columns
 READ_AHEAD = 3  # photos in flight: hides a slow decode behind an iteration
@@ -59,7 +59,7 @@ class TrainingPhoto:
 
 
 @dataclass(frozen=True)
-class _Sent:
+class _PendingPhoto:
     """A photo on its way, and what it will be."""
 
     camera: Camera
@@ -98,7 +98,7 @@ class PhotoStream:
     ) -> None:
         self._views = views
         self._uploader = Uploader(torch.device("cpu"))
-        self._pending: deque[Future[_Sent]] = deque()
+        self._pending: deque[Future[_PendingPhoto]] = deque()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
         self.go_on(visits, first)
@@ -122,7 +122,7 @@ class PhotoStream:
     @staticmethod
     def over(
         views: Sequence[View],
-        looks: Sequence[Look],
+        looks: Sequence[TrainingSize],
         seed: int,
         first: int,
         cache: Path,
@@ -197,7 +197,7 @@ class PhotoStream:
         for level, decoded in zip(fitting, reduced_views(view, self._visits.max_megapixels, fitting), strict=True):
             self._cache.put((index, level), *decoded)
 
-    def _photo(self, iteration: int) -> _Sent:
+    def _photo(self, iteration: int) -> _PendingPhoto:
         visit = self._visits.at(iteration)
         window, whole = visit.window, visit.camera
         cut = window.grown(whole.width, whole.height)
@@ -205,7 +205,7 @@ class PhotoStream:
         mask = visit.counted(mask, cut)
         left, top, right, bottom = inner = window.within(cut)
         here = window.pixels if mask is None else int(np.count_nonzero(mask[top:bottom, left:right]))
-        return _Sent(
+        return _PendingPhoto(
             whole.cut(cut.left, cut.top, cut.width, cut.height),
             self._uploader.begin(pixels, mask),
             here == 0,
@@ -214,7 +214,7 @@ class PhotoStream:
             visit.round,
         )
 
-    def _decoded(self, visit: Visit, cut: Frame) -> tuple[Pixels, Mask | None, int]:
+    def _decoded(self, visit: Visit, cut: PixelRectangle) -> tuple[Pixels, Mask | None, int]:
         """A part of a photo, and how many of the whole photo's pixels count."""
         if visit.view in self._unread:
             self._store(visit.view)

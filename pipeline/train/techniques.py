@@ -18,16 +18,16 @@ from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.backdrop import Backdrop
-from splatpipe.pipeline.train.clearing import Clearing, free_space_of
 from splatpipe.pipeline.train.densify import DensitySchedule
-from splatpipe.pipeline.train.distortion import FIRST_SHARE, Distortion
+from splatpipe.pipeline.train.distortion_loss import FIRST_SHARE, DistortionLoss
 from splatpipe.pipeline.train.dropout import Dropout
 from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.train.floater_pruning import FloaterPruning, free_space_of
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.robust import Robust
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.plan import TrainingPlan
+from splatpipe.pipeline.train.robust import RobustMask
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
@@ -35,7 +35,7 @@ Kind = TypeVar("Kind", bound=Technique)
 
 
 def make_techniques(
-    plan: Plan,
+    plan: TrainingPlan,
     sky: SkyModel | None = None,
     views: Sequence[View] = (),
     dataset: Path | None = None,
@@ -67,13 +67,13 @@ def make_techniques(
     if options.exposure == "affine":
         made.append(Exposure(plan.train_views))
     if options.robust:
-        robust = Robust(plan.train_views, options.robust, schedule.density.first)
+        robust = RobustMask(plan.train_views, options.robust, schedule.density.first)
         robust.watch(view.camera for view in views)
         made.append(robust)
     if options.distortion_weight:
-        made.append(Distortion(options.distortion_weight, int(FIRST_SHARE * schedule.iterations)))
+        made.append(DistortionLoss(options.distortion_weight, int(FIRST_SHARE * schedule.iterations)))
     if options.prune_free_space and dataset is not None:
-        made.append(Clearing(free_space_of(views, dataset), schedule))
+        made.append(FloaterPruning(free_space_of(views, dataset), schedule))
     if area is not None:
         made.append(Backdrop(area, schedule.density))
     for technique in made:
@@ -114,13 +114,13 @@ class Techniques:
         """The same with another one in the place of that of its kind."""
         return Techniques(tuple(given if type(given) is type(each) else each for each in self.each))
 
-    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
         """How to render."""
         for technique in self.each:
             settings = technique.settings(settings, model, camera, now)
         return settings
 
-    def before_render(self, model: Gaussians, now: Moment) -> Gaussians:
+    def before_render(self, model: Gaussians, now: ScheduleStep) -> Gaussians:
         """The model as it is rendered in this iteration."""
         for technique in self.each:
             model = technique.before_render(model, now)

@@ -45,7 +45,7 @@ class Uploader:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._lead = Lead(QUEUED)
+        self._lead = RunAheadLimit(QUEUED)
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def begin(self, pixels: Pixels, mask: Mask | None) -> Upload:
@@ -94,14 +94,14 @@ class Uploader:
 
 
 @runtime_checkable
-class Event(Protocol):
+class DeviceEvent(Protocol):
     """As ``torch.cuda.Event``."""
 
     def synchronize(self) -> None:
         """Wait until it has happened."""
 
 
-class Lead:
+class RunAheadLimit:
     """Keeps the host from running ahead of a device without end, and the device busy all the same.
 
     Args:
@@ -110,9 +110,9 @@ class Lead:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._ahead: deque[Event] = deque()
+        self._ahead: deque[DeviceEvent] = deque()
 
-    def add(self, event: Event) -> None:
+    def add(self, event: DeviceEvent) -> None:
         """Take what the device comes to later than all before; waits for the oldest where there are too many."""
         self._ahead.append(event)
         if len(self._ahead) > self._most:

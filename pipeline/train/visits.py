@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, reduced_camera
 from splatpipe.pipeline.train.draws import WINDOW_ORDER, permutation, random_bits
-from splatpipe.pipeline.train.looks import Frame, Look, windows_of
+from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize, windows_of
 
 MOST_WINDOWS = 1 << 20  # of a photo: where the next one's random numbers begin
 
@@ -36,11 +36,11 @@ class Visit:
     view: int
     level: int
     camera: Camera
-    window: Frame
+    window: PixelRectangle
     cells: Bool[np.ndarray, "rows columns"] | None = field(default=None, compare=False)
     round: int = field(default=0, compare=False)
 
-    def counted(self, mask: Mask | None, cut: Frame) -> Mask | None:
+    def counted(self, mask: Mask | None, cut: PixelRectangle) -> Mask | None:
         """Which pixels of a part count; None where all do.
 
         Args:
@@ -96,7 +96,7 @@ class PhotoVisits(Visits):
     """
 
     def __init__(
-        self, cameras: Sequence[Camera], looks: Sequence[Look], seed: int, max_megapixels: float | None = None
+        self, cameras: Sequence[Camera], looks: Sequence[TrainingSize], seed: int, max_megapixels: float | None = None
     ) -> None:
         self._cameras, self._looks, self._seed, self.max_megapixels = cameras, looks, seed, max_megapixels
         photos = len(cameras)
@@ -112,7 +112,7 @@ class PhotoVisits(Visits):
         self._given = np.full(len(looks), -1, np.int64)  # windows that do not follow from the turn
         for look in sorted(set(looks), key=lambda look: (look.level, look.window_pixels)):
             self._mix(look)
-        before: Counter[tuple[int, Look]] = Counter()
+        before: Counter[tuple[int, TrainingSize]] = Counter()
         for place, key in enumerate(zip(self._views.tolist(), looks, strict=True)):
             self._turns[place] = before[key]
             before[key] += 1
@@ -127,10 +127,10 @@ class PhotoVisits(Visits):
                 begun = photos * -(-begun // photos)
             yield from range(begun, until + 1, self._count(look))
 
-    def _count(self, look: Look) -> int:
+    def _count(self, look: TrainingSize) -> int:
         return max(1, sum(len(self._windows_at(view, look)) for view in range(len(self._cameras))))
 
-    def _mix(self, look: Look) -> None:
+    def _mix(self, look: TrainingSize) -> None:
         """Let the windows of all photos go by rounds, where photos have different numbers of them."""
         counts = [len(self._windows_at(view, look)) for view in range(len(self._cameras))]
         if len(set(counts)) < 2:
@@ -140,7 +140,7 @@ class PhotoVisits(Visits):
         rows = in_rounds(self._seed, len(pairs), len(places))
         self._views[places], self._given[places] = pairs[rows].T
 
-    def _windows_at(self, view: int, look: Look) -> list[Frame]:
+    def _windows_at(self, view: int, look: TrainingSize) -> list[PixelRectangle]:
         camera = self.camera(view, look.level)
         return self._windows[camera.width, camera.height, look.window_pixels]
 
@@ -185,10 +185,10 @@ class PartVisits(Visits):
     def __init__(
         self,
         cameras: Sequence[Camera],
-        looks: Sequence[Look],
+        looks: Sequence[TrainingSize],
         seed: int,
         max_megapixels: float | None,
-        parts: Mapping[int, Sequence[tuple[int, Frame]]],
+        parts: Mapping[int, Sequence[tuple[int, PixelRectangle]]],
         cells: Mapping[int, Bool[np.ndarray, "rows columns"]] | None = None,
     ) -> None:
         self._cameras, self._looks, self.max_megapixels, self._parts = cameras, looks, max_megapixels, parts
@@ -228,7 +228,7 @@ def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"
     return np.concatenate(rounds)[:visits]
 
 
-def runs(looks: Sequence[Look]) -> Iterable[tuple[Look, int, int]]:
+def runs(looks: Sequence[TrainingSize]) -> Iterable[tuple[TrainingSize, int, int]]:
     """The looks one after the other, each with the iterations that were done before it and that are done after it."""
     done = 0
     for look, same in groupby(looks):
@@ -249,7 +249,7 @@ def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits
     return found
 
 
-def _wanted_again(views: Sequence[int], looks: Sequence[Look]) -> dict[int, list[int]]:
+def _wanted_again(views: Sequence[int], looks: Sequence[TrainingSize]) -> dict[int, list[int]]:
     """Of some iterations' photos those that are looked at more than once, with their levels."""
     times: Counter[int] = Counter()
     levels: defaultdict[int, set[int]] = defaultdict(set)

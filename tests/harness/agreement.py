@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from frames import Case, Outcome
+from frames import RenderCase, RenderOutcome
 
 # Largest differences of pictures, float32 against float64.
 PICTURES = {
@@ -25,7 +25,7 @@ FLIP = 0.02
 """How far off such a pixel's colour may be: a step of alpha, 1/255, of colours up to four."""
 
 
-def flipped(ours: Outcome, exact: Outcome) -> np.ndarray:
+def flipped(ours: RenderOutcome, exact: RenderOutcome) -> np.ndarray:
     """(h, w) where a picture is beyond its tolerance."""
     beyond = [
         (np.abs(ours.pictures[name].astype(np.float64) - exact.pictures[name]) <= limit)
@@ -35,7 +35,7 @@ def flipped(ours: Outcome, exact: Outcome) -> np.ndarray:
     return ~np.logical_and.reduce([each.all(axis=2) if each.ndim == 3 else each for each in beyond])
 
 
-def without_flips(case: Case, flips: np.ndarray) -> Case:
+def without_flips(case: RenderCase, flips: np.ndarray) -> RenderCase:
     """The case with nothing coming back from some pixels."""
     upstream = {
         name: np.where(flips[..., None] if value.ndim == 3 else flips, np.float32(0), value)
@@ -44,7 +44,7 @@ def without_flips(case: Case, flips: np.ndarray) -> Case:
     return case.changed(upstream=upstream)
 
 
-def picture_complaints(ours: Outcome, exact: Outcome) -> list[str]:
+def picture_complaints(ours: RenderOutcome, exact: RenderOutcome) -> list[str]:
     """In what way pictures, radii and visible are not those of the definition."""
     found = []
     flips = flipped(ours, exact)
@@ -64,7 +64,7 @@ def picture_complaints(ours: Outcome, exact: Outcome) -> list[str]:
     return found
 
 
-def gradient_errors(ours: Outcome, exact: Outcome) -> dict[str, float]:
+def gradient_errors(ours: RenderOutcome, exact: RenderOutcome) -> dict[str, float]:
     """By parameter, relative in L2 over all Gaussians; not a number where one is not."""
     return {
         name: float(
@@ -75,7 +75,7 @@ def gradient_errors(ours: Outcome, exact: Outcome) -> dict[str, float]:
     }
 
 
-def gradient_complaints(ours: Outcome, exact: Outcome, limit: float = GRADIENTS) -> list[str]:
+def gradient_complaints(ours: RenderOutcome, exact: RenderOutcome, limit: float = GRADIENTS) -> list[str]:
     """Which gradients are not those of the definition."""
     errors = gradient_errors(ours, exact)
     return [f"gradient of {name}: {error:.1e}" for name, error in errors.items() if not error <= limit]

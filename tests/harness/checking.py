@@ -18,7 +18,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from agreement import gradient_complaints, picture_complaints
-from frames import ORDERS, Case, Outcome, controls, run
+from frames import ORDERS, RenderCase, RenderOutcome, controls, run
 from training import Draws, Loss, step_complaints
 
 from splatpipe.pipeline.engine.errors import MachineError
@@ -29,20 +29,20 @@ PATIENCE_S = 60
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferenceResult:
     """By the definition: pictures and gradients of frames, a loss, draws, and pictures of a large frame."""
 
-    frames: list[tuple[Case, Outcome]]
+    frames: list[tuple[RenderCase, RenderOutcome]]
     loss: Loss
     draws: Draws
-    large: tuple[Case, Outcome]
+    large: tuple[RenderCase, RenderOutcome]
 
 
-def complaints(library: CudaLibrary, truth: Truth) -> Iterator[str]:
+def complaints(library: CudaLibrary, truth: ReferenceResult) -> Iterator[str]:
     """In what way the kernels are not right, one after another; nothing if they are."""
     harness = controls(library)
     harness.harness_multiprocessors(1)  # so that blocks have several turns
-    firsts: list[Outcome] = []
+    firsts: list[RenderOutcome] = []
     for turn, order in enumerate(ORDERS):
         harness.harness_order(*order)
         for number, (case, exact) in enumerate(truth.frames):
@@ -62,7 +62,7 @@ def complaints(library: CudaLibrary, truth: Truth) -> Iterator[str]:
         yield from truth.draws.complaints(library)
 
 
-def first_complaint(library: CudaLibrary, truth: Truth) -> str:
+def first_complaint(library: CudaLibrary, truth: ReferenceResult) -> str:
     """The first of ``complaints``, also where the kernels do not even run; empty if there is none."""
     np.seterr(all="ignore")  # poison is signalling NaN
     try:
@@ -71,7 +71,7 @@ def first_complaint(library: CudaLibrary, truth: Truth) -> str:
         return str(error)
 
 
-def in_a_process(library: CudaLibrary, truth: Truth, fault: int) -> str:
+def in_a_process(library: CudaLibrary, truth: ReferenceResult, fault: int) -> str:
     """``first_complaint`` with a fault alive, or how the process ended."""
     reading, writing = os.pipe()
     child = os.fork()

@@ -6,19 +6,19 @@ import math
 
 import numpy as np
 import torch
-from frames import GREY, PARAMETERS, Case, Outcome
+from frames import GREY, PARAMETERS, RenderCase, RenderOutcome
 
 from splatpipe.pipeline.geometry.camera import Camera, Window
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 
-def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object) -> Case:
+def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object) -> RenderCase:
     """The case of a scene, with random gradients of all pictures."""
     rng = np.random.default_rng(seed)
     size, part = (camera.height, camera.width), camera.window
     upstream = {"colour": rng.normal(size=(*size, 3)), **{name: rng.normal(size=size) for name in GREY}}
-    return Case(
+    return RenderCase(
         {name: getattr(scene, name).detach().numpy() for name in PARAMETERS},
         camera.cam_from_world[:3].copy(),
         (camera.fx, camera.fy, camera.cx, camera.cy),
@@ -29,13 +29,13 @@ def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object)
     ).changed(**settings)
 
 
-def camera_of(case: Case) -> Camera:
+def camera_of(case: RenderCase) -> Camera:
     pose = np.eye(4)
     pose[:3] = case.pose
     return Camera("view", *case.size, *case.intrinsics, pose, None if case.window is None else Window(*case.window))
 
 
-def options_of(case: Case) -> RenderOptions:
+def options_of(case: RenderCase) -> RenderOptions:
     return RenderOptions(
         case.sh_degree,
         background=case.background,
@@ -47,7 +47,7 @@ def options_of(case: Case) -> RenderOptions:
     )
 
 
-def exact_outcome(case: Case, backend: str = "reference", gradients: bool = True) -> Outcome:
+def exact_outcome(case: RenderCase, backend: str = "reference", gradients: bool = True) -> RenderOutcome:
     """What the definition gives in float64, or the CPU's kernels in float32."""
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = {name: torch.from_numpy(case.rows[name]).to(dtype).requires_grad_(gradients) for name in PARAMETERS}
@@ -65,4 +65,4 @@ def exact_outcome(case: Case, backend: str = "reference", gradients: bool = True
                 total = total + (getattr(made, name) * torch.from_numpy(weights).to(dtype)).sum()
         asked = leaves | {"means2d": probe}
         back = dict(zip(asked, torch.autograd.grad(total, list(asked.values())), strict=True))
-    return Outcome(pictures, {name: value.numpy() for name, value in back.items()})
+    return RenderOutcome(pictures, {name: value.numpy() for name, value in back.items()})

@@ -63,7 +63,7 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class Case:
+class RenderCase:
     """A view of some Gaussians, and what comes back from its pictures.
 
     Attributes:
@@ -104,19 +104,19 @@ class Case:
         shot.antialias, shot.depths, shot.magnitudes = int(self.antialias), int(self.depths), int(self.magnitudes)
         return shot
 
-    def changed(self, **changes: object) -> Case:
+    def changed(self, **changes: object) -> RenderCase:
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RenderOutcome:
     """What came out: pictures, radii and visible; gradients by parameter and of means2d; the frame's facts."""
 
     pictures: dict[str, np.ndarray]
     gradients: dict[str, np.ndarray]
     facts: tuple[int, int, int] = (0, 0, 0)
 
-    def differs(self, other: Outcome) -> list[str]:
+    def differs(self, other: RenderOutcome) -> list[str]:
         """Names of what does not have the same bits; the number of chunks is no result."""
         ours, theirs = self.pictures | self.gradients, other.pictures | other.gradients
         names = [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()]
@@ -131,10 +131,10 @@ def rows_of(arrays: dict[str, np.ndarray]) -> SplatRows:
     return SplatRows(*(pointer(arrays[name]) for name in PARAMETERS))
 
 
-class Frame:
+class DeviceFrame:
     """A case on the device, from forward on."""
 
-    def __init__(self, library: CudaLibrary, case: Case, capacity: int = 1 << 16, passes: int = 1) -> None:
+    def __init__(self, library: CudaLibrary, case: RenderCase, capacity: int = 1 << 16, passes: int = 1) -> None:
         self.library, self.case, self.at = library, case, Memory()
         self.shot = case.shot()
         count, capacity = case.count, max(capacity, case.count, 1)
@@ -182,16 +182,16 @@ class Frame:
         return gradients | {"means2d": means2d}
 
 
-def run(library: CudaLibrary, case: Case, capacity: int = 1 << 16, passes: int = 1) -> Outcome:
+def run(library: CudaLibrary, case: RenderCase, capacity: int = 1 << 16, passes: int = 1) -> RenderOutcome:
     """Forward and, where there is something to come back, backward; asserts that nothing was written beside."""
-    frame = Frame(library, case, capacity, passes)
+    frame = DeviceFrame(library, case, capacity, passes)
     pictures = frame.forward()
     gradients = {}
     if case.upstream:
         frame.blend_backward()
         gradients = frame.project_backward()
     assert not frame.at.overrun(), f"written beside {frame.at.overrun()}"
-    return Outcome(pictures, gradients, frame.facts())
+    return RenderOutcome(pictures, gradients, frame.facts())
 
 
 def controls(library: CudaLibrary) -> ctypes.CDLL:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from frames import PARAMETERS, Case, Frame, Memory, Outcome, pointer, rows_of
+from frames import PARAMETERS, DeviceFrame, Memory, RenderCase, RenderOutcome, pointer, rows_of
 
 from splatpipe.pipeline.raster.cuda_api import SplatRectangle, SplatStep
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
@@ -56,13 +56,13 @@ class Loss:
             yield f"gradient of the loss: {error:.1e}"
 
 
-def step_complaints(library: CudaLibrary, case: Case, exact: Outcome) -> Iterator[str]:
+def step_complaints(library: CudaLibrary, case: RenderCase, exact: RenderOutcome) -> Iterator[str]:
     """Of Adam's step (Kingma and Ba, ICLR 2015) fused with the backward pass, of the visible rows."""
     rng = np.random.default_rng(8)
     start = {"value": case.rows}
     start["mean"] = {name: (1e-2 * rng.normal(size=rows.shape)).astype(np.float32) for name, rows in case.rows.items()}
     start["square"] = {name: (1e-4 * rng.random(rows.shape)).astype(np.float32) for name, rows in case.rows.items()}
-    frame = Frame(library, case)
+    frame = DeviceFrame(library, case)
     frame.forward()
     frame.blend_backward()
     now = {

@@ -38,7 +38,7 @@ class Mounts:
 
 
 @dataclass(frozen=True)
-class End:
+class ContainerEnd:
     """How a stopped container ended.
 
     Attributes:
@@ -84,7 +84,7 @@ class Container:
             raise Problem(f"It complains:\n{self._told()}")
         return self._told()
 
-    def stop_inside(self, command: list[str], stage: str, done: float) -> End:
+    def stop_inside(self, command: list[str], stage: str, done: float) -> ContainerEnd:
         """Run a command and send SIGTERM to it once a stage has done more than so much."""
         before = sum(1 for _ in self._events())
         with self._running(command) as process:
@@ -96,7 +96,7 @@ class Container:
             except subprocess.TimeoutExpired:
                 subprocess.run(["runc", "kill", self._name, "KILL"], check=True)
                 process.wait(PATIENCE_S)
-            return End(process.returncode, time.monotonic() - sent_s, progress, self._told())
+            return ContainerEnd(process.returncode, time.monotonic() - sent_s, progress, self._told())
 
     def _await_progress(self, process: subprocess.Popen[bytes], before: int, stage: str, done: float) -> str:
         until_s = time.monotonic() + PATIENCE_S

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.run_sources import RunSurface
-from splatpipe.pipeline.surface.site import Site
+from splatpipe.pipeline.surface.site_extent import SiteExtent
 from splatpipe.pipeline.surface.sources import DepthSource
 from splatpipe.pipeline.survey.frames import Frame
 
@@ -19,9 +19,9 @@ GSD_M = 0.1
 SIDE_M = 10.0  # of what is made into clouds and meshes: the house, and lawn around it
 
 
-def house_site() -> Site:
+def house_site() -> SiteExtent:
     """A square about the house."""
-    return Site(
+    return SiteExtent(
         GSD_M,
         -1.0,
         7.0,

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.sfm.lens_model import simplest
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 WIDTH, HEIGHT = 1200, 900
 TRACK = 9  # photos that would find a point if all had it in view
@@ -21,7 +21,7 @@ class LensScene:
     """A model with simple lenses, its view graph, and the lenses that the points were seen through."""
 
     model: pycolmap.Reconstruction
-    verified: Verified
+    verified: ViewGraph
     lenses: Mapping[int, pycolmap.Camera]
 
 
@@ -103,7 +103,7 @@ def make_scene(
             model.add_point3D(place, track, np.zeros(3, np.uint8))
             for (first, k), (second, j) in pairwise(elements):
                 matches.setdefault((first, second), []).append((k, j))
-    verified = Verified(
+    verified = ViewGraph(
         {number: f"{number:03}.jpg" for number in keypoints},
         {number: lens.camera_id for number, lens in enumerate(lens_of, start=1)},
         {number: pycolmap.Camera(camera.todict()) for number, camera in cameras.items()},

@@ -17,7 +17,7 @@ from splatpipe.pipeline.photos.dataset import Split, View, load_views, split_vie
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import C0, rgb_to_dc
-from splatpipe.pipeline.train.lengths import Footage
+from splatpipe.pipeline.train.lengths import PhotoSizes
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.schedule import UNKNOWN, Schedule, resolve_schedule
 
@@ -45,7 +45,7 @@ def plain(**options: object) -> TrainConfig:
 def resolver(**density: object) -> Callable[[TrainConfig, int], Schedule]:
     """``resolve_schedule`` with other lengths and limits of density control, to be put into its place."""
 
-    def resolved(config: TrainConfig, footage: Footage = UNKNOWN) -> Schedule:
+    def resolved(config: TrainConfig, footage: PhotoSizes = UNKNOWN) -> Schedule:
         schedule = resolve_schedule(config, footage)
         return replace(schedule, density=replace(schedule.density, **density))  # type: ignore[arg-type]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from lens_scene import HEIGHT, WIDTH, look_from, make_lens
 
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 FOCAL = 1000.0
 NOISE_PX = 0.5
@@ -32,7 +32,7 @@ class Ring:
     poses: Mapping[int, Pose]
     points: np.ndarray
     rows: Mapping[int, np.ndarray]
-    verified: Verified
+    verified: ViewGraph
 
     def centre(self, number: int) -> np.ndarray:
         pose = self.poses[number]
@@ -71,7 +71,7 @@ def make_ring(
             kept = np.sort(rng.permutation(len(a))[: most - 5 * step])
             matches[first, second] = np.column_stack([a[kept], b[kept]]).astype(np.uint32)
     names = {number: f"{number:03}.jpg" for number in poses}
-    verified = Verified(names, dict.fromkeys(poses, 1), {1: lens}, keypoints, dict(sorted(matches.items())))
+    verified = ViewGraph(names, dict.fromkeys(poses, 1), {1: lens}, keypoints, dict(sorted(matches.items())))
     return Ring(poses, places, rows, verified)
 
 
@@ -114,7 +114,7 @@ def turn_up(degrees: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def with_matches(ring: Ring, wrong: Mapping[tuple[int, int], int], seed: int = 1) -> Verified:
+def with_matches(ring: Ring, wrong: Mapping[tuple[int, int], int], seed: int = 1) -> ViewGraph:
     """The view graph with pairs whose matches are of things that only look alike."""
     rng = np.random.default_rng(seed)
     matches = dict(ring.verified.matches)
@@ -122,7 +122,7 @@ def with_matches(ring: Ring, wrong: Mapping[tuple[int, int], int], seed: int = 1
         a, b = (rng.permutation(len(ring.verified.keypoints[number]))[:count] for number in (i, j))
         matches[i, j] = np.column_stack([a, b]).astype(np.uint32)
     old = ring.verified
-    return Verified(old.names, old.camera_of, old.cameras, old.keypoints, dict(sorted(matches.items())))
+    return ViewGraph(old.names, old.camera_of, old.cameras, old.keypoints, dict(sorted(matches.items())))
 
 
 def write_descriptors(ring: Ring, path: Path) -> None:
@@ -137,7 +137,7 @@ def write_descriptors(ring: Ring, path: Path) -> None:
             database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, values))
 
 
-def write_database(verified: Verified, path: Path, keep: Callable[[int, int], bool] = lambda i, j: True) -> None:
+def write_database(verified: ViewGraph, path: Path, keep: Callable[[int, int], bool] = lambda i, j: True) -> None:
     """The view graph as matching leaves it."""
     with pycolmap.Database.open(path) as database:
         for camera in verified.cameras.values():

@@ -49,7 +49,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.comparison import brighter_ev, duller
 from splatpipe.pipeline.sfm.keypoints import single_threaded_opencv
-from splatpipe.pipeline.sfm.quick_match import Glimpse, glimpse
+from splatpipe.pipeline.sfm.quick_match import QuickFeatures, glimpse
 
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
@@ -130,7 +130,7 @@ def look_at(intake: Intake, threads: int, report: Reporter) -> Look:
     if count < LEAST_PHOTOS:
         return Look((), NOTHING, (), unknown, unknown, (float("nan"),) * count)
     names = [photo.name for photo in intake.photos]
-    glimpses: list[Glimpse] = []
+    glimpses: list[QuickFeatures] = []
     with single_threaded_opencv():
         for found in ordered_map(glimpse, intake.photos, threads):
             glimpses.append(found)

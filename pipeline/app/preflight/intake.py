@@ -22,7 +22,7 @@ from splatpipe.pipeline.photos.duplicates import split_duplicates
 from splatpipe.pipeline.photos.names import printable, some
 from splatpipe.pipeline.photos.photo_list import Photo, photo_root
 from splatpipe.pipeline.photos.preparation import Preparation, check_photos
-from splatpipe.pipeline.photos.scan import LeftOut, scan_folder
+from splatpipe.pipeline.photos.scan import ExcludedPhoto, scan_folder
 from splatpipe.pipeline.sfm.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairs import Layout
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
@@ -147,7 +147,7 @@ def _file_places(
     return places.by_name, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
 
 
-def _unreadable(entries: Sequence[LeftOut]) -> list[Finding]:
+def _unreadable(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
     """One finding a reason."""
     by_reason: dict[str, list[str]] = {}
     for entry in entries:
@@ -159,7 +159,7 @@ def _unreadable(entries: Sequence[LeftOut]) -> list[Finding]:
     ]
 
 
-def _duplicates(entries: Sequence[LeftOut]) -> list[Finding]:
+def _duplicates(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
     if not entries:
         return []
     told = [f"{printable(entry.name)} {entry.reason}" for entry in entries]

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.app.preflight.findings import Finding
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import printable, some
-from splatpipe.pipeline.sfm.quick_match import Glimpse
+from splatpipe.pipeline.sfm.quick_match import QuickFeatures
 
 DULL = 0.85  # of a logarithm of energies: a shake of 3 px gives 1.1 and more, sharp photos 0.5 at most
 DULL_SPREADS = 4.0  # times the usual deviation between photos, where a whole capture is shaken
@@ -59,7 +59,7 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
 
 
 def find_exposures(
-    photos: Sequence[CheckedPhoto], glimpses: Sequence[Glimpse], brighter_ev: Float64[np.ndarray, " n"]
+    photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures], brighter_ev: Float64[np.ndarray, " n"]
 ) -> list[Finding]:
     """Photos much brighter or darker than their neighbours where both show the same, and photos that show nothing."""
     findings = []
@@ -108,7 +108,7 @@ def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:
     return ", as its exposure settings say" if by_settings * step > 0.5 * step * step else ""
 
 
-def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[Glimpse]) -> list[Finding]:
+def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures]) -> list[Finding]:
     """Photos that are another one saved anew: the same picture and time, other bytes."""
     if len(photos) < 2:
         return []

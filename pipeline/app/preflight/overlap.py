@@ -21,10 +21,10 @@ from splatpipe.pipeline.sfm.pairs import (
     positions_tell,
     select_pairs,
 )
-from splatpipe.pipeline.sfm.quick_match import Agreement, Glimpse, match_glimpses
+from splatpipe.pipeline.sfm.quick_match import InlierMatches, QuickFeatures, match_glimpses
 from splatpipe.pipeline.sfm.retrieval import look_alike_costs
 from splatpipe.pipeline.survey.flight_gaps import MissingStrip, find_missing
-from splatpipe.pipeline.survey.swapped_positions import Flight, find_swapped
+from splatpipe.pipeline.survey.swapped_positions import PositionEvidence, find_swapped
 
 EXHAUSTIVE_UP_TO = 40  # photos: 780 pairs, five seconds
 NEIGHBOURS = 8  # partners a photo by positions or sequence; the run takes 20
@@ -45,7 +45,7 @@ class Overlap:
         pieces: Photos that hang together, the largest first.
     """
 
-    found: Mapping[Pair, Agreement]
+    found: Mapping[Pair, InlierMatches]
     pieces: tuple[tuple[int, ...], ...]
 
     @property
@@ -62,7 +62,7 @@ class Overlap:
         return own
 
 
-def match_quickly(layout: Layout, glimpses: Sequence[Glimpse], threads: int, report: Reporter) -> Overlap:
+def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: int, report: Reporter) -> Overlap:
     """Match neighbours by what is known of the photos, look-alikes, and more of them for those that find no partner."""
     count = len(layout)
 
@@ -86,7 +86,7 @@ def match_quickly(layout: Layout, glimpses: Sequence[Glimpse], threads: int, rep
     return Overlap(found, pieces_of(found, count))
 
 
-def pieces_of(found: Mapping[Pair, Agreement], count: int) -> tuple[tuple[int, ...], ...]:
+def pieces_of(found: Mapping[Pair, InlierMatches], count: int) -> tuple[tuple[int, ...], ...]:
     """Photos (numbers) that hang together, the largest piece first."""
     labels = components([pair for pair, agreed in found.items() if len(agreed)], count)
     pieces: dict[int, list[int]] = {}
@@ -126,13 +126,13 @@ def overlap_findings(names: Sequence[str], overlap: Overlap) -> list[Finding]:
     return findings
 
 
-def flight_of(layout: Layout, overlap: Overlap) -> Flight:
+def flight_of(layout: Layout, overlap: Overlap) -> PositionEvidence:
     """The way of the flight; without places where these scatter no wider than their errors."""
     places = layout.positions_m if positions_tell(layout) else np.full_like(layout.positions_m, np.nan)
-    return Flight(places, layout.times, overlap.matches)
+    return PositionEvidence(places, layout.times, overlap.matches)
 
 
-def swap_findings(names: Sequence[str], flight: Flight) -> list[Finding]:
+def swap_findings(names: Sequence[str], flight: PositionEvidence) -> list[Finding]:
     """Photos that have each other's position."""
     findings = []
     for pair in find_swapped(flight):
@@ -145,7 +145,7 @@ def swap_findings(names: Sequence[str], flight: Flight) -> list[Finding]:
     return findings
 
 
-def gap_findings(names: Sequence[str], flight: Flight) -> tuple[list[Finding], list[Gap]]:
+def gap_findings(names: Sequence[str], flight: PositionEvidence) -> tuple[list[Finding], list[Gap]]:
     """Strips of photos that are missing along the way."""
     findings, gaps = [], []
     for strip in find_missing(names, flight):
@@ -161,7 +161,7 @@ def gap_findings(names: Sequence[str], flight: Flight) -> tuple[list[Finding], l
     return findings, gaps
 
 
-def _outline(flight: Flight, strip: MissingStrip) -> tuple[tuple[float, float], ...]:
+def _outline(flight: PositionEvidence, strip: MissingStrip) -> tuple[tuple[float, float], ...]:
     """A box along the gap."""
     start, end = flight.places_m[strip.before, :2], flight.places_m[strip.after, :2]
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)

@@ -13,7 +13,7 @@ from splatpipe.pipeline.app.preflight.findings import ControlPlace, Finding, Pla
 from splatpipe.pipeline.app.preflight.intake import Intake
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.names import NameFinder, some
-from splatpipe.pipeline.sfm.footprints import FURTHEST, LEAST_HEIGHT_M, Views
+from splatpipe.pipeline.sfm.footprints import FURTHEST, LEAST_HEIGHT_M, StatedPoses
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
@@ -33,7 +33,7 @@ def origin_of(intake: Intake) -> tuple[float, float] | None:
     return None if first is None else (first.latitude, first.longitude)
 
 
-def footprint(views: Views | None, photo: int) -> tuple[Place, ...] | None:
+def footprint(views: StatedPoses | None, photo: int) -> tuple[Place, ...] | None:
     """Corners of what a photo shows of the ground, as far as it reaches; None where that is not known."""
     if views is None or not bool(views.known()[photo]):
         return None

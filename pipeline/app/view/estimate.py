@@ -17,19 +17,19 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.joint_fit import JointFit, fit_jointly
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.survey.accuracy import Placed, accuracy_json
+from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json
 from splatpipe.pipeline.survey.blunders import name_blunders, require_near
 from splatpipe.pipeline.survey.control_file import ControlFile
 from splatpipe.pipeline.survey.fitting import NoPlaceError
-from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.place import (
-    Site,
+from splatpipe.pipeline.survey.local_survey import (
+    LocalSurvey,
     make_site,
     observed_in,
     require_fit,
     start_similarity,
     stations_of,
 )
+from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, SurveyPoint, locate, residual_px, with_roles
 
 Marks = Mapping[str, Mapping[str, tuple[float, float]]]
@@ -98,7 +98,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class _Fitted:
-    site: Site
+    site: LocalSurvey
     fit: JointFit
     survey: Survey
 
@@ -151,7 +151,7 @@ class Estimator:
         )
         places[~by_marks], radius[~by_marks] = self._expected(fitted, ~by_marks)
         gsd = None if self._gsd is None else self._gsd * similarity.scale
-        placed = Placed(job.model, similarity, fitted.fit.offsets)
+        placed = GeoreferencedModel(job.model, similarity, fitted.fit.offsets)
         tables = accuracy_json(survey, site, placed, gsd)["tables"]
         sigmas = self._sigmas(fitted)
         tied = any(point.surveyed.z is not None for point in survey.of_role("control"))
@@ -186,7 +186,7 @@ class Estimator:
             fit = replace(fit, similarity=start[0])
         return _Fitted(site, fit, survey)
 
-    def _lifted(self, similarity: Similarity, site: Site) -> Similarity:
+    def _lifted(self, similarity: Similarity, site: LocalSurvey) -> Similarity:
         """Before any mark: the model moved in height so that the points lie on it, whatever datum each is in."""
         cloud = similarity.apply(self._job.model.points)
         lifts = []

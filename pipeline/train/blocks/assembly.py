@@ -34,7 +34,7 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
         StageError: if a block is missing, or a part of one is broken.
     """
     site, coarse = load_site_plan(inputs["blocks.plan"]), inputs["blocks.coarse"]
-    read = _Reader(inputs.shards, report)
+    read = _BlockReader(inputs.shards, report)
     _require_all(site, inputs.shards)
     count, sh_degree = counted(site.partition, read)
     comments = [MIP_COMMENT] if load_rendering(coarse / "rendering.json").antialias else []
@@ -66,7 +66,7 @@ def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:
         )
 
 
-class _Reader:
+class _BlockReader:
     """Reads what a block trained, and tells how far that is: each is read to count and to write."""
 
     def __init__(self, folders: Sequence[Path], report: Reporter) -> None:

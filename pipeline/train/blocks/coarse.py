@@ -12,24 +12,24 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.train.blocks.forecast import footage_on
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths
-from splatpipe.pipeline.train.blocks.outlook import footage_on
 from splatpipe.pipeline.train.blocks.schedules import coarse_schedule
-from splatpipe.pipeline.train.looks import Look
 from splatpipe.pipeline.train.loop import train_whole
 from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan
-from splatpipe.pipeline.train.planning import Scene
+from splatpipe.pipeline.train.plan import TrainingPlan
+from splatpipe.pipeline.train.planning import PlanningInput
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.sky_file import write_skies
 from splatpipe.pipeline.train.start import started
+from splatpipe.pipeline.train.windows import TrainingSize
 
 SKIES = "skies.npz"
 
 
 @dataclass(frozen=True)
-class Limits:
+class TrainingLimits:
     """What keeps a training to its memory.
 
     Attributes:
@@ -41,7 +41,7 @@ class Limits:
     window_pixels: int
 
 
-def train_coarse(config: TrainConfig, inputs: Inputs, limits: Limits, out: Path, report: Reporter) -> Summary:
+def train_coarse(config: TrainConfig, inputs: Inputs, limits: TrainingLimits, out: Path, report: Reporter) -> Summary:
     """Write what the stage `train` does, of the whole scene at its first size, and the photos' skies.
 
     Args:
@@ -55,7 +55,7 @@ def train_coarse(config: TrainConfig, inputs: Inputs, limits: Limits, out: Path,
         SplatpipeError, MachineError, KeyboardInterrupt: as ``loop.run``.
     """
 
-    def fit(plan: Plan, scene: Scene, _step: Step, _report: Reporter) -> Plan:
+    def fit(plan: TrainingPlan, scene: PlanningInput, _step: Step, _report: Reporter) -> TrainingPlan:
         return coarse_plan(plan, scene, limits)
 
     unhurried = config.model_copy(update={"time_budget_s": 0.0})
@@ -77,7 +77,7 @@ def coarse_iterations(config: TrainConfig, cameras: Sequence[Camera], window_pix
     return sum(count for _level, count in coarse_lengths(config, footage))
 
 
-def coarse_plan(plan: Plan, scene: Scene, limits: Limits) -> Plan:
+def coarse_plan(plan: TrainingPlan, scene: PlanningInput, limits: TrainingLimits) -> TrainingPlan:
     """That of the coarse pass.
 
     Args:
@@ -92,6 +92,6 @@ def coarse_plan(plan: Plan, scene: Scene, limits: Limits) -> Plan:
         plan,
         schedule=schedule,
         last_iteration=schedule.iterations,
-        train_megapixels=round(1e-6 * plan.footage.pixels(Look(schedule.finest.level)), 4),
+        train_megapixels=round(1e-6 * plan.footage.pixels(TrainingSize(schedule.finest.level)), 4),
         initial_gaussians=started(scene.start.sparse, scene.start.dense, limits.gaussians),
     )

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanPoints
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.train.blocks.partition import Cell, Partition
-from splatpipe.pipeline.train.blocks.sight import Sight
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 
 BINS = 1024  # along the longer side of what is cut: 256 blocks are still cut to some percents of a cell
 NEAR = 4.0  # times the median size of a pixel: what is seen more coarsely is background
@@ -50,7 +50,7 @@ class WorkMap:
 
 
 def site(
-    plan: GroundPlan, seen: Sequence[Sight], xyz: Float64[np.ndarray, "p 3"], area: PlanArea | None = None
+    plan: GroundPlan, seen: Sequence[PhotoCoverage], xyz: Float64[np.ndarray, "p 3"], area: PlanArea | None = None
 ) -> Cell:
     """The rectangle that is cut: what photos see, and not from too far; beyond it the outer cells go on.
 
@@ -77,7 +77,7 @@ def site(
 
 
 def _evenly(
-    sight: Sight, xyz: Float64[np.ndarray, "p 3"], most: int
+    sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], most: int
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
     """About so many of the places that a photo sees, and how large a pixel is there."""
     samples = sight.samples(xyz)
@@ -86,7 +86,7 @@ def _evenly(
     return samples.places[rows], samples.distances[rows] / math.sqrt(sight.camera.fx * sight.camera.fy)
 
 
-def work_map(plan: GroundPlan, extent: Cell, seen: Sequence[Sight], xyz: Float64[np.ndarray, "p 3"]) -> WorkMap:
+def work_map(plan: GroundPlan, extent: Cell, seen: Sequence[PhotoCoverage], xyz: Float64[np.ndarray, "p 3"]) -> WorkMap:
     """Count points and pixels.
 
     Args:

@@ -20,10 +20,16 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
 from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.division import Division
-from splatpipe.pipeline.train.blocks.outlook import Cut, Outlook, block_outlooks, coarse_sights, footage_on
+from splatpipe.pipeline.train.blocks.forecast import (
+    BlockForecast,
+    WindowScheme,
+    block_outlooks,
+    coarse_sights,
+    footage_on,
+)
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.prospect import Prospect, write_free_space
-from splatpipe.pipeline.train.blocks.sight import Sight
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
+from splatpipe.pipeline.train.blocks.scope import BlockScope, write_free_space
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan, block_limits
 from splatpipe.pipeline.train.options import TrainConfig
 
@@ -64,7 +70,7 @@ def lay_out(
         outlooks = block_outlooks(train, views, seen, xyz, partition, division.window_pixels)
         limits = block_limits(division, train.sh_degree, counted)
         cameras = [view.camera for view in views]
-        parts = Cut.of(train, *footage_on(train, cameras, division.window_pixels))
+        parts = WindowScheme.of(train, *footage_on(train, cameras, division.window_pixels))
         scene = (gaussians, seen, xyz)
         around = _look_around(partition, parts, outlooks, scene, out / PROSPECTS, report)
         if train.prune_free_space:
@@ -86,9 +92,9 @@ def lay_out(
 
 def _look_around(
     partition: Partition,
-    parts: Cut,
-    outlooks: Sequence[Outlook],
-    scene: tuple[Gaussians, Sequence[Sight], Float64[np.ndarray, "p 3"]],
+    parts: WindowScheme,
+    outlooks: Sequence[BlockForecast],
+    scene: tuple[Gaussians, Sequence[PhotoCoverage], Float64[np.ndarray, "p 3"]],
     folder: Path,
     report: Reporter,
 ) -> list[int]:
@@ -105,7 +111,7 @@ def _look_around(
     found = []
     for number, outlook in enumerate(outlooks):
         report.progress(number, len(outlooks), "looking around blocks", "blocks")
-        prospect = Prospect.of(partition, number, outlook.windows, parts, scene)
+        prospect = BlockScope.of(partition, number, outlook.windows, parts, scene)
         prospect.write(folder, number)
         found.append(len(prospect.around.rows))
     return found

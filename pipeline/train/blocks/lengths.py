@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 
-from splatpipe.pipeline.train.lengths import Footage, Length, lengths_of
+from splatpipe.pipeline.train.lengths import Length, PhotoSizes, lengths_of
 from splatpipe.pipeline.train.options import TrainConfig
 
 COARSE_PART = 0.5  # of the iterations where there is one size only
 
 
-def coarse_lengths(config: TrainConfig, footage: Footage) -> list[Length]:
+def coarse_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
     """Iterations of the coarse pass.
 
     Args:
@@ -26,7 +26,7 @@ def coarse_lengths(config: TrainConfig, footage: Footage) -> list[Length]:
     return [(first, count if finer else math.ceil(COARSE_PART * count))]
 
 
-def finer_lengths(config: TrainConfig, footage: Footage) -> list[Length]:
+def finer_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
     """Iterations of all that comes after the coarse pass, if no window were in two blocks, the first size first.
 
     Args:

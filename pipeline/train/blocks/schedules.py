@@ -16,13 +16,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths, finer_lengths
-from splatpipe.pipeline.train.lengths import Footage, Length, lengths_of
+from splatpipe.pipeline.train.lengths import Length, PhotoSizes, lengths_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import Rates
 from splatpipe.pipeline.train.schedule import Schedule, schedule_of
 
 
-def block_lengths(config: TrainConfig, footage: Footage, parts: Mapping[int, int]) -> list[Length]:
+def block_lengths(config: TrainConfig, footage: PhotoSizes, parts: Mapping[int, int]) -> list[Length]:
     """Iterations of a block, the first size first; a size at which it sees nothing is left out.
 
     Args:
@@ -37,7 +37,7 @@ def block_lengths(config: TrainConfig, footage: Footage, parts: Mapping[int, int
     ]
 
 
-def coarse_schedule(config: TrainConfig, footage: Footage) -> Schedule:
+def coarse_schedule(config: TrainConfig, footage: PhotoSizes) -> Schedule:
     """That of the coarse pass.
 
     Args:
@@ -48,7 +48,7 @@ def coarse_schedule(config: TrainConfig, footage: Footage) -> Schedule:
 
 
 def block_schedule(
-    config: TrainConfig, footage: Footage, seen: Footage, parts: Mapping[int, int], begun: float
+    config: TrainConfig, footage: PhotoSizes, seen: PhotoSizes, parts: Mapping[int, int], begun: float
 ) -> Schedule:
     """That of a block.
 
@@ -66,7 +66,7 @@ def block_schedule(
     return replace(made, sh_every=1, dropout=dropout, density=density, rates=rates)
 
 
-def share_at(config: TrainConfig, footage: Footage, begun: float) -> float:
+def share_at(config: TrainConfig, footage: PhotoSizes, begun: float) -> float:
     """How much of its schedule a training of the whole has done when it has that part of its Gaussians.
 
     That is ``densify.room_at`` turned around, for a training that begins with hardly any; no more than is done when

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.sight import Sight
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.blocks.visibility import BlockViews, Windows
 
@@ -29,7 +29,7 @@ COARSEST = 64.0  # pixels of a voxel at the cell's edge: beyond it the least opa
 
 
 @dataclass(frozen=True, eq=False)
-class Around:
+class BlockSurroundings:
     """What a block's windows see of a coarse model besides the Gaussians that the block trains.
 
     Attributes:
@@ -45,9 +45,12 @@ class Around:
         return _within(coarse.select(torch.from_numpy(self.rows)), self.units, most)
 
 
-def seen_around(
-    partition: Partition, block: int, coarse: Gaussians, view: tuple[BlockViews, Sequence[Sight], Sequence[Windows]]
-) -> Around:
+def visible_around(
+    partition: Partition,
+    block: int,
+    coarse: Gaussians,
+    view: tuple[BlockViews, Sequence[PhotoCoverage], Sequence[Windows]],
+) -> BlockSurroundings:
     """What a block's windows see around it.
 
     Args:
@@ -65,7 +68,7 @@ def seen_around(
     rows = np.flatnonzero(~partition.trained_by(block, means) & np.isfinite(pixel))
     cell = partition.cells[block].grown(partition.margin)
     away = cell.distance(partition.plan.places(means[rows])) / math.sqrt(cell.area)
-    return Around(rows, pixel[rows] * (1.0 + away))
+    return BlockSurroundings(rows, pixel[rows] * (1.0 + away))
 
 
 def _within(gaussians: Gaussians, unit: Float64[np.ndarray, " n"], most: int) -> Gaussians:
@@ -81,7 +84,7 @@ def _within(gaussians: Gaussians, unit: Float64[np.ndarray, " n"], most: int) ->
 
 
 def _seen_in(
-    gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], sight: Sight, windows: Windows
+    gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], sight: PhotoCoverage, windows: Windows
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
     """The Gaussians that reach into windows of a photo and are not behind its surface; a pixel's size at each."""
     camera = sight.camera
@@ -101,7 +104,7 @@ def _seen_in(
 
 
 def _hidden(
-    sight: Sight,
+    sight: PhotoCoverage,
     depth: Float32[np.ndarray, "h w"],
     pixels: Float64[np.ndarray, "n 2"],
     size: tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]],

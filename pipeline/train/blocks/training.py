@@ -20,22 +20,22 @@ from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
 from splatpipe.pipeline.train.blocks.coarse import SKIES
 from splatpipe.pipeline.train.blocks.fence import Fence
-from splatpipe.pipeline.train.blocks.outlook import Cut, Parts
+from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.prospect import Prospect, Surveyor, read_free_space, rows_of
 from splatpipe.pipeline.train.blocks.schedules import block_schedule
-from splatpipe.pipeline.train.clearing import Clearing
+from splatpipe.pipeline.train.blocks.scope import BlockScope, ScopeReader, read_free_space, rows_of
 from splatpipe.pipeline.train.exposure import Exposure, read_exposures
+from splatpipe.pipeline.train.floater_pruning import FloaterPruning
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.hooks import Technique
-from splatpipe.pipeline.train.looks import Look
-from splatpipe.pipeline.train.loop import Course, go_through, summary_of
+from splatpipe.pipeline.train.loop import TrainingSetup, go_through, summary_of
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import Plan, footage_of, load_or_write_plan, make_plan, sizes_of
+from splatpipe.pipeline.train.plan import TrainingPlan, footage_of, load_or_write_plan, make_plan, sizes_of
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.sky_file import read_skies
 from splatpipe.pipeline.train.techniques import Techniques, make_techniques
 from splatpipe.pipeline.train.visits import PartVisits, Visits
+from splatpipe.pipeline.train.windows import TrainingSize
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +127,8 @@ class Block:
     parts: SiteParts
     task: BlockTask
     device: Device
-    whole: Plan
-    surveyor: Surveyor
+    whole: TrainingPlan
+    surveyor: ScopeReader
     exposures: Mapping[str, list[list[float]]]
 
     @staticmethod
@@ -151,8 +151,10 @@ class Block:
             "exposure": exposure,
         }
         whole = make_plan(config.model_copy(update=decided), views, split, 0, task.window_pixels)
-        cut = Cut.of(whole.options, whole.footage, whole.megapixels)
-        surveyor = Surveyor(parts.prospects, parts.coarse, parts.partition, task.number, trained_on, cut, task.frozen)
+        cut = WindowScheme.of(whole.options, whole.footage, whole.megapixels)
+        surveyor = ScopeReader(
+            parts.prospects, parts.coarse, parts.partition, task.number, trained_on, cut, task.frozen
+        )
         return Block(parts, task, device, whole, surveyor, exposures)
 
     def start(self) -> Gaussians:
@@ -163,7 +165,7 @@ class Block:
         """The photos that it sees, in the order of all."""
         return [self.surveyor.views[row] for row in rows_of(windows)]
 
-    def plan(self, windows: Parts) -> Plan:
+    def plan(self, windows: Parts) -> TrainingPlan:
         """What it does; no iterations where it sees nothing, or has nothing to train."""
         options, cameras = self.whole.options, [view.camera for view in self.views(windows)]
         sizes = sizes_of(cameras)
@@ -180,10 +182,10 @@ class Block:
         seen = footage_of(sizes, self.whole.megapixels, self.whole.window_pixels)
         pieces = {level: len(pairs) for level, pairs in windows.items()}
         schedule = block_schedule(options, self.whole.footage, seen, pieces, count / self.task.trained)
-        size = round(1e-6 * seen.pixels(Look(schedule.finest.level)), 4)
+        size = round(1e-6 * seen.pixels(TrainingSize(schedule.finest.level)), 4)
         return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
 
-    def course(self, plan: Plan, prospect: Prospect, out: Path) -> Course:
+    def course(self, plan: TrainingPlan, prospect: BlockScope, out: Path) -> TrainingSetup:
         """What it goes through.
 
         Args:
@@ -200,11 +202,11 @@ class Block:
             for level, pairs in windows.items()
         }
 
-        def visits(looks: Sequence[Look]) -> Visits:
+        def visits(looks: Sequence[TrainingSize]) -> Visits:
             cameras = [view.camera for view in views]
             return PartVisits(cameras, looks, plan.options.seed, plan.megapixels, pieces, cells)
 
-        return Course(
+        return TrainingSetup(
             plan,
             self.device,
             views,
@@ -214,7 +216,7 @@ class Block:
             frozen=lambda: self.surveyor.frozen(out),
         )
 
-    def techniques(self, plan: Plan, views: Sequence[View]) -> Techniques:
+    def techniques(self, plan: TrainingPlan, views: Sequence[View]) -> Techniques:
         """Those of the options; sky and exposures are the coarse pass's.
 
         Args:
@@ -232,15 +234,15 @@ class Block:
         more: list[Technique] = [self.fence(plan)]
         if plan.options.prune_free_space:
             cameras = [view.camera for view in self.surveyor.views]
-            more.append(Clearing(read_free_space(self.parts.prospects, cameras), plan.schedule))
+            more.append(FloaterPruning(read_free_space(self.parts.prospects, cameras), plan.schedule))
         return Techniques((*made, *more))
 
-    def fence(self, plan: Plan) -> Fence:
+    def fence(self, plan: TrainingPlan) -> Fence:
         """What keeps its Gaussians to cell and margin."""
         return Fence(self.parts.partition, self.task.number, self.task.share, plan.schedule.density)
 
 
-def _leave(block: Block, plan: Plan, out: Path, trained: tuple[Gaussians, History]) -> dict[str, JSON]:
+def _leave(block: Block, plan: TrainingPlan, out: Path, trained: tuple[Gaussians, History]) -> dict[str, JSON]:
     """Write the outcome: of the Gaussians those that are the block's to leave."""
     gaussians, history = trained
     gaussians = gaussians.select(block.fence(plan).kept(gaussians))

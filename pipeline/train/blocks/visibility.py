@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.train.blocks.partition import NOBODY, Partition
-from splatpipe.pipeline.train.blocks.sight import Samples, Sight
-from splatpipe.pipeline.train.looks import windows_of
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, Samples
+from splatpipe.pipeline.train.windows import windows_of
 
 LEAST_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner of it that its neighbours show whole
 LEAST_POINTS = 4  # observed by the photo, in the cell and in the window: thin things that a coarse depth misses
@@ -79,7 +79,7 @@ def windows(camera: Camera, window_pixels: int) -> Windows:
 
 def block_views(
     partition: Partition,
-    seen: Sequence[Sight],
+    seen: Sequence[PhotoCoverage],
     xyz: Float64[np.ndarray, "p 3"],
     cut: Callable[[Camera], Windows],
 ) -> list[BlockViews]:

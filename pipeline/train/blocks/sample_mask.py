@@ -11,15 +11,17 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.sight import Sight
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 
 MARGINS = 2.0  # around the cell: what is trained reaches one, and casts its light a little farther
 
-Sighted = Bool[np.ndarray, "rows columns"]
+SampleMask = Bool[np.ndarray, "rows columns"]
 """What of a whole photo counts, by the cells of a grid that covers it."""
 
 
-def sighted(partition: Partition, block: int, sight: Sight, xyz: Float64[np.ndarray, "p 3"]) -> Sighted:
+def counted_samples(
+    partition: Partition, block: int, sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"]
+) -> SampleMask:
     """What of a photo counts for a block, by the samples of its depth.
 
     Counted are samples whose place lies in the cell grown by ``MARGINS``, those without a depth (what is there, nobody

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, robust_similarity
-from splatpipe.pipeline.geometry.joint_fit import JointFit, Observed, Priors
+from splatpipe.pipeline.geometry.joint_fit import JointFit, JointObservations, Priors
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 from splatpipe.pipeline.survey.crs import to_geodetic
@@ -79,7 +79,7 @@ class Targets:
 
 
 @dataclass(frozen=True)
-class Site:
+class LocalSurvey:
     """Where the world's zero is, and what is known in it.
 
     Attributes:
@@ -137,7 +137,7 @@ def locate_survey(survey: Survey, config: GeorefConfig) -> Float64[np.ndarray, "
 
 def make_site(
     survey: Survey, geodetic: Float64[np.ndarray, "n 3"], stations: Stations, frame: Frame | None, config: GeorefConfig
-) -> Site:
+) -> LocalSurvey:
     """The world of a capture: its zero is that of the positions' frame, at the height of the control."""
     heights = geodetic[np.isfinite(geodetic[:, 2]), 2]
     if frame is not None and frame.origin is not None:
@@ -159,10 +159,12 @@ def make_site(
     ]
     spread = np.array(sigmas, dtype=np.float64)
     spread[~known, 2], enu[~known, 2] = np.inf, 0.0
-    return Site(origin, Targets(enu, spread, geodetic), stations, origin.enu_from_geodetic(stations.geodetic))
+    return LocalSurvey(origin, Targets(enu, spread, geodetic), stations, origin.enu_from_geodetic(stations.geodetic))
 
 
-def observed_in(site: Site, survey: Survey, model: SparseModel, scale: float, mark_sigma_px: float) -> Observed:
+def observed_in(
+    site: LocalSurvey, survey: Survey, model: SparseModel, scale: float, mark_sigma_px: float
+) -> JointObservations:
     """Control (first, in the survey's order) and positions, with sigmas that hold the marks' as well."""
     chosen = [k for k, point in enumerate(survey.points) if point.role == "control" and point.found is not None]
     found = [survey.points[k].found for k in chosen]
@@ -176,7 +178,7 @@ def observed_in(site: Site, survey: Survey, model: SparseModel, scale: float, ma
     )
     sigmas = np.hypot(site.targets.sigmas[chosen], marks.reshape(-1, 1))
     count = len(site.stations)
-    return Observed(
+    return JointObservations(
         np.concatenate([source, model.centres[site.stations.indices]]),
         np.concatenate([site.targets.enu[chosen], site.station_enu]),
         np.concatenate([sigmas, site.stations.sigmas]),
@@ -186,7 +188,7 @@ def observed_in(site: Site, survey: Survey, model: SparseModel, scale: float, ma
 
 
 def start_similarity(
-    site: Site, survey: Survey, model: SparseModel, positions: Positions, frame: Frame | None
+    site: LocalSurvey, survey: Survey, model: SparseModel, positions: Positions, frame: Frame | None
 ) -> tuple[Similarity, Priors]:
     """World from model, near the truth, and what else holds the fit.
 
@@ -247,7 +249,7 @@ def _levelled(
     return Similarity(scale, rotation, centre - scale * (rotation @ source.mean(axis=0)))
 
 
-def require_fit(fit: JointFit, observed: Observed, survey: Survey) -> None:
+def require_fit(fit: JointFit, observed: JointObservations, survey: Survey) -> None:
     """Refuse control that has another shape than the model.
 
     Raises:
@@ -275,7 +277,7 @@ def require_fit(fit: JointFit, observed: Observed, survey: Survey) -> None:
         raise SplatpipeError(f"The control points of {survey.name} do not fit the model.", "Check its coordinates.")
 
 
-def with_sigmas_times(observed: Observed, factor: float) -> Observed:
+def with_sigmas_times(observed: JointObservations, factor: float) -> JointObservations:
     """The same with control that is less accurate by a factor."""
     scale = np.where(observed.is_control, factor, 1.0)[:, None]
     return replace(observed, sigmas=observed.sigmas * scale)

@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float64, UInt8
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
-from splatpipe.pipeline.surface.sources import DepthMap
+from splatpipe.pipeline.surface.sources import PosedDepthMap
 
 Points = tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"]]  # east, north, up
 
 
 @dataclass(frozen=True)
-class Place:
+class PhotoCoordinates:
     """Where points lie in a photo.
 
     Attributes:
@@ -39,7 +39,7 @@ def place_in(
     east: Float64[np.ndarray, "*#n"],
     north: Float64[np.ndarray, "*#n"],
     up: Float64[np.ndarray, "*#n"],
-) -> Place:
+) -> PhotoCoordinates:
     """Project points, each by itself, so that the bits do not depend on how many there are; nan is outside."""
     m = camera.cam_from_world
     x, y, depth = (m[i, 0] * east + m[i, 1] * north + m[i, 2] * up + m[i, 3] for i in range(3))
@@ -49,11 +49,11 @@ def place_in(
     inside = ahead & (column >= 0.0) & (column < camera.width) & (row >= 0.0) & (row < camera.height)
     centre = camera.centre()
     sine = (centre[2] - up) / np.sqrt(np.square(x) + np.square(y) + np.square(np.where(ahead, depth, 1.0)))
-    return Place(column, row, depth, sine, inside)
+    return PhotoCoordinates(column, row, depth, sine, inside)
 
 
 @dataclass(frozen=True)
-class Sight:
+class PointVisibility:
     """What a photo says about points.
 
     Attributes:
@@ -83,7 +83,9 @@ class Sight:
         return np.asarray(self.said & _native.UNKNOWN != 0)
 
 
-def sight(found: DepthMap, points: Points, least_m: float, sines: Float64[np.ndarray, " *n"] | None = None) -> Sight:
+def sight(
+    found: PosedDepthMap, points: Points, least_m: float, sines: Float64[np.ndarray, " *n"] | None = None
+) -> PointVisibility:
     """Compare points with a photo's depths: they are the same within some pixels' widths, more where the ray is flat.
 
     Args:
@@ -97,7 +99,7 @@ def sight(found: DepthMap, points: Points, least_m: float, sines: Float64[np.nda
     """
     said = np.empty(points[2].shape, np.uint8)
     _native.look(found.depth, native_camera(found.camera), contiguous(points), sines, least_m, said)
-    return Sight(said)
+    return PointVisibility(said)
 
 
 def contiguous(points: Points) -> Points:

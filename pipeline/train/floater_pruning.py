@@ -37,7 +37,7 @@ def free_space_of(views: Sequence[View], dataset: Path) -> FreeSpace:
     return free_space(cameras, points.xyz, [tracks[camera.name] for camera in cameras])
 
 
-class Clearing(Technique):
+class FloaterPruning(Technique):
     """Looks for Gaussians in free space now and then.
 
     Args:

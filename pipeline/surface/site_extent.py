@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthMap, DepthSource
+from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
 
 SAMPLES = 3000  # depths of a photo, evenly
 CELL_GSD = 100.0  # ground sample distances of a plan cell: so many samples of a photo lie in each that it sees
@@ -34,7 +34,7 @@ LEAST_MARGIN_M = 3.0  # and at least so much: a mast or a well
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
+class SiteExtent:
     """What a run's photos show.
 
     Attributes:
@@ -71,7 +71,7 @@ class Site:
         return float(self.covered.sum()) * self.cell_m**2
 
 
-def save_site(path: Path, site: Site | None, dsm_cell_m: float = 0.0) -> None:
+def save_site(path: Path, site: SiteExtent | None, dsm_cell_m: float = 0.0) -> None:
     """As JSON; ``load_site`` reads it.
 
     Args:
@@ -89,7 +89,7 @@ def save_site(path: Path, site: Site | None, dsm_cell_m: float = 0.0) -> None:
     write_json(path, {**facts, **plan, "dsm_cell_m": dsm_cell_m})
 
 
-def load_site(path: Path) -> tuple[Site, float] | None:
+def load_site(path: Path) -> tuple[SiteExtent, float] | None:
     """What ``save_site`` was given.
 
     Raises:
@@ -107,12 +107,14 @@ def load_site(path: Path) -> tuple[Site, float] | None:
         west, south, east, north = (float(each) for each in told["reach"])
         corner_east, corner_north = (float(each) for each in told["corner"])
         covered, corner = bits.reshape(shape).astype(np.bool_), (corner_east, corner_north)
-        return Site(gsd, low, high, (west, south, east, north), corner, cell, covered), dsm_cell
+        return SiteExtent(gsd, low, high, (west, south, east, north), corner, cell, covered), dsm_cell
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError(f"The site {path.name} cannot be read: {error}", "Run again with --rerun dsm.") from error
 
 
-def survey_site(sources: Sequence[DepthSource], finer: float, area: PlanArea | None, threads: int) -> Site | None:
+def measure_extent(
+    sources: Sequence[DepthSource], finer: float, area: PlanArea | None, threads: int
+) -> SiteExtent | None:
     """Look at the depths of all photos; None where nothing is seen by enough of them.
 
     Args:
@@ -145,12 +147,12 @@ def survey_site(sources: Sequence[DepthSource], finer: float, area: PlanArea | N
     (west, south), (east, north) = every[inside, :2].min(axis=0), every[inside, :2].max(axis=0)
     reach = float(west), float(south), float(east), float(north)
     wider = cv2.dilate(covered.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return Site(gsd, low, high, reach, (float(corner[0]), float(corner[1])), cell, wider)
+    return SiteExtent(gsd, low, high, reach, (float(corner[0]), float(corner[1])), cell, wider)
 
 
 def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
     """East, north, up of some depths, and a pixel's side there: on the ground, and across the ray."""
-    found: DepthMap = source.load()
+    found: PosedDepthMap = source.load()
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
     row, column = (grid.ravel() for grid in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])

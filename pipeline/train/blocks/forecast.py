@@ -21,18 +21,18 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.blocks.lengths import finer_lengths
 from splatpipe.pipeline.train.blocks.partition import Partition
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, sights
 from splatpipe.pipeline.train.blocks.schedules import block_lengths, block_schedule
-from splatpipe.pipeline.train.blocks.sight import Sight, sights
 from splatpipe.pipeline.train.blocks.visibility import Windows, block_views
-from splatpipe.pipeline.train.lengths import Footage
-from splatpipe.pipeline.train.looks import Frame, windows_of
+from splatpipe.pipeline.train.lengths import PhotoSizes
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photo_cache import stored_bytes
 from splatpipe.pipeline.train.plan import footage_of, sizes_of
+from splatpipe.pipeline.train.windows import PixelRectangle, windows_of
 
 
 @dataclass(frozen=True)
-class Cut:
+class WindowScheme:
     """How photos are cut into windows at the sizes that blocks train.
 
     Attributes:
@@ -46,7 +46,7 @@ class Cut:
     max_megapixels: float | None
 
     @staticmethod
-    def of(config: TrainConfig, footage: Footage, max_megapixels: float | None) -> Cut:
+    def of(config: TrainConfig, footage: PhotoSizes, max_megapixels: float | None) -> WindowScheme:
         """That of a training's blocks.
 
         Args:
@@ -55,13 +55,13 @@ class Cut:
             max_megapixels: That they are reduced to.
         """
         levels = tuple(level for level, _count in finer_lengths(config, footage))
-        return Cut(levels, footage.window_pixels, max_megapixels)
+        return WindowScheme(levels, footage.window_pixels, max_megapixels)
 
     def camera(self, camera: Camera, level: int) -> Camera:
         """A photo's at a level."""
         return reduced_camera(camera, self.max_megapixels, level)
 
-    def frames(self, camera: Camera, level: int) -> list[Frame]:
+    def frames(self, camera: Camera, level: int) -> list[PixelRectangle]:
         """The windows of a photo at a level, in its pixels there."""
         reduced = self.camera(camera, level)
         return windows_of(reduced.width, reduced.height, self.window_pixels)
@@ -79,7 +79,7 @@ Parts = dict[int, Int64[np.ndarray, "k 2"]]
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class BlockForecast:
     """What a block will do.
 
     Attributes:
@@ -101,8 +101,8 @@ class Outlook:
     disk_bytes: int
 
 
-def seen_windows(
-    partition: Partition, sight: Sight, xyz: Float64[np.ndarray, "p 3"], cut: Cut
+def visible_windows(
+    partition: Partition, sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], cut: WindowScheme
 ) -> dict[int, Bool[np.ndarray, "cells w"]]:
     """By the level, which windows of a photo show each cell.
 
@@ -127,7 +127,7 @@ def parts_of(shown: Iterable[Mapping[int, Bool[np.ndarray, "cells w"]]], block: 
     """The windows that a block trains on.
 
     Args:
-        shown: Of each photo, as of ``seen_windows``.
+        shown: Of each photo, as of ``visible_windows``.
         block: Its number.
     """
     found: dict[int, list[tuple[int, int]]] = {}
@@ -140,11 +140,11 @@ def parts_of(shown: Iterable[Mapping[int, Bool[np.ndarray, "cells w"]]], block: 
 def block_outlooks(
     config: TrainConfig,
     views: Sequence[View],
-    seen: Sequence[Sight],
+    seen: Sequence[PhotoCoverage],
     xyz: Float64[np.ndarray, "p 3"],
     partition: Partition,
     window_pixels: int,
-) -> list[Outlook]:
+) -> list[BlockForecast]:
     """What each block will do.
 
     Args:
@@ -156,12 +156,12 @@ def block_outlooks(
         window_pixels: Of a photo, that an iteration looks at at most.
     """
     footage, most = footage_on(config, [view.camera for view in views], window_pixels)
-    cut = Cut.of(config, footage, most)
-    shown = [seen_windows(partition, sight, xyz, cut) for sight in seen]
+    cut = WindowScheme.of(config, footage, most)
+    shown = [visible_windows(partition, sight, xyz, cut) for sight in seen]
     return [_outlook(config, footage, cut, views, parts_of(shown, block)) for block in range(len(partition.cells))]
 
 
-def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> tuple[Footage, float | None]:
+def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> tuple[PhotoSizes, float | None]:
     """Photos as they are trained on, and the megapixels that they are reduced to; None where they are as they are."""
     sizes = sizes_of(cameras)
     most = config.max_megapixels or None
@@ -170,7 +170,9 @@ def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: in
     return footage_of(sizes, most, window_pixels), most
 
 
-def _outlook(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[View], parts: Parts) -> Outlook:
+def _outlook(
+    config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: Sequence[View], parts: Parts
+) -> BlockForecast:
     each = block_lengths(config, footage, {level: len(pairs) for level, pairs in parts.items()})
     pixels, stored = [], 0
     for level, _count in each:
@@ -182,12 +184,12 @@ def _outlook(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[Vi
             stored += stored_bytes(cut.camera(views[row].camera, level), views[row].mask_path is not None)
     counts = tuple(len(parts[level]) for level, _count in each)
     iterations = sum(count for _level, count in each)
-    return Outlook(
+    return BlockForecast(
         parts, len(rows), counts, tuple(pixels), iterations, _steps(config, footage, cut, views, parts), stored
     )
 
 
-def _steps(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[View], parts: Parts) -> int:
+def _steps(config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: Sequence[View], parts: Parts) -> int:
     """Steps of density control of a block."""
     pieces = {level: len(pairs) for level, pairs in parts.items()}
     rows = {row for pairs in parts.values() for row in pairs[:, 0].tolist()}
@@ -200,7 +202,7 @@ def _steps(config: TrainConfig, footage: Footage, cut: Cut, views: Sequence[View
 
 def coarse_sights(
     coarse: Path, views: Sequence[View], observed: Sequence[Int64[np.ndarray, " _"]], machine: Machine
-) -> list[Sight]:
+) -> list[PhotoCoverage]:
     """What photos see by the depth of a coarse model; 40 kB a photo.
 
     Args:
@@ -224,7 +226,7 @@ def each_sight(
     views: Sequence[View],
     observed: Sequence[Int64[np.ndarray, " _"]],
     device: Device,
-) -> Iterator[Sight]:
+) -> Iterator[PhotoCoverage]:
     """The same one after the other, where the bits are seen to; ``gaussians`` are the coarse model's."""
     options = load_rendering(coarse / "rendering.json").options(gaussians)
     drawn = gaussians.to(device.tensors)

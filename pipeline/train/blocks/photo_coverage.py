@@ -38,7 +38,7 @@ class Samples:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class PhotoCoverage:
     """What one photo sees.
 
     Attributes:
@@ -92,7 +92,7 @@ def sights(
     observed: Sequence[Int64[np.ndarray, " _"]],
     depth_of: Callable[[Camera], Float32[np.ndarray, "h w"]] | None,
     counted_of: Callable[[Camera], Bool[np.ndarray, "h w"] | None] | None = None,
-) -> list[Sight]:
+) -> list[PhotoCoverage]:
     """What photos see.
 
     Args:
@@ -105,5 +105,5 @@ def sights(
     for camera, rows in zip(cameras, observed, strict=True):
         grid = reduced_camera(camera, MEGAPIXELS)
         depth = None if depth_of is None else depth_of(grid)
-        found.append(Sight(camera, grid, depth, None if counted_of is None else counted_of(grid), rows))
+        found.append(PhotoCoverage(camera, grid, depth, None if counted_of is None else counted_of(grid), rows))
     return found

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.photo_samples import PhotoSource, sampled, tone_curve
-from splatpipe.pipeline.surface.sight import Points, place_in
+from splatpipe.pipeline.surface.point_visibility import Points, place_in
 
 SHADES = 5  # terms of a photo's shading
 GAMMA = 2.4  # of sRGB above its darkest values: (value + offset) ** gamma is proportional to light
@@ -17,7 +17,7 @@ OFFSET = 0.055 * 255.0
 
 
 @dataclass(frozen=True, eq=False)
-class Levels:
+class PhotoGains:
     """Of all photos.
 
     Attributes:
@@ -30,13 +30,13 @@ class Levels:
     shading: Float64[np.ndarray, "n k 3"]
 
     @staticmethod
-    def plain(photos: int) -> Levels:
+    def plain(photos: int) -> PhotoGains:
         """Photos as they are."""
-        return Levels(np.ones((photos, 3)), np.zeros((photos, SHADES, 3)))
+        return PhotoGains(np.ones((photos, 3)), np.zeros((photos, SHADES, 3)))
 
-    def of(self, numbers: list[int]) -> Levels:
+    def of(self, numbers: list[int]) -> PhotoGains:
         """Of some photos."""
-        return Levels(self.gain[numbers], self.shading[numbers])
+        return PhotoGains(self.gain[numbers], self.shading[numbers])
 
     def sampled(
         self,

@@ -20,7 +20,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.hooks import Shot, Technique
-from splatpipe.pipeline.train.schedule import Moment
+from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
 FIRST_SHARE = 0.2  # of a run from sparse points, without it: the surface has to be found first
@@ -30,7 +30,7 @@ HALF_PX = 10.0  # beyond it at which half of the most is reached
 CENTRE_EVERY = 500  # iterations between looks for the model's centre on a device: by then it hardly moves
 
 
-class Distortion(Technique):
+class DistortionLoss(Technique):
     """Adds the spread of the depths along each ray to the loss.
 
     Args:
@@ -49,7 +49,7 @@ class Distortion(Technique):
         """Whether it has a part in the loss at a place of the schedule, from 1."""
         return place > self._after
 
-    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: Moment) -> RenderOptions:
+    def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
         """With depths, measured from where float32 tells them best."""
         if not self.is_counted(now.place):
             return settings
@@ -57,7 +57,7 @@ class Distortion(Technique):
             self._centre = model.means.detach().mean(dim=0).double().cpu()
         return replace(settings, depth=True, depth_origin=depth_along(self._centre, camera))
 
-    def _is_worn(self, model: Gaussians, now: Moment) -> bool:
+    def _is_worn(self, model: Gaussians, now: ScheduleStep) -> bool:
         """Whether the model's centre has to be looked for again: on a device seldom, for that waits for it."""
         if model.means.device.type == "cpu":
             return True

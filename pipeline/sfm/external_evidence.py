@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.sfm.judging import Reason, is_trusted
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
-from splatpipe.pipeline.sfm.verified import Verified
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 LEAST_POSITIONS = 8  # photos; a similarity bends itself to fewer
 STEPS = 30  # of the reweighted fit
@@ -23,7 +23,7 @@ SMOOTH = 0.5  # a residual's difference from its neighbour's, to its length: noi
 
 
 @dataclass(frozen=True)
-class Disagreement:
+class PositionMisfit:
     """How positions stand to a model after the similarity that most of them agree on.
 
     Attributes:
@@ -38,7 +38,7 @@ class Disagreement:
 
 
 def outside_reasons(
-    model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON], positions: Sequence[JSON]
+    model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON], positions: Sequence[JSON]
 ) -> list[Reason]:
     """Doubts that the matches themselves cannot raise.
 
@@ -51,7 +51,7 @@ def outside_reasons(
     return [*_untold_focal_lengths(model, verified, cameras), *_positions(model, positions)]
 
 
-def _untold_focal_lengths(model: pycolmap.Reconstruction, verified: Verified, cameras: Sequence[JSON]) -> list[Reason]:
+def _untold_focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[Reason]:
     used = sorted({model.images[number].camera_id for number in model.reg_image_ids()})
     rough = [number for number in used if not is_trusted(cameras[number - 1])]
     if not rough:
@@ -93,7 +93,7 @@ def _metres(entries: Sequence[JSON]) -> Float64[np.ndarray, "n 3"]:
     return np.column_stack([off[:, 0] * np.cos(np.radians(degrees[0, 1])), off[:, 1], up - up[0]])
 
 
-def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, "n 3"]) -> Disagreement:
+def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, "n 3"]) -> PositionMisfit:
     """Fit a similarity by least absolute distances, and describe what is left.
 
     Args:
@@ -111,7 +111,7 @@ def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray
     nearest = np.argmin(distances, axis=1)
     apart = float(np.median(np.linalg.norm(residuals - residuals[nearest], axis=1)))
     size = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    return Disagreement(median, size, apart / max(median, 1e-9))
+    return PositionMisfit(median, size, apart / max(median, 1e-9))
 
 
 def _similar(

@@ -16,7 +16,7 @@ MOST_OBLONG = 2.5  # sides of a cell: strips cost more at their borders than a f
 
 
 @dataclass(frozen=True)
-class Look:
+class TrainingSize:
     """A size to train at.
 
     Attributes:
@@ -29,7 +29,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Frame:
+class PixelRectangle:
     """A rectangle of a picture, pixels.
 
     Attributes:
@@ -59,21 +59,21 @@ class Frame:
         """How many it has."""
         return self.width * self.height
 
-    def grown(self, width: int, height: int) -> Frame:
+    def grown(self, width: int, height: int) -> PixelRectangle:
         """With all that SSIM sees from inside, as far as the picture goes.
 
         Args:
             width: Of the picture.
             height: Of the picture.
         """
-        return Frame(
+        return PixelRectangle(
             max(0, self.left - REACH_PX),
             max(0, self.top - REACH_PX),
             min(width, self.right + REACH_PX),
             min(height, self.bottom + REACH_PX),
         )
 
-    def within(self, other: Frame) -> tuple[int, int, int, int]:
+    def within(self, other: PixelRectangle) -> tuple[int, int, int, int]:
         """Its left, top, right and bottom in the pixels of another frame."""
         return (
             self.left - other.left,
@@ -83,7 +83,7 @@ class Frame:
         )
 
 
-def windows_of(width: int, height: int, window_pixels: int) -> list[Frame]:
+def windows_of(width: int, height: int, window_pixels: int) -> list[PixelRectangle]:
     """The windows of a picture, row by row: as few as there can be of nearly equal, nearly square cells.
 
     Args:
@@ -92,10 +92,12 @@ def windows_of(width: int, height: int, window_pixels: int) -> list[Frame]:
         window_pixels: Of a window at most; 0 for the whole picture in one. Cells are never under ``LEAST_SIDE_PX``.
     """
     if window_pixels == 0 or width * height <= window_pixels:
-        return [Frame(0, 0, width, height)]
+        return [PixelRectangle(0, 0, width, height)]
     rows, columns = _divisions(width, height, window_pixels)
     across, down = _borders(width, columns), _borders(height, rows)
-    return [Frame(left, top, right, bottom) for top, bottom in pairwise(down) for left, right in pairwise(across)]
+    return [
+        PixelRectangle(left, top, right, bottom) for top, bottom in pairwise(down) for left, right in pairwise(across)
+    ]
 
 
 def _divisions(width: int, height: int, window_pixels: int) -> tuple[int, int]:

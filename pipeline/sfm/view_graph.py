@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt32
 
 
 @dataclass(frozen=True)
-class Verified:
+class ViewGraph:
     """The view graph; images and cameras under COLMAP's numbers, which count from 1 in name order.
 
     Attributes:
@@ -30,7 +30,7 @@ class Verified:
     matches: Mapping[tuple[int, int], UInt32[np.ndarray, "_ 2"]]
 
 
-def read_verified(database: Path) -> Verified:
+def read_verified(database: Path) -> ViewGraph:
     """Read the view graph of a database that matching left."""
     with pycolmap.Database.open(database) as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
@@ -47,7 +47,7 @@ def read_verified(database: Path) -> Verified:
             rows = np.asarray(geometry.inlier_matches, np.uint32).reshape(-1, 2)
             if len(rows):
                 found[i, j] = rows if i < j else np.ascontiguousarray(rows[:, ::-1])
-        return Verified(
+        return ViewGraph(
             names={image.image_id: image.name for image in images},
             camera_of={image.image_id: image.camera_id for image in images},
             cameras={camera.camera_id: camera for camera in opened.read_all_cameras()},

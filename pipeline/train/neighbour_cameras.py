@@ -14,7 +14,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
-class Witnesses:
+class NeighbourCameras:
     """Cameras of some photos, of any size, and which of them stood near each other.
 
     Attributes:
@@ -30,7 +30,7 @@ class Witnesses:
     nearest: Int64[Tensor, "n k"]
 
     @staticmethod
-    def of(cameras: Sequence[Camera], most: int) -> Witnesses:
+    def of(cameras: Sequence[Camera], most: int) -> NeighbourCameras:
         """Of at least one camera, with up to ``most`` near each."""
         poses = torch.from_numpy(np.stack([camera.cam_from_world for camera in cameras]))
         lenses = [
@@ -42,16 +42,16 @@ class Witnesses:
         for row, centre in enumerate(centres):
             order = np.argsort(np.linalg.norm(centres - centre, axis=1), kind="stable")
             nearest.append(order[order != row][:most])
-        return Witnesses(
+        return NeighbourCameras(
             poses[:, :3, :3].contiguous(),
             poses[:, :3, 3].contiguous(),
             torch.tensor(lenses, dtype=torch.float64),
             torch.from_numpy(np.array(nearest, np.int64).reshape(len(cameras), -1)),
         )
 
-    def to(self, device: torch.device) -> Witnesses:
+    def to(self, device: torch.device) -> NeighbourCameras:
         """The same on a device."""
-        return Witnesses(*(each.to(device) for each in (self.rotations, self.shifts, self.lenses, self.nearest)))
+        return NeighbourCameras(*(each.to(device) for each in (self.rotations, self.shifts, self.lenses, self.nearest)))
 
     def places(self, row: int, shown: Float64[Tensor, "m 2"], depths: Float64[Tensor, " m"]) -> Float64[Tensor, "m 3"]:
         """World points of what a photo shows, in widths and heights of it, at depths along its axis."""

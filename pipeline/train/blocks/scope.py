@@ -24,11 +24,11 @@ from splatpipe.pipeline.splat.archives import read_archive
 from splatpipe.pipeline.splat.free_space import FreeSpace, PhotoBounds
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
-from splatpipe.pipeline.train.blocks.outlook import Cut, Parts
+from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.sight import Sight
-from splatpipe.pipeline.train.blocks.sighted import Sighted, sighted
-from splatpipe.pipeline.train.blocks.surroundings import Around, seen_around
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
+from splatpipe.pipeline.train.blocks.sample_mask import SampleMask, counted_samples
+from splatpipe.pipeline.train.blocks.surroundings import BlockSurroundings, visible_around
 from splatpipe.pipeline.train.blocks.visibility import BlockPhoto, BlockViews
 
 FROZEN = "frozen.ply"
@@ -38,7 +38,7 @@ _COUNTED = "counted_"
 
 
 @dataclass(frozen=True, eq=False)
-class Prospect:
+class BlockScope:
     """What one block looks at; photos by their rows among those trained on.
 
     Attributes:
@@ -48,17 +48,17 @@ class Prospect:
     """
 
     windows: Parts
-    counted: dict[int, Sighted]
-    around: Around
+    counted: dict[int, SampleMask]
+    around: BlockSurroundings
 
     @staticmethod
     def of(
         partition: Partition,
         block: int,
         windows: Parts,
-        cut: Cut,
-        scene: tuple[Gaussians, Sequence[Sight], Float64[np.ndarray, "p 3"]],
-    ) -> Prospect:
+        cut: WindowScheme,
+        scene: tuple[Gaussians, Sequence[PhotoCoverage], Float64[np.ndarray, "p 3"]],
+    ) -> BlockScope:
         """Work it out.
 
         Args:
@@ -80,8 +80,8 @@ class Prospect:
             photos.append(BlockPhoto(place, np.concatenate(chosen), 0, 0.0, 0.0))
             frames.append(np.concatenate(each))
         view = (BlockViews(tuple(photos)), [seen[row] for row in rows], frames)
-        counted = {row: sighted(partition, block, seen[row], xyz) for row in rows}
-        return Prospect(windows, counted, seen_around(partition, block, coarse, view))
+        counted = {row: counted_samples(partition, block, seen[row], xyz) for row in rows}
+        return BlockScope(windows, counted, visible_around(partition, block, coarse, view))
 
     def write(self, folder: Path, block: int) -> None:
         """Keep it in a folder of all blocks."""
@@ -95,7 +95,7 @@ class Prospect:
         write_durably(_path(folder, block), write)
 
     @staticmethod
-    def read(folder: Path, block: int) -> Prospect:
+    def read(folder: Path, block: int) -> BlockScope:
         """The inverse of ``write``.
 
         Raises:
@@ -108,13 +108,13 @@ class Prospect:
             counted = {int(row): grid for row, grid in _named(arrays, _COUNTED)}
             if sorted(counted) != rows_of(windows):
                 raise ValueError("other photos count than are looked at")
-            return Prospect(windows, counted, Around(arrays["rows"].astype(np.int64), arrays["units"]))
+            return BlockScope(windows, counted, BlockSurroundings(arrays["rows"].astype(np.int64), arrays["units"]))
         except (OSError, ValueError, KeyError, IndexError) as error:
             raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
 
 
 @dataclass(frozen=True, eq=False)
-class Surveyor:
+class ScopeReader:
     """Who knows it of a block that is trained.
 
     Attributes:
@@ -132,16 +132,16 @@ class Surveyor:
     partition: Partition
     number: int
     views: Sequence[View]
-    cut: Cut
+    cut: WindowScheme
     most_frozen: int
 
-    def prospect(self) -> Prospect:
+    def prospect(self) -> BlockScope:
         """What the block looks at.
 
         Raises:
             StageError: if it is not there, or broken.
         """
-        return Prospect.read(self.prospects, self.number)
+        return BlockScope.read(self.prospects, self.number)
 
     def frozen(self, out: Path) -> Gaussians:
         """What is drawn around the block, kept in its folder for those who look at its checkpoints.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.train.distortion import LEAST_ALPHA
+from splatpipe.pipeline.train.distortion_loss import LEAST_ALPHA
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
@@ -24,7 +24,7 @@ REACHES_PX = (1, 4, 12)  # between a place and those on either side: from what i
 HALF_PX = 1.0  # off the line, pixels on the ground, at which half of the most is reached
 
 
-class Evenness(Technique):
+class SmoothnessLoss(Technique):
     """Adds how uneven the depths are to the loss; used with ``Distortion``, which asks for them.
 
     Args:

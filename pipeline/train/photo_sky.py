@@ -20,7 +20,7 @@ RIM_PX = 3  # around the sky, of ``WORK_MEGAPIXELS``: what the search may have l
 
 
 @dataclass(frozen=True)
-class SeenSky:
+class PhotoSky:
     """A photo's sky.
 
     Attributes:
@@ -57,22 +57,22 @@ class PhotoSkies:
             moved._bits = {name: torch.from_numpy(mask.bits).to(device) for name, mask in self.masks.items()}
         return moved
 
-    def seen(self, camera: Camera) -> SeenSky | None:
+    def seen(self, camera: Camera) -> PhotoSky | None:
         """The sky of a photo at the size of ``camera``; None where it shows none."""
         found = self.masks.get(camera.name)
         if found is None:
             return None
         bits = self._bits.get(camera.name)
-        return seen_by_cpu(found, camera) if bits is None else seen_by_device(bits, found.shape, camera)
+        return photo_sky_on_cpu(found, camera) if bits is None else photo_sky_on_device(bits, found.shape, camera)
 
 
-def seen_by_cpu(found: SkyMask, camera: Camera) -> SeenSky:
+def photo_sky_on_cpu(found: SkyMask, camera: Camera) -> PhotoSky:
     """A photo's sky at the size of ``camera``, or in its window."""
     share = found.unpacked()
     if camera.window is not None and camera.whole().height >= share.shape[0]:
         return _seen_in_window(share, camera)
     wider = _widened(share)
-    return SeenSky(_surely(share, camera), _surely(wider, camera))
+    return PhotoSky(_surely(share, camera), _surely(wider, camera))
 
 
 def _widened(share: Bool[np.ndarray, "_ _"]) -> Bool[np.ndarray, "_ _"]:
@@ -80,7 +80,7 @@ def _widened(share: Bool[np.ndarray, "_ _"]) -> Bool[np.ndarray, "_ _"]:
     return np.asarray(cv2.dilate(share.view(np.uint8), np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8))).view(bool)
 
 
-def _seen_in_window(share: Bool[np.ndarray, "_ _"], camera: Camera) -> SeenSky:
+def _seen_in_window(share: Bool[np.ndarray, "_ _"], camera: Camera) -> PhotoSky:
     """The same for a window of a photo larger than its mask: only what the window shows of the mask is looked at."""
     taken, places = [], []
     for old, (new, pixels) in zip(share.shape, _sides(camera), strict=True):
@@ -92,7 +92,7 @@ def _seen_in_window(share: Bool[np.ndarray, "_ _"], camera: Camera) -> SeenSky:
     part = np.ascontiguousarray(share[taken[0], taken[1]])
     if not part.any() or part.all():
         everywhere = torch.full((camera.height, camera.width), bool(part.any()))
-        return SeenSky(everywhere, everywhere)
+        return PhotoSky(everywhere, everywhere)
     (down, top), (right, left) = places
     from_window = np.array([[right, 0.0, left], [0.0, down, top]])
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -101,10 +101,10 @@ def _seen_in_window(share: Bool[np.ndarray, "_ _"], camera: Camera) -> SeenSky:
         cv2.warpAffine(sky.astype(np.float32), from_window, size, flags=how, borderMode=cv2.BORDER_REPLICATE) > SURE
         for sky in (part, _widened(part))
     )
-    return SeenSky(torch.from_numpy(mask), torch.from_numpy(around))
+    return PhotoSky(torch.from_numpy(mask), torch.from_numpy(around))
 
 
-def seen_by_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camera: Camera) -> SeenSky:
+def photo_sky_on_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camera: Camera) -> PhotoSky:
     """The same from a mask's bits, made where they are; only rounding may differ.
 
     Args:
@@ -118,7 +118,7 @@ def seen_by_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camera: Ca
     wider = functional.max_pool2d(share, 2 * RIM_PX + 1, stride=1, padding=RIM_PX)
     down, right = (_resizing(old, *side, share) for old, side in zip(shape, _sides(camera), strict=True))
     mask, around = down @ torch.cat((share, wider)) @ right.T > SURE
-    return SeenSky(mask, around)
+    return PhotoSky(mask, around)
 
 
 def _sides(camera: Camera) -> tuple[tuple[int, slice], tuple[int, slice]]:
