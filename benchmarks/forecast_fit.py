@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 from splatpipe.stages.costs import REFERENCE, Costs, StageCosts
 from splatpipe.stages.forecast import counted, forecast
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import NEIGHBOURS, CaptureSize, Units, Work
+from splatpipe.stages.work import NEIGHBOURS, CaptureSize, CaptureWork, WorkUnits
 
 KINDS = ("cpu_seconds", "peak_memory_bytes", "disk_bytes")
 BY_GAUSSIANS = ("train", "clean", "evaluate", "export")
@@ -110,7 +110,7 @@ def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
     What these runs do not tell (of an extractor that none used, of a film) is taken from ``base``.
     """
     scenes = [scene_of(run, base) for run in runs]
-    works = [Work.of(run.size, run.config, scene, run.threads) for run, scene in zip(runs, scenes, strict=True)]
+    works = [CaptureWork.of(run.size, run.config, scene, run.threads) for run, scene in zip(runs, scenes, strict=True)]
     units = [work.units() for work in works]
     keypoints = dict(base.keypoints)
     for extractor in {run.config.features.extractor for run in runs}:
@@ -142,7 +142,7 @@ def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
 
 def scene_of(run: FinishedRun, base: Costs) -> Costs:
     """Costs with what this run's scene had, which is known afterwards only: the units of its work come out as done."""
-    bare = Work.of(run.size, run.config, replace(base, gaussians=1.0), run.threads)
+    bare = CaptureWork.of(run.size, run.config, replace(base, gaussians=1.0), run.threads)
     options, counts = run.config, run.counts
     keypoints = {
         **base.keypoints,
@@ -170,7 +170,7 @@ def _typical(values: Sequence[float], otherwise: float) -> float:
     return math.exp(sum(math.log(value) for value in values) / len(values)) if values else otherwise
 
 
-def _line(those: Sequence[tuple[Mapping[str, float], Units]], slope: float | None = None) -> tuple[float, float]:
+def _line(those: Sequence[tuple[Mapping[str, float], WorkUnits]], slope: float | None = None) -> tuple[float, float]:
     """A stage's memory: what is there whatever the size, and a unit's; neither below zero (relative least squares)."""
     units = np.array([of.memory for _, of in those])
     used = np.array([found["peak_memory_bytes"] for found, _ in those])

@@ -24,7 +24,7 @@ from opened_run import open_run
 from tables import Row, print_table
 from tiled_site import Tiling, middle_and_edge, write_coarse, write_site
 
-from splatpipe.pipeline.app.preflight.start import told_of_blocks
+from splatpipe.pipeline.app.preflight.start import blocks_text
 from splatpipe.pipeline.engine.config import load_preset, parse_set, resolve
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.executor import Executor
@@ -39,7 +39,7 @@ from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.forecast import machine_speed, needs_of, needs_of_blocks
 from splatpipe.stages.line import TRAIN
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import MEGA, CaptureSize, Work
+from splatpipe.stages.work import MEGA, CaptureSize, CaptureWork
 
 LOOK_EVERY_S = 0.5
 COLUMNS = {
@@ -196,13 +196,11 @@ def main() -> None:
     sizes = [view.camera.width * view.camera.height for view in run.views]
     size = CaptureSize(tiling.photos, sum(sizes) / len(sizes) / MEGA, positions=True)
     speed = machine_speed()
-    work = Work.of(size, config, REFERENCE, arguments.threads)
+    work = CaptureWork.of(size, config, REFERENCE, arguments.threads)
     needs = needs_of(work, speed)
     if work.blocks is None:
         options.exit(2, "That much memory holds the site in one: lower --max-memory, or raise --gaussians.\n")
-    print(
-        f"{tiling.photos:,} photos in {len(tiling.offsets)} tiles, {told_of_blocks(work.blocks)}; machine {speed:.2f}"
-    )
+    print(f"{tiling.photos:,} photos in {len(tiling.offsets)} tiles, {blocks_text(work.blocks)}; machine {speed:.2f}")
     _tell_whole(needs)
     if arguments.told_only:
         return

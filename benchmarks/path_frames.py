@@ -28,7 +28,7 @@ from tables import Row, print_table
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.film.camera_path import (
     FINE_STEPS,
-    Lens,
+    FilmCamera,
     cameras_along,
     centripetal_knots,
     evenly_timed,
@@ -37,7 +37,7 @@ from splatpipe.pipeline.film.camera_path import (
     upright_route,
 )
 from splatpipe.pipeline.film.filming import open_scene
-from splatpipe.pipeline.film.photo_route import Capture, followed_photos
+from splatpipe.pipeline.film.photo_route import PhotoTrack, followed_photos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.photos.images import Pixels
@@ -143,7 +143,7 @@ def _median(depth: Depth) -> float | None:
     return float(np.median(surface)) if surface.size else None
 
 
-def path(capture: Capture, cameras: Sequence[Camera], frames: int) -> list[tuple[float, Camera]]:
+def path(capture: PhotoTrack, cameras: Sequence[Camera], frames: int) -> list[tuple[float, Camera]]:
     """Cameras along a smooth way through all of some, level, with the first one's intrinsics.
 
     Args:
@@ -160,7 +160,7 @@ def path(capture: Capture, cameras: Sequence[Camera], frames: int) -> list[tuple
     fine = np.linspace(0.0, knots[-1], FINE_STEPS + 1)
     even = evenly_timed(route_of(spline(route.values(), knots, fine)), distance, frames, frames / FPS)
     at = np.interp(even, np.arange(len(fine)), fine)
-    along = cameras_along(route_of(spline(route.values(), knots, at)), Lens(1, 1, 1.0), capture.up)
+    along = cameras_along(route_of(spline(route.values(), knots, at)), FilmCamera(1, 1, 1.0), capture.up)
     places = np.interp(at, knots, np.arange(len(cameras))).tolist()
     found = [replace(cameras[0], cam_from_world=camera.cam_from_world) for camera in along]
     return list(zip(places, found, strict=True))

@@ -22,7 +22,7 @@ from tables import Row, print_table
 
 from splatpipe.pipeline.edit.cleaning import clean_scene
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
-from splatpipe.pipeline.edit.sightings import Photos
+from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.render.rendering import Model, render_pixels
@@ -51,7 +51,7 @@ PICTURE_COLUMNS = {
 }
 
 
-def photos_of(run: OpenedRun) -> Photos:
+def photos_of(run: OpenedRun) -> TrainingPhotos:
     """What the cleaner is told: the photos of the training, and none that was held out."""
     views = [view for view in run.views if view.camera.name not in run.held_out]
 
@@ -59,10 +59,10 @@ def photos_of(run: OpenedRun) -> Photos:
         return reduced_view(views[index], SEEN_MEGAPIXELS)[1:]
 
     cameras = [reduced_camera(view.camera, SEEN_MEGAPIXELS) for view in views]
-    return Photos(cameras, run.options, picture, run.model[1])
+    return TrainingPhotos(cameras, run.options, picture, run.model[1])
 
 
-def kept_by_cleaner(model: Gaussians, photos: Photos | None) -> Bool[np.ndarray, " n"]:
+def kept_by_cleaner(model: Gaussians, photos: TrainingPhotos | None) -> Bool[np.ndarray, " n"]:
     """Which Gaussians the cleaner leaves."""
     return np.asarray(clean_scene(model, photos).keep.numpy())
 

@@ -23,7 +23,7 @@ from playwright.sync_api import Page, sync_playwright
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.handover import in_world
-from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
+from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SPREAD = 0.9  # of the parent's standard deviations: how its parts lie in it
@@ -55,7 +55,7 @@ def write_page(run: OpenedRun, count: int, folder: Path) -> None:
     """Write the page of a model of that many Gaussians, the splat within."""
     gaussians, sky = run.model
     frame = load_frame(run.parts["georef.frame"].path)
-    look = look_of(run.options, sky)
+    look = viewer_rendering(run.options, sky)
     scene = viewer_scene(run.parts["undistort.dataset"].path, frame, look, run.held_out, count, f"{count:,} Gaussians")
     write_viewer(folder, scene, in_world(multiplied(gaussians, count), frame), largest_bytes=1e9)
 

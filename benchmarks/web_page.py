@@ -28,7 +28,7 @@ from splatpipe.pipeline.splat.scene import Scene, SceneFacts
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.handover import in_world
 from splatpipe.pipeline.web.site import write_site
-from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
+from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
 SITE, PAGE = "web", "viewer.html"
 PATIENCE_S = 420.0
@@ -65,7 +65,7 @@ def write_pages(run: OpenedRun, count: int, folder: Path) -> None:
     """Write a site and a page of a model of that many Gaussians."""
     gaussians, sky = run.model
     frame = load_frame(run.parts["georef.frame"].path)
-    look = look_of(run.options, sky)
+    look = viewer_rendering(run.options, sky)
     scene = viewer_scene(run.parts["undistort.dataset"].path, frame, look, run.held_out, count, f"{count:,} Gaussians")
     many = in_world(multiplied(gaussians, count), frame)
     folder.mkdir(parents=True, exist_ok=True)

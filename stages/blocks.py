@@ -27,7 +27,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import MEGA, CaptureSize, Work
+from splatpipe.stages.work import MEGA, CaptureSize, CaptureWork
 
 LARGEST_PHOTO = 200.0  # megapixels: the dataset's own size is what counts
 
@@ -134,7 +134,7 @@ def _scene(train: TrainConfig, plan: TrainingPlan) -> SceneSize:
     pixels = sum(width * height * count for width, height, count in plan.sizes) / max(photos, 1)
     size = CaptureSize(photos, pixels / MEGA, True, _shape(plan))
     whole = LineConfig(train=train, undistort=UndistortConfig(max_megapixels=LARGEST_PHOTO))
-    expected = Work.of(size, whole, REFERENCE, threads=1).grown
+    expected = CaptureWork.of(size, whole, REFERENCE, threads=1).grown
     return SceneSize(train.max_gaussians, expected, window, train.sh_degree, photos)
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatpipe.pipeline.edit.cleaning import Cleaned, clean_scene, told_in_a_line
+from splatpipe.pipeline.edit.cleaning import CleaningResult, clean_scene, removals_in_words
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS, CleanConfig
-from splatpipe.pipeline.edit.sightings import Photos
+from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import load_split, load_views
@@ -46,7 +46,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         kept = (piece.select(keep) for piece, keep in _pieces(gaussians, cleaned.keep))
         count, comments = len(gaussians) - removed, read_splat_header(trained).comments
         write_splat_parts(model, kept, count, gaussians.sh_degree, comments)
-        report.note(told_in_a_line(cleaned))
+        report.note(removals_in_words(cleaned))
     else:
         shutil.copyfile(trained, model)
     write_json(out / "cleaned.json", {"gaussians": len(gaussians), "removed": cleaned.removed})
@@ -58,7 +58,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     }
 
 
-def _cleaned(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> Cleaned:
+def _cleaned(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> CleaningResult:
     """By the photos that it was trained on: those held out are to measure it, and say nothing here."""
     held_out = set(load_split(inputs["split.views"]).held_out)
     views = [view for view in load_views(inputs["undistort.dataset"]) if view.camera.name not in held_out]
@@ -69,7 +69,7 @@ def _cleaned(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> Cleaned:
         _, photo, mask = reduced_view(views[index], SEEN_MEGAPIXELS)
         return photo, mask
 
-    photos = Photos(
+    photos = TrainingPhotos(
         [reduced_camera(view.camera, SEEN_MEGAPIXELS) for view in views],
         options,
         picture,

@@ -41,7 +41,7 @@ from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
 from splatpipe.pipeline.web.options import ExportConfig, format_names
 from splatpipe.pipeline.web.viewer import ViewerScene
-from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene, write_viewer
+from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
 Facts = dict[str, Any]
 
@@ -114,7 +114,7 @@ def viewer_of(inputs: Inputs, gaussians: Gaussians, title: str) -> ViewerScene:
         title: The pages'.
     """
     options, _ = as_trained(inputs["train.rendering"], gaussians)
-    look = look_of(options, read_panorama(inputs["train.sky"]))
+    look = viewer_rendering(options, read_panorama(inputs["train.sky"]))
     frame = load_frame(inputs["georef.frame"])
     scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out_names(inputs), len(gaussians), title)
     if (area := read_world_area(inputs.parts.get("georef.boundary"))) is not None:

@@ -17,7 +17,7 @@ from typing import Any
 from splatpipe.pipeline.engine.machine import available_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.needs import whole as whole
-from splatpipe.pipeline.engine.source import Source
+from splatpipe.pipeline.engine.source import RunSource
 from splatpipe.pipeline.engine.stage import Summary
 from splatpipe.pipeline.train.blocks.division import Division
 from splatpipe.pipeline.train.blocks.needs import MARGIN_GROWTH, grown_from
@@ -31,7 +31,7 @@ from splatpipe.pipeline.train.limits import (
 from splatpipe.stages.block_work import BEGINNING_S, BlockLoad
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import FEWEST_GAUSSIANS, LEAST_SHARE, MEGA, CaptureSize, Work
+from splatpipe.stages.work import FEWEST_GAUSSIANS, LEAST_SHARE, MEGA, CaptureSize, CaptureWork
 
 SPEED_NUMBERS = 20_000  # of a text without repeats, whose packing is timed
 SPEED_S = 0.008  # that the machine of the costs takes to pack it, undisturbed
@@ -59,10 +59,10 @@ def forecast(
         costs: Of a unit of each stage's work.
         machine_bytes: Memory of the machine that decides on blocks; 0 where nobody knows.
     """
-    return needs_of(Work.of(size, config, costs, threads, machine_bytes), speed)
+    return needs_of(CaptureWork.of(size, config, costs, threads, machine_bytes), speed)
 
 
-def needs_of(work: Work, speed: float) -> dict[str, Need]:
+def needs_of(work: CaptureWork, speed: float) -> dict[str, Need]:
     """What each stage of a work takes, by its name.
 
     Args:
@@ -97,7 +97,7 @@ class Forecaster:
 
     config: LineConfig
     threads: int
-    _works: dict[object, Work] = field(default_factory=dict, compare=False, repr=False)
+    _works: dict[object, CaptureWork] = field(default_factory=dict, compare=False, repr=False)
 
     @cached_property
     def speed(self) -> float:
@@ -117,7 +117,7 @@ class Forecaster:
         told = {} if decided is None else decided.get("of_blocks", {})
         return needs_of(work, self.speed) | needs_of_blocks(work, told, self.speed)
 
-    def _work(self, size: CaptureSize, decided: Summary | None) -> Work:
+    def _work(self, size: CaptureSize, decided: Summary | None) -> CaptureWork:
         """The line's, made once as long as nothing more is known."""
         key = size, decided is None
         if key not in self._works:
@@ -125,7 +125,7 @@ class Forecaster:
         return self._works[key]
 
 
-def work_as_decided(size: CaptureSize, config: LineConfig, threads: int, decided: Summary | None) -> Work:
+def work_as_decided(size: CaptureSize, config: LineConfig, threads: int, decided: Summary | None) -> CaptureWork:
     """The work as the stage ``blocks`` decided on it, on whatever machine; None: as it would decide on this one.
 
     Args:
@@ -135,13 +135,13 @@ def work_as_decided(size: CaptureSize, config: LineConfig, threads: int, decided
         decided: What the stage said.
     """
     if decided is None:
-        return Work.of(size, config, REFERENCE, threads, available_memory_bytes())
-    whole_scene = Work.of_whole(size, config, REFERENCE, threads, int(decided.get("limit_bytes", 0)))
+        return CaptureWork.of(size, config, REFERENCE, threads, available_memory_bytes())
+    whole_scene = CaptureWork.of_whole(size, config, REFERENCE, threads, int(decided.get("limit_bytes", 0)))
     division = decided.get("division")
     return whole_scene if division is None else whole_scene.divided_as(Division.of_facts(division))
 
 
-def needs_of_blocks(work: Work, told: Mapping[str, Any], speed: float) -> dict[str, Need]:
+def needs_of_blocks(work: CaptureWork, told: Mapping[str, Any], speed: float) -> dict[str, Need]:
     """Each block's need by its name, and that of all of them, once it is known what each looks at and begins with.
 
     Args:
@@ -192,7 +192,7 @@ def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
     return CaptureSize(photos, shorter * longer / MEGA, 2 * int(told["positions"]) > photos, shorter / longer, control)
 
 
-def has_control(source: Source) -> bool:
+def has_control(source: RunSource) -> bool:
     """Whether files of the user's ask for targets."""
     return any(source.named.get(part) is not None for part in ("source.control", "source.scale_bars"))
 

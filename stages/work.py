@@ -103,7 +103,7 @@ class CaptureSize:
 
 
 @dataclass(frozen=True)
-class Units:
+class WorkUnits:
     """A stage's work.
 
     Attributes:
@@ -118,7 +118,7 @@ class Units:
 
 
 @dataclass(frozen=True)
-class Work:
+class CaptureWork:
     """A capture and what is to be made of it.
 
     Attributes:
@@ -140,7 +140,7 @@ class Work:
     blocks: BlockWork | None = None
 
     @staticmethod
-    def of(size: CaptureSize, config: LineConfig, costs: Costs, threads: int, machine_bytes: int = 0) -> Work:
+    def of(size: CaptureSize, config: LineConfig, costs: Costs, threads: int, machine_bytes: int = 0) -> CaptureWork:
         """The work without a time budget.
 
         Args:
@@ -150,14 +150,16 @@ class Work:
             threads: Of the run.
             machine_bytes: The machine's memory, where it may decide on blocks; 0 where it is not to.
         """
-        work = Work._undivided(size, config, costs, threads)
+        work = CaptureWork._undivided(size, config, costs, threads)
         division = work.division(machine_bytes)
         if division.is_near and not config.train.max_memory_bytes:
-            return Work.of_whole(size, config, costs, threads, division.limit_bytes)
+            return CaptureWork.of_whole(size, config, costs, threads, division.limit_bytes)
         return work.divided_as(division)
 
     @staticmethod
-    def of_whole(size: CaptureSize, config: LineConfig, costs: Costs, threads: int, limit_bytes: int = 0) -> Work:
+    def of_whole(
+        size: CaptureSize, config: LineConfig, costs: Costs, threads: int, limit_bytes: int = 0
+    ) -> CaptureWork:
         """The work where the scene is trained whole, whatever its size.
 
         Args:
@@ -170,10 +172,10 @@ class Work:
         if limit_bytes:
             train = config.train.model_copy(update={"max_memory_bytes": limit_bytes})
             config = config.model_copy(update={"train": train})
-        work = Work._undivided(size, config, costs, threads)
+        work = CaptureWork._undivided(size, config, costs, threads)
         return replace(work, gaussians=min(work.most_gaussians, work.grown))
 
-    def divided_as(self, division: Division) -> Work:
+    def divided_as(self, division: Division) -> CaptureWork:
         """The same with the scene cut as it was decided."""
         if division.is_whole:
             return replace(self, gaussians=min(self.most_gaussians, self.grown), blocks=None)
@@ -184,8 +186,8 @@ class Work:
         return replace(self, gaussians=blocks.merged, blocks=blocks)
 
     @staticmethod
-    def _undivided(size: CaptureSize, config: LineConfig, costs: Costs, threads: int) -> Work:
-        work = Work(size, config, costs, threads, (), 0.0)
+    def _undivided(size: CaptureSize, config: LineConfig, costs: Costs, threads: int) -> CaptureWork:
+        work = CaptureWork(size, config, costs, threads, (), 0.0)
         return replace(work, lengths=tuple(lengths_of(config.train, work.footage)))
 
     def division(self, machine_bytes: int) -> Division:
@@ -198,7 +200,7 @@ class Work:
             return divided(scene, 0)
         return divided(scene, memory_limit(train.max_memory_bytes, machine_bytes), self.config.blocks.least)
 
-    def filling(self, seconds: float, speed: float) -> Work:
+    def filling(self, seconds: float, speed: float) -> CaptureWork:
         """The same with a training of so many seconds: iterations by their root, and the Gaussians that then fit in."""
         longer = replace(self, lengths=tuple(lengths(self.footage, worthwhile_iterations(seconds))))
         cpu = seconds / Need(0, 1.0, 0, parallel=PARALLEL["train"]).seconds(self.threads)
@@ -320,7 +322,7 @@ class Work:
         frame = size[0] * size[1] / MEGA if size else min(self.trained_at, MOST_FILM_MEGAPIXELS)
         return film.seconds * film.fps * frame
 
-    def units(self) -> dict[str, Units]:
+    def units(self) -> dict[str, WorkUnits]:
         """By stage: CPU time, memory, disk; also of those that are turned off."""
         size, train = self.size, self.config.train
         photos, pixels = float(size.photos), size.photos * size.megapixels
@@ -342,29 +344,29 @@ class Work:
         controlled = float(size.control)
         targets_at_once = self.threads * min(size.megapixels, TARGETS_TILE)
         return {
-            "ingest": Units(pixels, 0.0, photos),
-            "control": Units(controlled, 0.0, controlled),
-            "features": Units(looked, looked_at_once, keypoints),
-            "matches": Units(self.pairs * self.keypoints, float(self.threads), keypoints),
-            "sparse": Units(keypoints * mapping, keypoints, keypoints),
-            "targets": Units(controlled * pixels, controlled * targets_at_once, controlled * photos),
-            "georef": Units(photos, keypoints, keypoints),
-            "undistort": Units(pixels, at_once, photos * self.kept_at),
-            "split": Units(photos, 0.0, photos),
-            "initialize": Units(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
-            "blocks": Units(done * self.coarse_training, coarse_state, 0.0),
-            "train": Units(done * self.training, state, gaussians),
-            "clean": Units(looked_through, gaussians, gaussians),
-            "evaluate": Units(judged, gaussians, judged),
-            "export": Units(gaussians, gaussians, gaussians),
-            "flythrough": Units(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
-            "depths": Units(depths, 0.0, depths),
-            "dsm": Units(pixels, 0.0, pixels),
-            "ortho": Units(pixels, 0.0, pixels),
-            "splat_depths": Units(depths, 0.0, depths),
-            "facades": Units(pixels, 0.0, pixels),
-            "cloud": Units(pixels, 0.0, pixels),
-            "mesh": Units(pixels, 0.0, pixels),
+            "ingest": WorkUnits(pixels, 0.0, photos),
+            "control": WorkUnits(controlled, 0.0, controlled),
+            "features": WorkUnits(looked, looked_at_once, keypoints),
+            "matches": WorkUnits(self.pairs * self.keypoints, float(self.threads), keypoints),
+            "sparse": WorkUnits(keypoints * mapping, keypoints, keypoints),
+            "targets": WorkUnits(controlled * pixels, controlled * targets_at_once, controlled * photos),
+            "georef": WorkUnits(photos, keypoints, keypoints),
+            "undistort": WorkUnits(pixels, at_once, photos * self.kept_at),
+            "split": WorkUnits(photos, 0.0, photos),
+            "initialize": WorkUnits(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
+            "blocks": WorkUnits(done * self.coarse_training, coarse_state, 0.0),
+            "train": WorkUnits(done * self.training, state, gaussians),
+            "clean": WorkUnits(looked_through, gaussians, gaussians),
+            "evaluate": WorkUnits(judged, gaussians, judged),
+            "export": WorkUnits(gaussians, gaussians, gaussians),
+            "flythrough": WorkUnits(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
+            "depths": WorkUnits(depths, 0.0, depths),
+            "dsm": WorkUnits(pixels, 0.0, pixels),
+            "ortho": WorkUnits(pixels, 0.0, pixels),
+            "splat_depths": WorkUnits(depths, 0.0, depths),
+            "facades": WorkUnits(pixels, 0.0, pixels),
+            "cloud": WorkUnits(pixels, 0.0, pixels),
+            "mesh": WorkUnits(pixels, 0.0, pixels),
         }
 
     @property
@@ -434,7 +436,7 @@ class Work:
             return 0
         return {"blocks": self.blocks.coarse_bytes, "train": self.blocks.block_bytes}.get(stage, 0)
 
-    def _scratch(self, stage: str, units: Units) -> int:
+    def _scratch(self, stage: str, units: WorkUnits) -> int:
         """Bytes that a stage takes while it runs: a copy of the features; decoded photos and a checkpoint."""
         if stage in ("matches", "sparse"):
             return int(self.costs.stages["features"].disk * units.disk)

@@ -17,18 +17,18 @@ from types import SimpleNamespace
 import pytest
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.batch.account import Account
 from splatpipe.pipeline.app.batch.capture_list import read_captures
-from splatpipe.pipeline.app.batch.driver import STOPPED_NOTICE_S, Driver, Told, fresh_call
-from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.driver import STOPPED_NOTICE_S, Driver, Notifications, fresh_call
+from splatpipe.pipeline.app.batch.monitor import BatchMonitor
+from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
 from splatpipe.pipeline.app.batch.snakemake_process import open_profile, snakemake_command
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
-from splatpipe.pipeline.app.batch.tries import NO_WORD, Ending, TryLog
+from splatpipe.pipeline.app.batch.tries import NO_WORD, TryLog, TryResult
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
-from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED, Stopped
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED, StopSignal
 from splatpipe.stages.line import LINE
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -193,13 +193,13 @@ def planned(name: str, *stages: str) -> PlannedCapture:
 
 def call_of(out: Path, *captures: PlannedCapture, retries: int = 1) -> Call:
     call = fresh_call(out)
-    call.write_plan(Plan(str(out), time.time(), captures, retries=retries))
+    call.write_plan(BatchPlan(str(out), time.time(), captures, retries=retries))
     return call
 
 
-BAD = Ending(EXIT_STAGE, "The stage train died.", "See the log.")
-HOPELESS = Ending(EXIT_INPUT, "No two photos overlap.", "Fly again.", final=True)
-FULL = Ending(EXIT_MACHINE, "The disk is full.", "Make room.")
+BAD = TryResult(EXIT_STAGE, "The stage train died.", "See the log.")
+HOPELESS = TryResult(EXIT_INPUT, "No two photos overlap.", "Fly again.", final=True)
+FULL = TryResult(EXIT_MACHINE, "The disk is full.", "Make room.")
 
 
 @pytest.mark.parametrize(
@@ -207,16 +207,20 @@ FULL = Ending(EXIT_MACHINE, "The disk is full.", "Make room.")
     [
         ([], False, ("waiting", "ingest", 0.0, 0, "")),
         ([], True, ("stopped", "ingest", 0.0, 0, "It was stopped with the batch.")),
-        ([("ingest", Ending(0))], False, ("waiting", "train", 0.25, 0, "")),
-        ([("ingest", Ending(0)), ("train", None)], False, ("running", "train", 0.25, 1, "")),
-        ([("ingest", Ending(0)), ("train", BAD)], False, ("waiting", "train", 0.25, 1, "")),
-        ([("ingest", Ending(0)), ("train", BAD), ("train", FULL)], False, ("failed", "train", 0.25, 2, FULL.message)),
+        ([("ingest", TryResult(0))], False, ("waiting", "train", 0.25, 0, "")),
+        ([("ingest", TryResult(0)), ("train", None)], False, ("running", "train", 0.25, 1, "")),
+        ([("ingest", TryResult(0)), ("train", BAD)], False, ("waiting", "train", 0.25, 1, "")),
+        (
+            [("ingest", TryResult(0)), ("train", BAD), ("train", FULL)],
+            False,
+            ("failed", "train", 0.25, 2, FULL.message),
+        ),
         ([("ingest", HOPELESS)], False, ("failed", "ingest", 0.0, 1, HOPELESS.message)),
-        ([("ingest", Ending(0)), ("train", BAD), ("train", Ending(0))], True, ("done", "", 1.0, 2, "")),
+        ([("ingest", TryResult(0)), ("train", BAD), ("train", TryResult(0))], True, ("done", "", 1.0, 2, "")),
     ],
 )
 def test_a_captures_state_follows_from_its_tries_alone(
-    tmp_path: Path, tries: Sequence[tuple[str, Ending | None]], ended: bool, expected: tuple[object, ...]
+    tmp_path: Path, tries: Sequence[tuple[str, TryResult | None]], ended: bool, expected: tuple[object, ...]
 ) -> None:
     call = call_of(tmp_path, planned("house", "ingest", "train"))
     log = TryLog(call.tries_file("0001-house"))
@@ -229,7 +233,7 @@ def test_a_captures_state_follows_from_its_tries_alone(
             file.write(b'{"ended": {"exit_c')  # as a power cut leaves it
     if ended:
         call.write_end(time.time(), 0, "")
-    (house,) = Account(call).state().captures
+    (house,) = BatchMonitor(call).state().captures
     assert (house.state, house.stage, house.progress, house.tries, house.reason) == expected
     assert house.earlier == (("train: The stage train died.",) if ("train", BAD) in tries else ())
 
@@ -241,7 +245,7 @@ def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
     process.wait()
     begun = log.begin("ingest")
     call.tries_file("0001-house").write_text(json.dumps({"begun": {**vars(begun), "process": process.pid}}) + "\n")
-    (house,) = Account(call).state().captures
+    (house,) = BatchMonitor(call).state().captures
     assert (house.state, house.reason) == ("failed", NO_WORD)
 
 
@@ -254,7 +258,7 @@ def test_a_job_without_room_does_not_begin_and_a_hopeless_one_is_not_begun_again
     large = replace(planned("house"), jobs=(replace(job("ingest"), disk_bytes=10**18),))
     call = call_of(tmp_path, large, retries=5)
     assert run_job(call, "ingest") == run_job(call, "ingest") == EXIT_MACHINE
-    (house,) = Account(call).state().captures
+    (house,) = BatchMonitor(call).state().captures
     assert (house.state, house.tries) == ("failed", 1) and "GB free" in house.reason
     assert not (tmp_path / "house").exists() and not (call.folder / "marker").exists()
     assert any("does not begin" in said for said in call_warnings(call, large))
@@ -265,7 +269,7 @@ def test_a_job_without_room_does_not_begin_and_a_hopeless_one_is_not_begun_again
 def call_warnings(call: Call, capture: PlannedCapture) -> tuple[str, ...]:
     """Before anything has run."""
     call.tries_file(capture.key).unlink()
-    return Account(call).state().warnings
+    return BatchMonitor(call).state().warnings
 
 
 def test_the_workflow_has_a_rule_for_each_stage_that_runs_and_asks_for_what_it_needs(tmp_path: Path) -> None:
@@ -328,14 +332,14 @@ def test_a_stopped_batch_tells_of_itself_alone_and_waits_for_no_notice(
     call = call_of(tmp_path, planned("house", "train"), planned("barn", "train"))
     said: list[str] = []
     hangs = "echo $SPLATPIPE_STATE,$SPLATPIPE_CAPTURE >> told; sleep 99"
-    driver = Driver(call, open_profile(None), Told(said.append, hangs))
+    driver = Driver(call, open_profile(None), Notifications(said.append, hangs))
 
     def stop(_lock: int) -> None:
-        raise Stopped(EXIT_TERMINATED)
+        raise StopSignal(EXIT_TERMINATED)
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(driver, "_work", stop)
-    with pytest.raises(Stopped):
+    with pytest.raises(StopSignal):
         driver.run(0)
     assert (tmp_path / "told").read_text() == f"stopped,{tmp_path.name}\n"
     assert [line for line in said if "--notify" in line] == [

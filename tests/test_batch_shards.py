@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.app.batch.account import Account
 from splatpipe.pipeline.app.batch.driver import fresh_call
 from splatpipe.pipeline.app.batch.job import command_of
-from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
-from splatpipe.pipeline.app.batch.tries import Ending, Try, TryLog, read_tries, spent_s
+from splatpipe.pipeline.app.batch.monitor import BatchMonitor
+from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.tries import Try, TryLog, TryResult, read_tries, spent_s
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.engine.errors import EXIT_STAGE
 
@@ -24,7 +24,7 @@ import sharded  # noqa: E402
 
 NORTH, SOUTH = (3, 14, 15, 92), (2, 71)
 TOTALS = {name: sum(number**2 for number in numbers) for name, numbers in (("north", NORTH), ("south", SOUTH))}
-BAD = Ending(EXIT_STAGE, "The stage sum.2 died.", "See the log.")
+BAD = TryResult(EXIT_STAGE, "The stage sum.2 died.", "See the log.")
 
 
 def captures(folder: Path) -> Path:
@@ -81,7 +81,7 @@ def call_of(out: Path) -> Call:
     jobs = (job("divide"), job("sum", 300.0), job("show"))
     call = fresh_call(out)
     capture = PlannedCapture("house", "0001-house", "/photos", "preview", jobs, weights)
-    call.write_plan(Plan(str(out), time.time(), (capture,), retries=1))
+    call.write_plan(BatchPlan(str(out), time.time(), (capture,), retries=1))
     return call
 
 
@@ -113,28 +113,28 @@ def test_shards_have_their_own_part_of_what_a_stage_takes(tmp_path: Path) -> Non
     [
         ((), False, ("waiting", "sum.1", 0.125)),
         ((("sum.2", None),), False, ("running", "sum.2", 0.125)),
-        ((("sum.1", Ending(0)), ("sum.2", BAD)), False, ("waiting", "sum.2", 0.375)),
+        ((("sum.1", TryResult(0)), ("sum.2", BAD)), False, ("waiting", "sum.2", 0.375)),
         ((("sum.2", BAD), ("sum.2", BAD)), False, ("waiting", "sum.1", 0.125)),
         ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", None)), False, ("running", "sum.1", 0.125)),
-        ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", Ending(0))), False, ("failed", "sum.2", 0.375)),
+        ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", TryResult(0))), False, ("failed", "sum.2", 0.375)),
         ((("sum.2", BAD), ("sum.2", BAD)), True, ("failed", "sum.2", 0.125)),
         ((("sum.2", BAD),), True, ("stopped", "sum.1", 0.125)),
-        ((("sum.1", Ending(0)), ("sum.2", Ending(0))), False, ("waiting", "sum", 0.625)),
+        ((("sum.1", TryResult(0)), ("sum.2", TryResult(0))), False, ("waiting", "sum", 0.625)),
     ],
 )
 def test_of_shards_side_by_side_the_liveliest_is_told_of(
-    tmp_path: Path, tries: Sequence[tuple[str, Ending | None]], ended: bool, expected: tuple[object, ...]
+    tmp_path: Path, tries: Sequence[tuple[str, TryResult | None]], ended: bool, expected: tuple[object, ...]
 ) -> None:
     call = call_of(tmp_path)
     call.write_shards("0001-house", {"sum": [job("sum.1"), job("sum.2")]})
-    for stage, ending in (("divide", Ending(0)), *tries):
+    for stage, ending in (("divide", TryResult(0)), *tries):
         log = TryLog(call.tries_file("0001-house", stage))
         log.begin(stage)
         if ending is not None:
             log.end(ending)
     if ended:
         call.write_end(time.time(), 0, "")
-    (house,) = Account(call).state().captures
+    (house,) = BatchMonitor(call).state().captures
     assert (house.state, house.stage, house.progress) == expected
     failed = house.state == "failed"
     assert house.reason == (BAD.message if failed else house.reason) and house.tries == (2 if failed else house.tries)

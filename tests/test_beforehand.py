@@ -10,14 +10,14 @@ import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.cli_runs import overrides, request_of
-from splatpipe.pipeline.app.preflight.start import require_memory, told_beforehand
+from splatpipe.pipeline.app.preflight.start import forecast_text, require_memory
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.session import Request
 from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.forecast import forecast, least_memory_bytes
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import CaptureSize, Work
+from splatpipe.stages.work import CaptureSize, CaptureWork
 
 
 def request(tmp_path: Path, preset: str, **train: object) -> Request:
@@ -51,24 +51,24 @@ def test_the_least_limit_that_is_told_is_taken(tmp_path: Path) -> None:
 
 
 def test_a_run_says_what_it_takes_and_what_memory_leaves_out(tmp_path: Path) -> None:
-    told = told_beforehand(request(tmp_path, "preview"))
+    told = forecast_text(request(tmp_path, "preview"))
     assert told.startswith("40 photos of 1.1 megapixels take about ") and "1,500 iterations" in told
     assert "GB of memory" in told and "GB of disk" in told and "memory holds" not in told
     least = least_memory_bytes(LineConfig())
     tight = request(tmp_path, "standard", max_memory_bytes=least)
-    assert "the memory holds" in told_beforehand(tight) and "the photos ask for more" in told_beforehand(tight)
-    assert told_beforehand(request(tmp_path, "preview", time_budget_s=600.0)).endswith("GB of disk.")
+    assert "the memory holds" in forecast_text(tight) and "the photos ask for more" in forecast_text(tight)
+    assert forecast_text(request(tmp_path, "preview", time_budget_s=600.0)).endswith("GB of disk.")
 
 
 @pytest.mark.parametrize("preset", ["preview", "standard", "high"])
 def test_forecasts_follow_lengths_windows_and_limits(preset: str) -> None:
     config = resolve(LineConfig, [load_preset(preset)])
     small, large = (CaptureSize(photos, 20.0, True) for photos in (50, 1000))
-    each = [Work.of(size, config, REFERENCE, 2) for size in (small, large)]
+    each = [CaptureWork.of(size, config, REFERENCE, 2) for size in (small, large)]
     assert all(work.iterations >= 20 * work.size.photos and work.window <= 0.53 for work in each)
     few, many = (forecast(size, config)["train"] for size in (small, large))
     decoded = 3 * 0.25e6 * (1000 - 50)  # bytes of the photos that are more, at less than any preset's size
     assert many.cpu_seconds > few.cpu_seconds and many.scratch_bytes > few.scratch_bytes + decoded
     limited = resolve(LineConfig, [load_preset(preset), {"train": {"max_memory_bytes": 800_000_000}}])
-    assert Work.of(small, limited, REFERENCE, 2).window < each[0].window
+    assert CaptureWork.of(small, limited, REFERENCE, 2).window < each[0].window
     assert forecast(small, limited)["train"].memory_bytes <= 800_000_000

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.film.camera_path import (
-    Lens,
+    FilmCamera,
     Route,
     angle_of,
     angles_between,
@@ -27,7 +27,7 @@ from splatpipe.pipeline.film.camera_path import (
 from splatpipe.pipeline.film.clearance import Clearance
 from splatpipe.pipeline.film.keyframe_file import read_keyframes
 from splatpipe.pipeline.film.orbit import orbit
-from splatpipe.pipeline.film.photo_route import Capture, followed_photos, photo_film
+from splatpipe.pipeline.film.photo_route import PhotoTrack, followed_photos, photo_film
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 from splatpipe.pipeline.geometry.upright import rotation_to_up
@@ -55,7 +55,7 @@ def photo(place: tuple[float, float, float], target: tuple[float, float, float],
 HOUSE = np.random.default_rng(4).uniform([-4, -4, 0], [4, 4, 6], (4000, 3))  # solid through and through
 
 
-def capture(cameras: list[Camera], solid: np.ndarray = HOUSE) -> Capture:
+def capture(cameras: list[Camera], solid: np.ndarray = HOUSE) -> PhotoTrack:
     """Photos of a house of 8 × 8 × 6 metres; each sees the points in its picture on the side towards it."""
     points = HOUSE @ TILT.T
     seen = []
@@ -65,7 +65,7 @@ def capture(cameras: list[Camera], solid: np.ndarray = HOUSE) -> Capture:
         inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1) & (z > 0)
         near = np.linalg.norm(points - camera.centre(), axis=1)
         seen.append(np.flatnonzero(inside & (near < np.median(near))))
-    return Capture(cameras, seen, points, UP, Clearance(solid @ TILT.T))
+    return PhotoTrack(cameras, seen, points, UP, Clearance(solid @ TILT.T))
 
 
 def ring(count: int, radius: float = 20.0, height: float = 8.0, turn: float = 2.0 * math.pi) -> list[Camera]:
@@ -114,7 +114,7 @@ def test_a_film_is_smooth_and_near_its_photos_however_many_there_are(count: int)
 
 def test_cameras_of_a_film_are_level_whatever_the_photos_roll() -> None:
     rolled = [photo((20.0 * math.cos(a), 20.0 * math.sin(a), 8.0), (0, 0, 3), 0.4) for a in np.linspace(0, 2, 9)]
-    found = cameras_along(film(rolled), Lens(640, 360, 400.0), UP)
+    found = cameras_along(film(rolled), FilmCamera(640, 360, 400.0), UP)
     for camera in found:
         rotation = camera.cam_from_world[:3, :3]
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -197,7 +197,7 @@ def test_a_swaying_kite_is_followed_where_it_looked() -> None:
     mean = np.mean([TILT.T @ camera.cam_from_world[2, :3] for camera in cameras], axis=0)
     aside = np.degrees(angles_between(route.directions(), np.tile(mean / np.linalg.norm(mean), (FRAMES, 1))))
     assert aside.max() < 12.0 and np.median(aside) < 4.0
-    tops = np.array([-camera.cam_from_world[1, :3] for camera in cameras_along(route, Lens(64, 36, 50.0), UP)])
+    tops = np.array([-camera.cam_from_world[1, :3] for camera in cameras_along(route, FilmCamera(64, 36, 50.0), UP)])
     assert np.degrees(angles_between(tops, np.tile(-cameras[0].cam_from_world[1, :3], (FRAMES, 1)))).max() < 5.0
 
 
@@ -220,10 +220,10 @@ def test_upright_routes_know_places_headings_and_pitches() -> None:
     np.testing.assert_allclose(route.places, [[10, 0, 4], [0, 10, 14]], atol=1e-9)
     np.testing.assert_allclose(np.degrees(route.headings) % 360.0, [180, 270], atol=1e-6)
     np.testing.assert_allclose(np.degrees(route.pitches), [0, -45], atol=1e-6)
-    back = cameras_along(route, Lens(400, 300, 300.0), UP)[1]
+    back = cameras_along(route, FilmCamera(400, 300, 300.0), UP)[1]
     np.testing.assert_allclose(back.cam_from_world, photo((0, 10, 14), (0, 0, 4)).cam_from_world, atol=1e-9)
     assert angle_of([back]) == pytest.approx(math.degrees(2.0 * math.atan(200 / 300)))
-    assert Lens.of_angle(400, 300, angle_of([back])).focal_px == pytest.approx(300.0)
+    assert FilmCamera.of_angle(400, 300, angle_of([back])).focal_px == pytest.approx(300.0)
 
 
 @given(st.floats(0.01, 0.5))

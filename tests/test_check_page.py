@@ -115,7 +115,7 @@ def test_it_fits_the_screen_and_asks_for_nothing(
     assert said.index("This capture cannot be reconstructed as it is") < said.index("Two strips lie too far apart.")
     assert "41 % as sharp as its neighbours" in said and "−1.6 EV" in said and "cannot be read" in said
     assert "8.3 h" in said and "17 h" in said and "9.80 GB" in said and "It lacks 1.8 GB of memory." in said
-    assert watched.page.locator(".verdict li").count() == watched.page.locator("article.told").count() == 4
+    assert watched.page.locator(".verdict li").count() == watched.page.locator("article.finding-card").count() == 4
     every = "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
     assert watched.page.evaluate(every)
     assert watched.page.locator("img").count() == 3  # blurred, one beside it, and the dark one
@@ -233,10 +233,13 @@ def test_pictures_are_few_and_a_cut_off_photo_shows_what_there_is(
     path = tmp_path / "check.html"
     write_page(grid(tmp_path, demo_names, findings=tuple(findings)), path)
     watched = open_page(path.as_uri())
-    figures = [told.locator("img").count() for told in watched.page.locator("article.told").all()]
+    figures = [told.locator("img").count() for told in watched.page.locator("article.finding-card").all()]
     assert figures[:2] == [1, MOST_A_FINDING] and sum(figures) == MOST_PICTURES
-    assert watched.page.locator("article.told").nth(2).locator("details bdi").all_text_contents() == demo_names[:12]
-    picture = watched.page.locator("article.told img").first
+    assert (
+        watched.page.locator("article.finding-card").nth(2).locator("details bdi").all_text_contents()
+        == demo_names[:12]
+    )
+    picture = watched.page.locator("article.finding-card img").first
     upper = """image => {
         const canvas = Object.assign(document.createElement("canvas"), {width: image.width, height: image.height});
         const context = canvas.getContext("2d");

@@ -10,9 +10,9 @@ import pytest
 import torch
 from jaxtyping import Bool, Float32, Float64
 
-from splatpipe.pipeline.edit.cleaning import Cleaned, clean_scene
+from splatpipe.pipeline.edit.cleaning import CleaningResult, clean_scene
 from splatpipe.pipeline.edit.depth_islands import without_islands
-from splatpipe.pipeline.edit.sightings import Photos, look_through
+from splatpipe.pipeline.edit.visibility import TrainingPhotos, look_through
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
@@ -75,7 +75,7 @@ def cameras() -> list[Camera]:
     return [camera((7.0 * np.cos(a), 7.0 * np.sin(a), height), f"{a:.2f}") for a, height in turns]
 
 
-def photos(pictures: bool) -> Photos:
+def photos(pictures: bool) -> TrainingPhotos:
     """Of the scene as it is."""
 
     def picture(index: int) -> tuple[Pixels, Mask | None]:
@@ -83,7 +83,7 @@ def photos(pictures: bool) -> Photos:
             colour = rasterizer.render(scene(), cameras()[index], OPTIONS).colour
         return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).numpy().astype(np.uint8), None
 
-    return Photos(cameras(), OPTIONS, picture if pictures else None)
+    return TrainingPhotos(cameras(), OPTIONS, picture if pictures else None)
 
 
 def planted(kind: str) -> Gaussians:
@@ -103,7 +103,7 @@ def planted(kind: str) -> Gaussians:
     return made_of(np.array([[0.0, 0.0, 4.0]]), (1.5, 1.5, 0.1), 1.0, opacity=0.2)
 
 
-def shares(cleaned: Cleaned) -> tuple[float, float]:
+def shares(cleaned: CleaningResult) -> tuple[float, float]:
     """Of the planted that are found, and of the scene that is lost."""
     real = len(scene())
     return 1.0 - float(cleaned.keep[real:].float().mean()), 1.0 - float(cleaned.keep[:real].float().mean())
@@ -148,7 +148,7 @@ def test_pictures_keep_what_floats_and_is_real() -> None:
             colour = rasterizer.render(real, cameras()[index], OPTIONS).colour
         return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).numpy().astype(np.uint8), None
 
-    assert clean_scene(real, Photos(cameras(), OPTIONS, picture)).keep[-2:].all()
+    assert clean_scene(real, TrainingPhotos(cameras(), OPTIONS, picture)).keep[-2:].all()
     assert not clean_scene(real, photos(pictures=True)).keep[-2:].any()  # on photos without them
 
 
@@ -176,7 +176,7 @@ def test_weights_are_those_of_the_definition() -> None:
     """Two Gaussians, one before the other: the sums of α T by the slow definition, rendered in white on black."""
     two = made_of(np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 1.0]]), 0.2, 0.5, opacity=0.6)
     above = camera((0.01, 0.0, 7.0), "above")
-    found = look_through(two, Photos([above], OPTIONS), lambda _done: None)
+    found = look_through(two, TrainingPhotos([above], OPTIONS), lambda _done: None)
     for row in range(2):
         colours = torch.zeros(2, 3)
         colours[row] = 1.0
@@ -190,7 +190,7 @@ def test_weights_are_those_of_the_definition() -> None:
 def test_the_angle_between_photos_is_told() -> None:
     one = made_of(np.array([[0.0, 0.0, 0.7]]), 0.2, 0.5)
     pair = [camera((5.0 * np.sin(a), 0.0, 0.7 + 5.0 * np.cos(a)), str(a)) for a in (-0.2, 0.2)]
-    found = look_through(one, Photos(pair, OPTIONS), lambda _done: None)
+    found = look_through(one, TrainingPhotos(pair, OPTIONS), lambda _done: None)
     assert found.photos[0] == pytest.approx(2.0, abs=0.01)
     assert found.angle_deg[0] == pytest.approx(np.rad2deg(0.2), rel=0.02)
 

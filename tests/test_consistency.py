@@ -10,7 +10,7 @@ from splatpipe.pipeline.render.consistency import (
     NO_SURFACE,
     SAMPLE_EVERY,
     depth_differences,
-    disagreement,
+    depth_disagreement,
     neighbouring_pairs,
 )
 
@@ -56,7 +56,7 @@ def test_turned_and_smaller_neighbour_agrees_within_half_a_pixel() -> None:
     smaller = turned.scaled(60, 45)
     for neighbour in (turned, smaller):
         both = (LEFT, neighbour), (neighbour, LEFT)
-        figures = disagreement([depth_differences(a, true_depth(a), b, true_depth(b)) for a, b in both])
+        figures = depth_disagreement([depth_differences(a, true_depth(a), b, true_depth(b)) for a, b in both])
         assert figures.pixels > 300 and figures.share == 0.0
         assert figures.median is not None and figures.median < 0.003
 
@@ -68,7 +68,7 @@ def test_what_one_view_alone_calls_a_surface_is_a_contradiction() -> None:
     wrong = found[found > 0.05]
     assert wrong.size == 20
     np.testing.assert_allclose(wrong, WALL / 6.0 - 1.0, rtol=1e-6)
-    figures = disagreement([found])
+    figures = depth_disagreement([found])
     assert figures.share == pytest.approx(20 / found.size) and figures.pixels == found.size
 
 
@@ -85,9 +85,9 @@ def test_real_board_before_the_wall_contradicts_nothing() -> None:
     both = (LEFT, RIGHT), (RIGHT, LEFT)
     found = [depth_differences(a, true_depth(a, box=True), b, true_depth(b, box=True)) for a, b in both]
     without = [depth_differences(a, true_depth(a), b, true_depth(b)) for a, b in both]
-    figures = disagreement(found)
+    figures = depth_disagreement(found)
     assert figures.share == 0.0 and figures.median is not None and figures.median < 1e-6
-    assert figures.pixels < disagreement(without).pixels  # some of the wall is hidden from the other
+    assert figures.pixels < depth_disagreement(without).pixels  # some of the wall is hidden from the other
 
 
 def test_looking_through_everything_is_the_largest_contradiction() -> None:
@@ -103,7 +103,7 @@ def test_views_that_do_not_meet_have_no_figures() -> None:
     away = camera(0.0, turned=np.pi)
     found = depth_differences(LEFT, true_depth(LEFT), away, np.ones((HEIGHT, WIDTH), np.float32))
     assert found.size == 0
-    figures = disagreement([found])
+    figures = depth_disagreement([found])
     assert (figures.median, figures.share, figures.pixels) == (None, None, 0)
     tiny = replace(LEFT, width=1, height=1)
     assert depth_differences(tiny, np.ones((1, 1), np.float32), LEFT, true_depth(LEFT)).size == 0

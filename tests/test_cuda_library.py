@@ -13,7 +13,7 @@ import torch
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster import cuda_api, cuda_driver, cuda_library
-from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, Installed, reason_of
+from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaInstallation, CudaLibrary, reason_of
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 from building import build_on_cpu
@@ -21,7 +21,7 @@ from building import build_on_cpu
 NATIVE = Path(__file__).parent.parent / "pipeline" / "raster" / "native" / "cuda"
 API = (NATIVE / "api.h").read_text()
 H200 = CudaDevice("NVIDIA H200", 90, 13000, 13000, 150_000_000_000)
-GOOD = Installed(13000, library=(0, H200), torch_cuda="12.8")
+GOOD = CudaInstallation(13000, library=(0, H200), torch_cuda="12.8")
 
 
 def build(source: str, out: Path, *flags: str) -> None:
@@ -96,10 +96,10 @@ def test_nothing_is_in_the_way_of_a_good_installation():
 @pytest.mark.parametrize(
     ("installed", "reason", "hint"),
     [
-        (Installed(0), "no NVIDIA driver", "install its driver"),
-        (Installed(12080, driver_code=100), "no NVIDIA graphics card", "nvidia-smi"),
-        (Installed(12080, driver_code=803), "driver does not start .*803", "nvidia-smi"),
-        (Installed(13000, has_library=False), "built without CUDA kernels", "nvcc"),
+        (CudaInstallation(0), "no NVIDIA driver", "install its driver"),
+        (CudaInstallation(12080, driver_code=100), "no NVIDIA graphics card", "nvidia-smi"),
+        (CudaInstallation(12080, driver_code=803), "driver does not start .*803", "nvidia-smi"),
+        (CudaInstallation(13000, has_library=False), "built without CUDA kernels", "nvcc"),
         (
             replace(GOOD, driver=12080),
             r"too old: it knows CUDA 12.8, less than the CUDA kernels \(CUDA 13\) need",

@@ -13,7 +13,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.cuda_library import why_not
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
+from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
 from splatpipe.pipeline.splat.sky_mask import SkyMask
 from splatpipe.pipeline.train.photo_sky import PhotoSky
@@ -130,7 +130,7 @@ def test_nodes_that_do_not_reach_the_last_pixel_are_refused(kernels: CudaKernels
     colour, alpha = torch.zeros(20, 20, 3), torch.zeros(20, 20)
     for rows, step in ((3, 8), (20, 9)):
         with use_kernels(kernels), pytest.raises(Exception, match="argument"):
-            laid_over_nodes(colour, alpha, torch.zeros(rows, 4, 3), Behind(BACKGROUND, step=step))
+            laid_over_nodes(colour, alpha, torch.zeros(rows, 4, 3), SkyLayer(BACKGROUND, step=step))
 
 
 def test_nothing_beyond_the_nodes_is_looked_at(kernels: CudaKernels) -> None:
@@ -138,6 +138,6 @@ def test_nothing_beyond_the_nodes_is_looked_at(kernels: CudaKernels) -> None:
     guarded = torch.full((4, 2, 3), torch.nan)
     guarded[:3] = torch.rand(3, 2, 3, generator=torch.Generator().manual_seed(2))
     with use_kernels(kernels):
-        picture = laid_over_nodes(colour, alpha, guarded[:3], Behind((0.0, 0.0, 0.0)))
+        picture = laid_over_nodes(colour, alpha, guarded[:3], SkyLayer((0.0, 0.0, 0.0)))
     torch.testing.assert_close(picture[::8, ::8], guarded[:3], rtol=0, atol=1e-6)
     assert bool(picture.isfinite().all())

@@ -22,7 +22,7 @@ from splatpipe.pipeline.survey.handover import facts_of, in_world, pose_in_world
 from splatpipe.pipeline.survey.world import open_world
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
 from splatpipe.pipeline.web.options import ExportConfig, format_names
-from splatpipe.pipeline.web.viewer_scene import look_of, viewer_scene
+from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -42,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunSplat:
     dataset = tiny_scene.write_dataset(tmp_path_factory.mktemp("run") / "dataset")
     cameras = [view.camera for view in load_views(dataset)]
     scene = Scene(in_world(tiny_scene.true_model(), FRAME), facts_of(FRAME, antialias=False))
-    shown = viewer_scene(dataset, FRAME, look_of(RenderOptions(sh_degree=3), None))
+    shown = viewer_scene(dataset, FRAME, viewer_rendering(RenderOptions(sh_degree=3), None))
     return RunSplat(
         scene, FRAME, dataset, cameras, load_points(dataset), frozenset({cameras[0].name}), {"format": 1}, shown
     )

@@ -16,12 +16,12 @@ import torch
 from pyproj import Transformer
 
 from splatpipe.pipeline.app.cli_edit import steps_in_order
+from splatpipe.pipeline.edit.editing import EditTask, edit_splat
 from splatpipe.pipeline.edit.pictures import choose_views, oblique_view
 from splatpipe.pipeline.edit.record import with_edits
-from splatpipe.pipeline.edit.size import Output
-from splatpipe.pipeline.edit.sources import Source, open_source, read_cameras
+from splatpipe.pipeline.edit.size import OutputFile
+from splatpipe.pipeline.edit.sources import SplatSource, open_source, read_cameras
 from splatpipe.pipeline.edit.steps import parse_steps
-from splatpipe.pipeline.edit.work import Task, edit_splat
 from splatpipe.pipeline.edit.workpiece import Workpiece, between
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.camera import Camera
@@ -41,7 +41,7 @@ from tiny_scene import Recorder, cameras, true_model
 PLACE = SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
 PLACED = SceneFacts("z up", False, True, PLACE)
 SAME_DB = 60.0  # what is only moved: float32's rounding of means, scales and harmonics
-OUTPUT = Output(Path("out.ply"), format_named("ply"))
+OUTPUT = OutputFile(Path("out.ply"), format_named("ply"))
 
 
 def edited(scene: Scene, *given: tuple[str, Any], local: bool = False) -> Scene:
@@ -397,7 +397,7 @@ def test_it_is_reduced_to_so_many_or_to_so_many_bytes(tmp_path: Path):
     scene = Scene(true_model(600), SceneFacts())
     assert len(edited(scene, ("reduce", "200")).gaussians) == 200
     assert same(edited(scene, ("reduce", "900")).gaussians, scene.gaussians)
-    output = Output(tmp_path / "small.ply", format_named("ply"))
+    output = OutputFile(tmp_path / "small.ply", format_named("ply"))
     piece = Workpiece(Scene(scene.gaussians.clone(), scene.facts))
     parse_steps([("reduce", "0.05MB")], output, False)[0].apply(piece)
     plain_ply.write(output.path, piece.scene())
@@ -532,7 +532,7 @@ def test_a_run_is_edited_from_the_command_line_and_stays_as_it_is(run_folder: Pa
     expected = edited(Scene(true_model(), PLACED), ("rotate", "30"), ("crop_box", "-1.5,-9,1.5,9"), local=True)
     assert len(read.gaussians) == told["gaussians"] == len(expected.gaussians)
     record = json.loads((tmp_path / "site.edits.json").read_text())
-    assert record["input"]["sha256"] == Source(run_folder / "splat.ply", None).digest()
+    assert record["input"]["sha256"] == SplatSource(run_folder / "splat.ply", None).digest()
     assert record["steps"] == told["steps"] and record["output"]["gaussians"] == told["gaussians"]
     assert (run_folder / "splat.ply").read_bytes() == before
     picture = cv2.imread(str(tmp_path / "site.edit.png"))
@@ -540,8 +540,8 @@ def test_a_run_is_edited_from_the_command_line_and_stays_as_it_is(run_folder: Pa
     made = {name: (tmp_path / name).read_bytes() for name in ("site.ply", "site.edits.json", "site.edit.png")}
     given = [("rotate", "30"), ("crop_box", "-1.5,-9,1.5,9"), ("about", "0,0,0"), ("rotate", "7")]
     with same_bits(1):
-        output = Output(out, format_named("ply"))
-        edit_splat(Task(open_source(run_folder), output, parse_steps(given, output, True)), Recorder())
+        output = OutputFile(out, format_named("ply"))
+        edit_splat(EditTask(open_source(run_folder), output, parse_steps(given, output, True)), Recorder())
     assert all((tmp_path / name).read_bytes() == content for name, content in made.items())
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["run", *made])
 
@@ -550,14 +550,16 @@ def test_errors_leave_nothing_behind_and_say_what_to_do(run_folder: Path, tmp_pa
     told = splatpipe_edit(run_folder, tmp_path / "a.ply", "--crop-box", "0,0,1,1")
     assert told["exit_code"] == 1 and "leaves nothing" in told["error"]["message"]
     with pytest.raises(UsageError, match="nothing to do"):
-        edit_splat(Task(open_source(run_folder), Output(tmp_path / "a.ply", format_named("ply")), []), Recorder())
+        edit_splat(
+            EditTask(open_source(run_folder), OutputFile(tmp_path / "a.ply", format_named("ply")), []), Recorder()
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 @pytest.mark.parametrize("name", ["splat.ply", "stages/train/model.ply", ".partial/a.ply", "cameras.json"])
 def test_what_belongs_to_a_run_is_not_written_over(run_folder: Path, name):
     steps = parse_steps([("rotate", "1")], OUTPUT, False)
-    task = Task(open_source(run_folder), Output(run_folder / name, format_named("ply")), steps)
+    task = EditTask(open_source(run_folder), OutputFile(run_folder / name, format_named("ply")), steps)
     with pytest.raises(UsageError) as told:
         edit_splat(task, Recorder())
     assert "edited.ply" in told.value.hint or "IN stays" in told.value.hint
@@ -565,9 +567,9 @@ def test_what_belongs_to_a_run_is_not_written_over(run_folder: Path, name):
 
 def test_into_a_run_new_files_are_written_and_their_like_again(run_folder: Path):
     for degrees in ("1", "2"):
-        output = Output(run_folder / "edited.ply", format_named("ply"))
+        output = OutputFile(run_folder / "edited.ply", format_named("ply"))
         report = Recorder()
-        edit_splat(Task(open_source(run_folder), output, parse_steps([("rotate", degrees)], output, False)), report)
+        edit_splat(EditTask(open_source(run_folder), output, parse_steps([("rotate", degrees)], output, False)), report)
         assert report.steps[-1][0] == report.steps[-1][1]
     assert plain_ply.read(run_folder / "edited.ply").facts.edits[0]["degrees"] == 2.0
 
@@ -579,14 +581,15 @@ def test_what_is_read_is_not_written_over(tmp_path: Path):
     for name in ("a.ply", "b.ply"):
         with pytest.raises(UsageError, match="is read by this edit"):
             edit_splat(
-                Task(open_source(tmp_path / "a.ply"), Output(tmp_path / name, format_named("ply")), steps), Recorder()
+                EditTask(open_source(tmp_path / "a.ply"), OutputFile(tmp_path / name, format_named("ply")), steps),
+                Recorder(),
             )
 
 
 def test_a_model_folder_is_written_whole_and_no_folder_with_something_in_it(tmp_path: Path):
     plain_ply.write(tmp_path / "a.ply", Scene(true_model(), SceneFacts()))
-    output = Output(tmp_path / "model", format_named("model"))
-    task = Task(open_source(tmp_path / "a.ply"), output, parse_steps([("rotate", "1")], output, False), False)
+    output = OutputFile(tmp_path / "model", format_named("model"))
+    task = EditTask(open_source(tmp_path / "a.ply"), output, parse_steps([("rotate", "1")], output, False), False)
     edit_splat(task, Recorder())
     assert len(open_source(tmp_path / "model").read().gaussians) == len(true_model())
     assert len(open_source(tmp_path / "model").digest()) == 64

@@ -15,10 +15,10 @@ import pytest
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter
-from splatpipe.pipeline.engine.line import Line, survey
+from splatpipe.pipeline.engine.line import Line, line_status
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.runner import Outcome
-from splatpipe.pipeline.engine.session import Request, open_session, survey_line
+from splatpipe.pipeline.engine.session import Request, open_session, status_of
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.engine.store import open_store
 from splatpipe.pipeline.engine.worker import Task
@@ -311,19 +311,19 @@ def test_what_changed_while_a_stage_read_it_becomes_no_artifact(numbers: Path, o
 
 def test_survey_says_why(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
-    standings = list(survey(*survey_line(request_of(numbers, out, add={"offset": 5}))))
-    assert [(standing.stage.name, standing.state) for standing in standings] == [
+    statuses = list(line_status(*status_of(request_of(numbers, out, add={"offset": 5}))))
+    assert [(status.stage.name, status.state) for status in statuses] == [
         ("read", "valid"), ("add", "stale"), ("count", "waiting"), ("tell", "waiting"),
     ]  # fmt: skip
-    assert standings[1].reason == "add.offset changed from 0 to 5"
+    assert statuses[1].reason == "add.offset changed from 0 to 5"
 
 
 def test_clean_removes_only_what_nothing_asks_for(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     walk(request_of(numbers, out, add={"offset": 1}))
     request = request_of(numbers, out, add={"offset": 1})
-    line, store = survey_line(request)
-    removed, freed = store.remove_stale((standing.stage.name, standing.key) for standing in survey(line, store))
+    line, store = status_of(request)
+    removed, freed = store.remove_stale((status.stage.name, status.key) for status in line_status(line, store))
     assert removed == 3  # the first add, count and tell
     assert freed > 0
     assert walk(request)[0].ran == []
@@ -430,7 +430,7 @@ def test_looking_writes_nothing(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     (numbers / "d.txt").write_text("4")
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
-    list(survey(*survey_line(request_of(numbers, out))))
+    list(line_status(*status_of(request_of(numbers, out))))
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
 
 
@@ -454,7 +454,7 @@ def test_a_run_walks_to_every_deliverable_and_no_further_than_asked(numbers: Pat
 def test_a_stage_that_is_turned_off_reads_nothing_and_waits_for_nobody(numbers: Path, out: Path) -> None:
     off = request_of(numbers, out, count={"enabled": False})
     assert walk(off, until="count")[0].ran == ["count"]
-    assert [standing.state for standing in survey(*survey_line(off))] == ["missing", "waiting", "valid", "waiting"]
+    assert [status.state for status in line_status(*status_of(off))] == ["missing", "waiting", "valid", "waiting"]
     assert walk(off)[0].ran == ["read", "add", "tell"]
     assert (out / "telling.txt").read_text() == "nothing of 0 parts 21"
     changed = request_of(numbers, out, count={"enabled": False}, add={"offset": 1})

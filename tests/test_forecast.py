@@ -34,7 +34,7 @@ from splatpipe.stages.forecast import (
 )
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import Work
+from splatpipe.stages.work import CaptureWork
 
 SIZE = CaptureSize(photos=80, megapixels=12.0, positions=True)
 
@@ -133,7 +133,7 @@ LIMITED = {"max_gaussians": 4_000_000, "max_memory_bytes": 1_500_000_000}
 
 
 def test_blocks_are_forecast_by_what_each_begins_with_and_sees_around_itself() -> None:
-    work = Work.of(LARGE, configured("standard", **LIMITED), REFERENCE, 1)
+    work = CaptureWork.of(LARGE, configured("standard", **LIMITED), REFERENCE, 1)
     assert work.blocks is not None
     most, limit = work.blocks.division.need.trained, LIMITED["max_memory_bytes"]
     told = {
@@ -179,7 +179,7 @@ def test_a_run_goes_by_what_blocks_decided_and_decides_once(monkeypatch: pytest.
     assert (
         kept.needs(1.0)["train"].memory_bytes
         <= 1_500_000_000
-        < Work.of_whole(LARGE, free, REFERENCE, 2).needs(1.0)["train"].memory_bytes
+        < CaptureWork.of_whole(LARGE, free, REFERENCE, 2).needs(1.0)["train"].memory_bytes
     )
 
 

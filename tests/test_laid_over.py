@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.rasterizer import set_threads
-from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes, laid_over_nodes_reference
+from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes, laid_over_nodes_reference
 from splatpipe.pipeline.splat.panorama import STEP_PX, nodes_along
 
 PICTURE_ATOL = 1e-6  # of colours up to 2 in float32
@@ -41,11 +41,11 @@ class RandomPicture:
         self.alpha, self.nodes, elsewhere = rand(height, width), rand(*grid), rand(*grid)
         mask = rand(height, width) > 0.4
         mask[:, width // 2 + 20 :] = False  # whole vectors and tiles without
-        self.behind = Behind(BACKGROUND)
+        self.behind = SkyLayer(BACKGROUND)
         if kind == "masked":
-            self.behind = Behind(BACKGROUND, mask=mask)
+            self.behind = SkyLayer(BACKGROUND, mask=mask)
         if kind == "known":
-            self.behind = Behind(BACKGROUND, elsewhere, mask | (rand(height, width) > 0.7), mask)
+            self.behind = SkyLayer(BACKGROUND, elsewhere, mask | (rand(height, width) > 0.7), mask)
 
     def found(self, reference: bool = False) -> list[Tensor]:
         """The picture, and the gradients of a weighted sum of it by colour, alpha and nodes."""
@@ -101,7 +101,7 @@ def test_windows_show_what_the_whole_shows_and_their_gradients_add_up() -> None:
             cut = (rows, columns)
             part.colour, part.alpha, part.weight = given.colour[cut], given.alpha[cut], given.weight[cut]
             part.nodes = given.nodes[there]
-            part.behind = Behind(BACKGROUND, full.elsewhere[there], full.around[cut], full.mask[cut])
+            part.behind = SkyLayer(BACKGROUND, full.elsewhere[there], full.around[cut], full.mask[cut])
             found = part.found()
             picture[cut], by_alpha[cut] = found[0], found[2]
             by_nodes[there] += found[3]

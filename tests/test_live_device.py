@@ -11,8 +11,8 @@ from splatpipe.pipeline.app.view import checkpoint_render
 from splatpipe.pipeline.app.view.checkpoint_render import (
     LEFT_SHARE,
     RENDER_BYTES,
-    Shown,
-    Source,
+    LoadedModel,
+    ModelSource,
     device_of,
     newest,
     pictures,
@@ -54,8 +54,8 @@ def card(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return places
 
 
-def shown() -> Shown:
-    return Shown(tiny_scene.true_model(), None, RenderOptions(3, depth=False), None, 0)
+def shown() -> LoadedModel:
+    return LoadedModel(tiny_scene.true_model(), None, RenderOptions(3, depth=False), None, 0)
 
 
 def test_pictures_are_rendered_on_the_runs_device_as_far_as_its_memory_is_free(
@@ -101,7 +101,7 @@ def test_the_device_is_that_of_the_training_then_that_of_the_run() -> None:
 def test_the_page_renders_as_the_run_at_work_was_told(
     view: View, card: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = Source(tmp_path, "checkpoint", "stamp", None)
+    source = ModelSource(tmp_path, "checkpoint", "stamp", None)
     monkeypatch.setattr(checkpoint_render, "newest", lambda opened: source)
     monkeypatch.setattr(checkpoint_render, "load", lambda source, opened: shown())
     monkeypatch.setattr(Live, "_look", lambda live: (live._log.read(), (Contents(), (view,)))[1])

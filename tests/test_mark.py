@@ -18,8 +18,8 @@ from playwright.sync_api import Page
 
 from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.demo.truth import true_poses
-from splatpipe.pipeline.app.view.job import open_job
 from splatpipe.pipeline.app.view.marking import Marking, WrongRequestError
+from splatpipe.pipeline.app.view.marking_job import open_job
 from splatpipe.pipeline.app.view.photo import without_metadata
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.run_folder import open_run_folder

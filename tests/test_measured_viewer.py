@@ -10,8 +10,8 @@ import pytest
 from splatpipe.pipeline.app import measurements
 from splatpipe.pipeline.app.measured_viewer import renew_viewer
 from splatpipe.pipeline.app.measurements import MEASURED, outdated, read_measurements, write_measurements
-from splatpipe.pipeline.app.report.holdings import open_holdings
 from splatpipe.pipeline.app.report.measures import measures
+from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Stage
 from splatpipe.pipeline.engine.store import Artifact, StageInputs, Store, open_store
@@ -169,7 +169,7 @@ def test_the_report_tells_figures_to_what_they_are_known_to(out: Path) -> None:
     amounts = {"cut_m3": 12_345.678, "cut_sigma_m3": 45.6, "fill_m3": 0.123456, "fill_sigma_m3": 0.0456}
     amounts |= {"net_m3": -3.0, "net_sigma_m3": 0.0}
     write_measurements(out, "volumes", (surface, "any"), [{**VOLUME, **amounts}])
-    told = measures(open_holdings(out))
+    told = measures(read_report_inputs(out))
     (volume,), (section,) = told["volumes"], told["sections"]
     assert volume["cut"] == "12,346 ± 46 m³"
     assert volume["fill"] == "0.123 ± 0.046 m³"
@@ -179,7 +179,7 @@ def test_the_report_tells_figures_to_what_they_are_known_to(out: Path) -> None:
     assert section["files"] == [("CSV", "sections/section-1.csv")]
     assert not told["outdated"]
     make(Store(out), DSM, {}, "newer ")
-    told = measures(open_holdings(out))
+    told = measures(read_report_inputs(out))
     assert (told["sections"], told["volumes"], told["outdated"]) == ([], [], True)
 
 

@@ -11,7 +11,7 @@ from splatpipe.pipeline.engine.digests import HashTable
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import EventReporter
 from splatpipe.pipeline.engine.line import Line
-from splatpipe.pipeline.engine.source import MAX_NAMED_BYTES, Source, open_source, with_absolute_files
+from splatpipe.pipeline.engine.source import MAX_NAMED_BYTES, RunSource, open_source, with_absolute_files
 from splatpipe.pipeline.engine.store import Part
 from splatpipe.stages.line import GEOREF, INGEST, LINE
 from splatpipe.stages.options import LineConfig
@@ -27,11 +27,11 @@ def folder(tmp_path: Path) -> Path:
     return photos
 
 
-def opened(folder: Path, **options: dict[str, str]) -> Source:
+def opened(folder: Path, **options: dict[str, str]) -> RunSource:
     return open_source(folder, folder.parent.parent / "out", LINE, resolve(LineConfig, [options]))
 
 
-def digests(source: Source, folder: Path) -> dict[str, str]:
+def digests(source: RunSource, folder: Path) -> dict[str, str]:
     table = HashTable(folder.parent.parent / "table.json", remember=False)
     return source.digests(table, 1, EventReporter("source", lambda _: None))
 

@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 from markupsafe import Markup
 
-from splatpipe.pipeline.app.places import Places
+from splatpipe.pipeline.app.path_labels import PathLabels
 
 OUT = Path("/srv/customers/Brown & Sons/out")
 PHOTOS = Path("/home/jane doe/DCIM/100MEDIA")
 GCP = "/mnt/nas share/jane/survey (2)/gcp list.csv"
-PLACES = Places.of(OUT, PHOTOS, {"georef": {"control": GCP, "crs": "EPSG:32633+5773", "grids": ["~/grids/a b.tif"]}})
+PLACES = PathLabels.of(
+    OUT, PHOTOS, {"georef": {"control": GCP, "crs": "EPSG:32633+5773", "grids": ["~/grids/a b.tif"]}}
+)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +63,7 @@ def test_markup_of_our_own_is_left_alone() -> None:
 
 
 def test_a_root_as_out_names_nothing_else() -> None:
-    assert Places.of(Path("/"), Path("/photos")).plain("a/b /photos/x.jpg") != "aOUTb"
+    assert PathLabels.of(Path("/"), Path("/photos")).plain("a/b /photos/x.jpg") != "aOUTb"
 
 
 @pytest.mark.parametrize("hostile", ["/" * 20_000, "/a" * 20_000, "../" * 20_000, "~/" * 20_000, "/ " * 20_000])

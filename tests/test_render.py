@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 from playwright.sync_api import Browser
 
-from splatpipe.pipeline.app.renders import RenderTask, Wanted, render_run
+from splatpipe.pipeline.app.renders import RenderRequest, RenderTask, render_run
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Inputs
@@ -161,25 +161,25 @@ def test_an_orbit_is_made_below_out_and_a_lost_export_is_no_hindrance(demo_run: 
 
 
 WRONG = [
-    (Wanted("nowhere.json"), 2, "There is no file"),
-    (Wanted("{tmp}"), 2, "There is no file"),
-    (Wanted("{tmp}/broken.json"), 1, r"broken\.json"),
-    (Wanted(what="beauty"), 2, "beauty"),
-    (Wanted(size="641x360"), 2, "--size"),
-    (Wanted(size="1x1"), 2, "--size"),
-    (Wanted(size="640"), 2, "--size"),
-    (Wanted(size="9999x10"), 2, "--size"),
-    (Wanted(to=Path("{tmp}/film.avi")), 2, "is no film"),
-    (Wanted(to=Path("{tmp}/folder.webm")), 2, "is no film"),
-    (Wanted(stills=True, to=Path("{tmp}/broken.json")), 2, "is a file"),
-    (Wanted(stills=True, to=Path("{tmp}/stills.webm")), 2, "is a film's name"),
-    (Wanted(to=Path("/proc/films/film.webm")), 4, "Cannot make"),
+    (RenderRequest("nowhere.json"), 2, "There is no file"),
+    (RenderRequest("{tmp}"), 2, "There is no file"),
+    (RenderRequest("{tmp}/broken.json"), 1, r"broken\.json"),
+    (RenderRequest(what="beauty"), 2, "beauty"),
+    (RenderRequest(size="641x360"), 2, "--size"),
+    (RenderRequest(size="1x1"), 2, "--size"),
+    (RenderRequest(size="640"), 2, "--size"),
+    (RenderRequest(size="9999x10"), 2, "--size"),
+    (RenderRequest(to=Path("{tmp}/film.avi")), 2, "is no film"),
+    (RenderRequest(to=Path("{tmp}/folder.webm")), 2, "is no film"),
+    (RenderRequest(stills=True, to=Path("{tmp}/broken.json")), 2, "is a file"),
+    (RenderRequest(stills=True, to=Path("{tmp}/stills.webm")), 2, "is a film's name"),
+    (RenderRequest(to=Path("/proc/films/film.webm")), 4, "Cannot make"),
 ]
 
 
 @pytest.mark.parametrize(("wanted", "code", "message"), WRONG, ids=range(len(WRONG)))
 def test_wrong_wishes_are_told_before_anything_is_rendered(
-    demo_run: Path, tmp_path: Path, wanted: Wanted, code: int, message: str
+    demo_run: Path, tmp_path: Path, wanted: RenderRequest, code: int, message: str
 ) -> None:
     (tmp_path / "broken.json").write_text("[{}]")
     (tmp_path / "folder.webm").mkdir()
@@ -192,10 +192,10 @@ def test_wrong_wishes_are_told_before_anything_is_rendered(
 
 def test_an_out_without_a_splat_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no run"):
-        render_run(tmp_path, Wanted(), 1)
+        render_run(tmp_path, RenderRequest(), 1)
     (tmp_path / "stages").mkdir()
     with pytest.raises(UsageError, match="no trained splat"):
-        render_run(tmp_path, Wanted(), 1)
+        render_run(tmp_path, RenderRequest(), 1)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_keyframes_of_the_world_are_found_in_the_models_frame(tmp_path: Path) ->
     camera = tiny_scene.cameras()[0]
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")
     scene = open_scene(tiny_parts(tmp_path, dataset), 1, cpu())
-    names, (found,) = RenderTask(scene, world, Wanted(stills=True), read_keyframes(path), (320, 180)).stills()
+    names, (found,) = RenderTask(scene, world, RenderRequest(stills=True), read_keyframes(path), (320, 180)).stills()
     assert len(names) == 1 and found.width == 320
     np.testing.assert_allclose(world.apply(found.centre()[None])[0], [300, -80, 30], atol=1e-9)
     target, above = world.inverse().apply(np.array([[312.0, -86.0, 21.0], [312.0, -86.0, 22.0]]))

@@ -23,10 +23,10 @@ from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.console import show_bad_cameras
 from splatpipe.pipeline.app.report import make_report, write_report
 from splatpipe.pipeline.app.report.capturing import unit_of
-from splatpipe.pipeline.app.report.holdings import open_holdings
 from splatpipe.pipeline.app.report.page import report_page
 from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
 from splatpipe.pipeline.app.report.placing import placing_chapter
+from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
 
@@ -147,8 +147,8 @@ def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_places(
 ) -> None:
     """The drawn mark and circle are as far apart as the residual says, in the cut-out's own pixels."""
     watched = open_page((finished / "report.html").as_uri())
-    holdings = open_holdings(finished)
-    points = holdings.read("georef.control")["points"]
+    inputs = read_report_inputs(finished)
+    points = inputs.read("georef.control")["points"]
     assert watched.page.locator(".chip").count() == sum(len(point["observations"]) for point in points)
     assert watched.page.locator(".chip img").count() == watched.page.locator(".chip").count()
     point = next(point for point in points if point["name"] == "P05")
@@ -165,9 +165,9 @@ def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_places(
 
 
 def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
-    holdings = open_holdings(finished)
-    points = holdings.read("georef.control")["points"]
-    chips = cut_chips(points, holdings.part("ingest.photos"), holdings.photos_dir)
+    inputs = read_report_inputs(finished)
+    points = inputs.read("georef.control")["points"]
+    chips = cut_chips(points, inputs.part("ingest.photos"), inputs.photos_dir)
     seen = points[0]["observations"][0]
     chip = chips[0, 0]
     code = str(chip.picture).split(",")[1]
@@ -217,7 +217,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
 
 def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_of_run: Path) -> None:
     (copy_of_run / "report.html").unlink()
-    page = report_page(open_holdings(copy_of_run), drawn=False)
+    page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert "splatpipe report writes the page again" in page and "<svg role=" not in page and "data:image" not in page
     make_report(copy_of_run, copy_of_run / "splatpipe.log", until_s=time.monotonic() + 600.0)
     assert "<svg role=" in (copy_of_run / "report.html").read_text()
@@ -275,7 +275,7 @@ def test_a_run_without_any_position_says_that_nothing_is_in_metres(
 
 def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Callable[..., object]) -> None:
     """In events, in the control points, and in what was left out."""
-    holdings = open_holdings(copy_of_run)
+    inputs = read_report_inputs(copy_of_run)
     with (copy_of_run / "events.jsonl").open("a") as events:
         for kind, data in (
             (
@@ -296,11 +296,11 @@ def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Call
         point["name"] = point["why"] = told["file"] = f"$x_{HOSTILE}"
         point["observations"][0]["photo"] = f"../{HOSTILE}"
 
-    rewrite(holdings.part("georef.control"), hostile_control)
+    rewrite(inputs.part("georef.control"), hostile_control)
     left_out = [{"name": HOSTILE, "reason": HOSTILE}]
-    rewrite(holdings.part("ingest.left_out"), lambda told: told.update(left_out=left_out))
+    rewrite(inputs.part("ingest.left_out"), lambda told: told.update(left_out=left_out))
     stolen = {"name": HOSTILE, "file": "../../../etc/passwd"}
-    rewrite(holdings.part("evaluate.metrics"), lambda told: told["per_view"][0].update(stolen))
+    rewrite(inputs.part("evaluate.metrics"), lambda told: told["per_view"][0].update(stolen))
     write_report(copy_of_run)
     watched = open_page((copy_of_run / "report.html").as_uri())
     assert (watched.requests, watched.errors) == ([], [])
@@ -313,9 +313,9 @@ def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Call
     "part", ["georef.control", "evaluate.metrics", "sparse.summary", "train.history", "ingest.positions"]
 )
 def test_a_damaged_part_costs_its_chapter_and_not_the_report(copy_of_run: Path, part: str) -> None:
-    path = open_holdings(copy_of_run).part(part)
+    path = read_report_inputs(copy_of_run).part(part)
     path.write_text("[" + " " * (path.stat().st_size - 2) + "]")  # as long as it was, and something else
-    page = report_page(open_holdings(copy_of_run), drawn=False)
+    page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert page.count("This part could not be read") == 1
     assert "How it was made" in page
 
@@ -323,8 +323,8 @@ def test_a_damaged_part_costs_its_chapter_and_not_the_report(copy_of_run: Path, 
 def test_a_finished_run_whose_artifact_is_damaged_is_not_told_as_one_that_was_asked_to_end_there(
     copy_of_run: Path,
 ) -> None:
-    (open_holdings(copy_of_run).part("sparse.summary").parent / "manifest.json").write_text("{")
-    verdict = judge(open_holdings(copy_of_run))
+    (read_report_inputs(copy_of_run).part("sparse.summary").parent / "manifest.json").write_text("{")
+    verdict = judge(read_report_inputs(copy_of_run))
     assert verdict.level == "bad"
     assert verdict.headline == "Finished, but its results are damaged"
     assert "sparse" in verdict.text
@@ -377,10 +377,10 @@ def show_nothing_inside(told: dict[str, Any]) -> None:
 def test_the_verdict_follows_the_figures(
     copy_of_run: Path, part: str, change: Callable[[dict[str, object]], None], level: str, said: str
 ) -> None:
-    before = [finding.text for finding in judge(open_holdings(copy_of_run)).findings]
+    before = [finding.text for finding in judge(read_report_inputs(copy_of_run)).findings]
     assert not any(said in text for text in before)
-    rewrite(open_holdings(copy_of_run).part(part), change)
-    found = next(finding for finding in judge(open_holdings(copy_of_run)).findings if said in finding.text)
+    rewrite(read_report_inputs(copy_of_run).part(part), change)
+    found = next(finding for finding in judge(read_report_inputs(copy_of_run)).findings if said in finding.text)
     assert found.level == level
 
 
@@ -389,19 +389,19 @@ def test_scale_bars_are_told_one_by_one(copy_of_run: Path) -> None:
     bars = [("P1", "P2", 12.5, 0.0012, True), ("P2", "P3", 8.0, -0.9, False), ("P3", "P9", 4.0, None, False)]
     rows = [dict(zip(("a", "b", "metres", "error_m", "used"), bar, strict=True)) for bar in bars]
     scale = {"metric": True, "placed": False, "sentence": "by one bar.", "sigma": 0.001, "bars": rows}
-    holdings = open_holdings(copy_of_run)
-    rewrite(holdings.part("georef.frame"), lambda told: told.update(kind="arbitrary", metres=True, origin=None))
-    rewrite(holdings.part("georef.accuracy"), lambda told: told.update(scale=scale))
-    holdings = open_holdings(copy_of_run)
-    chapter = placing_chapter(holdings, None)
+    inputs = read_report_inputs(copy_of_run)
+    rewrite(inputs.part("georef.frame"), lambda told: told.update(kind="arbitrary", metres=True, origin=None))
+    rewrite(inputs.part("georef.accuracy"), lambda told: told.update(scale=scale))
+    inputs = read_report_inputs(copy_of_run)
+    chapter = placing_chapter(inputs, None)
     assert chapter is not None
     facts = dict(chapter["facts"])
     assert "place and heading are arbitrary" in facts["Frame"] and "a pixel" in facts["Ground sample distance"]
     assert facts["P1 to P2"].endswith("m, +1.2 mm in the model")
     assert facts["P2 to P3"].endswith("-900.0 mm in the model, left out")
     assert facts["P3 to P9"].endswith("a target of it was not found")
-    assert unit_of(holdings) == "metres"
-    finding = next(finding for finding in judge(holdings).findings if "metric but not placed" in finding.text)
+    assert unit_of(inputs) == "metres"
+    finding = next(finding for finding in judge(inputs).findings if "metric but not placed" in finding.text)
     assert finding.level == "doubt"  # one bar, which no other proves
 
 
@@ -410,8 +410,8 @@ def test_bad_cameras_are_the_first_words_of_page_and_console(
 ) -> None:
     reason = {"level": "bad", "kind": "bent", "text": "40 of 90 pairs contradict it.", "hint": "Add photos."}
     verdict = {"level": "bad", "reasons": [reason]}
-    rewrite(open_holdings(copy_of_run).part("sparse.summary"), lambda told: told.update(verdict=verdict))
-    told = judge(open_holdings(copy_of_run))
+    rewrite(read_report_inputs(copy_of_run).part("sparse.summary"), lambda told: told.update(verdict=verdict))
+    told = judge(read_report_inputs(copy_of_run))
     assert (told.level, told.headline) == ("bad", "The cameras are bad")
     assert (told.findings[0].level, told.findings[0].text) == ("bad", "40 of 90 pairs contradict it. Add photos.")
     show_bad_cameras(verdict)
@@ -423,7 +423,7 @@ def test_bad_cameras_are_the_first_words_of_page_and_console(
 
 
 def test_the_page_tells_which_mappers_were_tried(copy_of_run: Path) -> None:
-    page = report_page(open_holdings(copy_of_run), drawn=False)
+    page = report_page(read_report_inputs(copy_of_run), drawn=False)
     table = page[page.index("Ways of mapping that were tried") : page.index("Calibration</h3>")]
     assert "incremental" in table and "taken" in table and "nan" not in table
 
@@ -432,10 +432,10 @@ def test_a_broken_off_run_is_told_from_a_running_one(copy_of_run: Path) -> None:
     lines = (copy_of_run / "events.jsonl").read_text().splitlines()
     started = next(i for i, line in enumerate(lines) if '"stage_started"' in line and '"train"' in line)
     (copy_of_run / "events.jsonl").write_text("\n".join(lines[: started + 4]))
-    assert "Broken off in train" in report_page(open_holdings(copy_of_run), drawn=False)
+    assert "Broken off in train" in report_page(read_report_inputs(copy_of_run), drawn=False)
     with (copy_of_run / "stages" / ".lock").open("rb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert "Still running in train" in report_page(open_holdings(copy_of_run), drawn=False)
+        assert "Still running in train" in report_page(read_report_inputs(copy_of_run), drawn=False)
 
 
 def test_a_report_that_cannot_be_written_does_not_spoil_a_good_run(copy_of_run: Path) -> None:
@@ -476,7 +476,7 @@ def test_no_folder_outside_out_is_told(copy_of_run: Path) -> None:
     warning = {"kind": "warning", "stage": "georef", "data": {"message": message, "hint": message}, "time_s": 1e9}
     with (copy_of_run / "events.jsonl").open("a") as log:
         log.write(json.dumps(warning) + "\n")
-    page = report_page(open_holdings(copy_of_run), drawn=False)
+    page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert "PHOTOS/a.jpg and OUT/x and points 2.csv and y and z" in page
     for folder in ("jane", "customers", "Brown", "/srv", str(copy_of_run.parent), f"{Path.home()}/"):
         assert folder not in page

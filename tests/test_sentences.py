@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from splatpipe.pipeline.app.console import show_verdict
-from splatpipe.pipeline.app.report.verdict import Finding, Verdict
+from splatpipe.pipeline.app.report.verdict import Verdict, VerdictLine
 from splatpipe.pipeline.app.sentences import SENTENCES, sentence
 from splatpipe.stages.line import LINE
 
@@ -55,7 +55,7 @@ def test_every_stage_has_one_and_none_fails_on_what_it_does_not_know() -> None:
 
 
 def test_the_verdict_comes_first_with_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
-    doubt = Finding("doubt", "Floaters", "Something hangs in the air [bold]before[/] 5 photos")
+    doubt = VerdictLine("doubt", "Floaters", "Something hangs in the air [bold]before[/] 5 photos")
     show_verdict(Verdict("doubt", "Finished; 1 point to look at", "The run ended.", [doubt]))
     lines = capsys.readouterr().err.splitlines()
     assert lines[1:] == [

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.app.report.story import read_story
+from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.line import Standing, survey
+from splatpipe.pipeline.engine.line import StageStatus, line_status
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.needs import Need, used_and_forecast
 from splatpipe.pipeline.engine.run_folder import shard_events
 from splatpipe.pipeline.engine.runner import Outcome
-from splatpipe.pipeline.engine.session import Request, open_session, survey_line
+from splatpipe.pipeline.engine.session import Request, open_session, status_of
 from splatpipe.pipeline.engine.stage import Machine, Summary, shards_first
 
 LINES = Path(__file__).parent / "lines"
@@ -86,9 +86,9 @@ def alone(numbers: Path, out: Path, shard: str, *more: str, **options: object) -
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
-def standings(request: Request) -> dict[str, Standing]:
-    found = {standing.stage.name: standing for standing in survey(*survey_line(request))}
-    return found | {shard.stage.name: shard for standing in found.values() for shard in standing.shards}
+def statuses(request: Request) -> dict[str, StageStatus]:
+    found = {status.stage.name: status for status in line_status(*status_of(request))}
+    return found | {shard.stage.name: shard for status in found.values() for shard in status.shards}
 
 
 def digests(out: Path) -> dict[str, object]:
@@ -125,7 +125,7 @@ def test_shards_of_many_processes_each_killed_once_are_the_same_bits_as_one_runs
             _, said = process.communicate()
             assert process.returncode == (0 if again else -signal.SIGKILL), said
     assert {path: path.read_bytes() for path in many.iterdir() if path.is_file()} == before  # nothing but their own
-    found = standings(request_of(numbers, many, **slow))
+    found = statuses(request_of(numbers, many, **slow))
     assert [found[name].state for name in (*SHARDS, "sum")] == ["valid"] * 3 + ["missing"]
     assert all(found[name].artifact.summary["began_at"] == 1 for name in SHARDS)  # type: ignore[union-attr]
     outcome, _ = walk(request_of(numbers, many, **slow))
@@ -138,11 +138,11 @@ def test_a_killed_shard_costs_itself(numbers: Path, out: Path, monkeypatch: pyte
     monkeypatch.setenv(sharded.KILL_VARIABLE, "2")
     with pytest.raises(StageError, match=r"sum\.2 died of SIGKILL"):
         walk(request_of(numbers, out))
-    story = read_story(out / "events.jsonl", running=False)
-    assert story.culprit is not None and story.culprit.name == "sum.2"
+    history = read_history(out / "events.jsonl", running=False)
+    assert history.culprit is not None and history.culprit.name == "sum.2"
     log = RunLog(out, "events.jsonl")
     log.read()
-    assert list(story.stages) == list(log.stages) == ["read", "divide", *SHARDS, "sum", "show"]
+    assert list(history.stages) == list(log.stages) == ["read", "divide", *SHARDS, "sum", "show"]
     assert [log.stages[name].state for name in (*SHARDS, "sum")] == ["done", "failed", "done", "waiting"]
     monkeypatch.delenv(sharded.KILL_VARIABLE)
     outcome, _ = walk(request_of(numbers, out))
@@ -177,7 +177,7 @@ def test_two_writers_of_one_artifact_are_refused_and_of_two_are_not(
         with pytest.raises(UsageError, match=f"process {process.pid}\\) is working in"):
             walk(request)
         assert is_locked(out, "sum.2") and not is_locked(out, "sum.1") and not is_locked(out)
-        assert standings(request)["sum.2"].reason == "is being made"
+        assert statuses(request)["sum.2"].reason == "is being made"
         assert make_shard(request, 1).ran == ["sum.1"]
         with alone(numbers, out, "sum.2", "--wait", **slow) as waiting:
             _, said = waiting.communicate()
@@ -234,15 +234,15 @@ def test_clean_keeps_the_shards_that_are_asked_for(numbers: Path, out: Path) -> 
     request = request_of(numbers, out)
     walk(request, until="divide")
     make_shard(request, 2)
-    line, store = survey_line(request)
-    removed, _ = store.remove_stale(wanted for standing in survey(line, store) for wanted in standing.wanted)
+    line, store = status_of(request)
+    removed, _ = store.remove_stale(wanted for status in line_status(line, store) for wanted in status.wanted)
     assert removed == 1 + 6 + 1 + 1  # the other division, its shards, what they were joined to, what that showed
     assert walk(request)[0].ran == ["sum.1", "sum.3", "sum", "show"]
 
 
 def test_an_option_of_the_stage_reaches_its_shards_and_one_after_it_does_not(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
-    found = standings(request_of(numbers, out, sum={"offset": 1}))
+    found = statuses(request_of(numbers, out, sum={"offset": 1}))
     assert [found[name].state for name in (*SHARDS, "sum")] == ["stale"] * 4
     assert found["sum.2"].reason == "sum.offset changed from 0 to 1"
     outcome, _ = walk(request_of(numbers, out, sum={"offset": 1}))
@@ -287,7 +287,7 @@ def test_an_error_of_the_machines_or_the_inputs_stops_the_run_at_once(
     monkeypatch.setenv(sharded.FAIL_VARIABLE, "1")
     with pytest.raises(StageError, match="out of order"):
         walk(request_of(numbers, out))
-    assert standings(request_of(numbers, out))["sum.3"].state == "valid"
+    assert statuses(request_of(numbers, out))["sum.3"].state == "valid"
     monkeypatch.delenv(sharded.FAIL_VARIABLE)
     shutil.rmtree(out)
 

@@ -28,7 +28,7 @@ from splatpipe.pipeline.survey.frames import Frame, Similarity
 from splatpipe.pipeline.web.measured_page import with_measurements
 from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer import ViewerScene
-from splatpipe.pipeline.web.viewer_scene import Look, viewer_scene, write_viewer
+from splatpipe.pipeline.web.viewer_scene import ViewerRendering, viewer_scene, write_viewer
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -101,7 +101,7 @@ def root(model: Gaussians) -> LevelNode:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> ViewerScene:
     dataset = tiny_scene.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset")
     frame = Frame("arbitrary", Similarity(1.0, UP_FROM_DOWN, np.zeros(3)))
-    look = Look(antialias=False, background=(0.0, 0.0, 0.0), near=0.01)
+    look = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01)
     return viewer_scene(dataset, frame, look, (), COUNT, "Tiny </title> site")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import rasterio
 
-from splatpipe.pipeline.app.surfaces import Wanted, check_possible, measured_lines
+from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measured_lines
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_length
 from splatpipe.pipeline.surface import tsdf
@@ -102,7 +102,7 @@ def test_other_products_are_refused(products: str) -> None:
 @pytest.mark.parametrize("text", ["", "1,2,3", "1,2,3,4,5", "1,2,3,nan", "1,2,3,inf", "a,b,c,d", "1 2 3 4", "1," * 999])
 def test_other_sections_are_refused(text: str) -> None:
     with pytest.raises(UsageError):
-        Wanted.of([text], None, "rim")
+        MeasurementRequest.of([text], None, "rim")
     if text:
         with pytest.raises(UsageError):
             parse_lines(text)
@@ -147,12 +147,12 @@ def test_what_was_measured_is_told_in_lines() -> None:
 
 def test_a_section_without_length_is_refused() -> None:
     with pytest.raises(UsageError, match="no length"):
-        Wanted.of(["1,2,1,2.0"], None, "rim")
+        MeasurementRequest.of(["1,2,1,2.0"], None, "rim")
 
 
 def test_polygons_that_are_nowhere_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no file"):
-        Wanted.of([], tmp_path / "heap.geojson", "rim")
+        MeasurementRequest.of([], tmp_path / "heap.geojson", "rim")
 
 
 def test_lines_are_taken_whole_or_not_at_all() -> None:
@@ -164,8 +164,8 @@ def test_lines_are_taken_whole_or_not_at_all() -> None:
 @pytest.mark.parametrize("base", ["", "top", "1e999", "nan"])
 def test_other_bases_are_refused(base: str) -> None:
     with pytest.raises(UsageError):
-        Wanted.of([], None, base)
-    assert Wanted.of([], None, "512.5").base == 512.5
+        MeasurementRequest.of([], None, base)
+    assert MeasurementRequest.of([], None, "512.5").base == 512.5
 
 
 @pytest.mark.parametrize(("text", "metres"), [("2cm", 0.02), ("25mm", 0.025), ("0.1m", 0.1), (" 5 cm ", 0.05)])

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from splatpipe.pipeline.app.command_summary import for_the_user
 from splatpipe.pipeline.app.console import RunConsole, say, show_error
-from splatpipe.pipeline.app.ending import for_the_user
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, MachineError, SplatpipeError

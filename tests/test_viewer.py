@@ -29,7 +29,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 from splatpipe.pipeline.survey.frames import Frame, Origin, Similarity, load_frame
 from splatpipe.pipeline.web.measured_page import with_measurements
-from splatpipe.pipeline.web.viewer_scene import Look, upright, viewer_scene, write_viewer
+from splatpipe.pipeline.web.viewer_scene import ViewerRendering, upright, viewer_scene, write_viewer
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
@@ -71,7 +71,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def write_tiny(folder: Path, title: str = "Tiny", largest_bytes: float = 1e9, model: Gaussians | None = None) -> None:
     dataset = tiny_scene.write_dataset(folder / "dataset")
     frame = Frame("arbitrary", Similarity(1.0, UP_FROM_DOWN, np.zeros(3)))
-    look = Look(antialias=False, background=(0.0, 0.0, 0.0), near=0.01, sky=tiny_sky())
+    look = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01, sky=tiny_sky())
     model = tiny_scene.true_model() if model is None else model
     scene = viewer_scene(dataset, frame, look, ["flight 1/photo_0.png"], len(model), title)
     turned = model.transformed(1.0, torch.from_numpy(UP_FROM_DOWN), torch.zeros(3, dtype=torch.float64))

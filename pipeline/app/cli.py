@@ -48,19 +48,19 @@ from splatpipe.pipeline.app.cli_runs import (
     check_stage,
     existing,
     overrides,
+    print_forecast,
     request_of,
     stages_to_rerun,
-    tell_beforehand,
-    told_standing,
+    status_as_json,
     with_boundary,
     with_budgets,
 )
-from splatpipe.pipeline.app.ending import Ending, for_the_user, print_json
+from splatpipe.pipeline.app.command_summary import CommandSummary, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
     EXIT_USAGE,
-    Stopped,
+    StopSignal,
     UsageError,
     exit_code,
 )
@@ -120,7 +120,7 @@ def run(
     from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
     from splatpipe.pipeline.engine.config import load_preset
 
-    with Ending(out, as_json) as done:
+    with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         assignments = with_budgets(assignments, time_budget, max_memory)
         assignments = with_boundary(assignments, boundary)
@@ -129,7 +129,7 @@ def run(
         request = request_of(photos, out, resolved, device, threads)
         require_readable(request)
         require_memory(request)
-        tell_beforehand(request, until)
+        print_forecast(request, until)
         with RunSession(request, wait) as runner:
             done.outcome = runner.outcome
             runner.walk(until=until, rerun=again)
@@ -171,7 +171,7 @@ def stage(
     as_json: JsonOption = False,
 ) -> None:
     """Run one stage again on an existing OUT, and nothing else but what divides it; or make one of its shards."""
-    with Ending(out, as_json) as done:
+    with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         check_stage(name)
         if shard is not None and assignments:
@@ -198,7 +198,7 @@ def georef(
     as_json: JsonOption = False,
 ) -> None:
     """Place a finished run anew: other control points, another CRS. What does not change is reused."""
-    with Ending(out, as_json) as done:
+    with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
         tables = [*control, *overrides(None, assignments, None).tables]
@@ -244,13 +244,13 @@ def surface(
     as_json: JsonOption = False,
 ) -> None:
     """Make surface products of a finished run: orthophoto, surface model, façades, cloud, mesh; sections, volumes."""
-    from splatpipe.pipeline.app.surfaces import Wanted, check_possible, measure_surface, measured_lines
+    from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measure_surface, measured_lines
     from splatpipe.pipeline.engine.quantities import parse_length
     from splatpipe.stages.products import options_for
 
-    with Ending(out, as_json) as done:
+    with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
-        wanted = Wanted.of(section or [], volume, base)
+        wanted = MeasurementRequest.of(section or [], volume, base)
         products = "dsm" if products is None and wanted.anything else products
         asked = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
         tables = [asked, *overrides(None, assignments, None).tables]
@@ -261,7 +261,7 @@ def surface(
             runner.walk()
             if wanted.anything:
                 measured = measure_surface(out, wanted, threads or available_cores())
-                done.told, done.news = {"surface": measured}, measured_lines(out, measured)
+                done.details, done.news = {"surface": measured}, measured_lines(out, measured)
 
 
 app.command()(export)
@@ -283,11 +283,11 @@ def render(
     as_json: JsonOption = False,
 ) -> None:
     """Make a film or stills of a finished run, along its cameras, around it, or by a file of keyframes."""
-    with Ending(out, as_json) as done:
-        from splatpipe.pipeline.app.renders import Wanted, render_run
+    with CommandSummary(out, as_json) as done:
+        from splatpipe.pipeline.app.renders import RenderRequest, render_run
 
-        wanted = Wanted(path, what, stills, size, seconds, fps, target)
-        done.told = {"render": render_run(out, wanted, threads or available_cores(), device)}
+        wanted = RenderRequest(path, what, stills, size, seconds, fps, target)
+        done.details = {"render": render_run(out, wanted, threads or available_cores(), device)}
 
 
 @app.command()
@@ -317,15 +317,15 @@ def view(
 @app.command()
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Say what is there, what is stale and why."""
-    from splatpipe.pipeline.app.console import show_standings
-    from splatpipe.pipeline.engine.line import survey
-    from splatpipe.pipeline.engine.session import survey_line
+    from splatpipe.pipeline.app.console import show_status
+    from splatpipe.pipeline.engine.line import line_status
+    from splatpipe.pipeline.engine.session import status_of
 
-    with Ending(out, as_json) as done:
-        standings = list(survey(*survey_line(existing(out))))
-        done.told = {"stages": [told_standing(standing) for standing in standings]}
+    with CommandSummary(out, as_json) as done:
+        statuses = list(line_status(*status_of(existing(out))))
+        done.details = {"stages": [status_as_json(status) for status in statuses]}
     if not as_json:
-        show_standings(standings)
+        show_status(statuses)
 
 
 @app.command()
@@ -336,10 +336,10 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
     from splatpipe.pipeline.engine.run_folder import LOG_FILE, open_run_folder
     from splatpipe.stages.line import LINE
 
-    with Ending(out, as_json) as done:
+    with CommandSummary(out, as_json) as done:
         open_run_folder(out, LINE)
         path = make_report(out, out / LOG_FILE)
-        done.told = {"outputs": [str(path)]}
+        done.details = {"outputs": [str(path)]}
     say(str(path))
 
 
@@ -347,16 +347,16 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the present configuration no longer asks for."""
     from splatpipe.pipeline.app.console import say
-    from splatpipe.pipeline.engine.line import survey
+    from splatpipe.pipeline.engine.line import line_status
     from splatpipe.pipeline.engine.lock import locked
-    from splatpipe.pipeline.engine.session import survey_line
+    from splatpipe.pipeline.engine.session import status_of
 
-    with Ending(out, as_json) as done:
-        line, store = survey_line(existing(out))
+    with CommandSummary(out, as_json) as done:
+        line, store = status_of(existing(out))
         with locked(store.out, tell=say):
-            keep = [wanted for standing in survey(line, store) for wanted in standing.wanted]
+            keep = [wanted for status in line_status(line, store) for wanted in status.wanted]
             removed, freed = store.remove_stale(keep)
-        done.told = {"removed": removed, "freed_bytes": freed}
+        done.details = {"removed": removed, "freed_bytes": freed}
         say(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")
 
 
@@ -398,7 +398,7 @@ app.command(cls=OrderedCommand)(edit)
 
 
 def _stop(number: int, _frame: FrameType | None) -> NoReturn:
-    raise Stopped(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_TERMINATED)
+    raise StopSignal(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_TERMINATED)
 
 
 def main() -> NoReturn:
@@ -412,7 +412,7 @@ def main() -> NoReturn:
         if error.code == EXIT_USAGE and "--json" in sys.argv:
             print_json({"exit_code": EXIT_USAGE, "error": {"message": "Wrong call; see stderr.", "hint": "--help"}})
         raise
-    except Stopped as error:
+    except StopSignal as error:
         from splatpipe.pipeline.app.console import say
 
         say(f"{error} {error.hint}")

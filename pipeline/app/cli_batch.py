@@ -20,7 +20,7 @@ from splatpipe.pipeline.app.cli_options import (
     UntilOption,
 )
 from splatpipe.pipeline.app.cli_runs import check_stage, overrides, request_of
-from splatpipe.pipeline.app.ending import print_json
+from splatpipe.pipeline.app.command_summary import print_json
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, exit_code
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _uses_gpu(device: str, profile: Profile) -> bool:
 
 def _run(captures: Path, out: Path, settings: Settings, profile: Profile, command: str) -> BatchState:
     from splatpipe.pipeline.app.batch.capture_list import read_captures
-    from splatpipe.pipeline.app.batch.driver import Driver, Told, fresh_call, hold, summary, with_unlisted
+    from splatpipe.pipeline.app.batch.driver import Driver, Notifications, fresh_call, hold, summary, with_unlisted
     from splatpipe.pipeline.app.batch.planning import make_plan
     from splatpipe.pipeline.app.batch.publication import PAGE_FILE
     from splatpipe.pipeline.app.console import say
@@ -116,7 +116,7 @@ def _run(captures: Path, out: Path, settings: Settings, profile: Profile, comman
     with hold(out.resolve()) as lock:
         call = fresh_call(out)
         call.write_plan(with_unlisted(make_plan(listed, call, settings)))
-        state = Driver(call, profile, Told(say, command)).run(lock)
+        state = Driver(call, profile, Notifications(say, command)).run(lock)
     say(f"{summary(state.captures)}. {out / PAGE_FILE}")
     return state
 

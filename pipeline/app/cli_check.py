@@ -9,7 +9,7 @@ import typer
 
 from splatpipe.pipeline.app.cli_options import ConfigOption, JsonOption, PhotosArgument, SetOption, ThreadsOption
 from splatpipe.pipeline.app.cli_runs import overrides
-from splatpipe.pipeline.app.ending import Ending
+from splatpipe.pipeline.app.command_summary import CommandSummary
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, MachineError
 
 if TYPE_CHECKING:
@@ -34,10 +34,10 @@ def check(
 ) -> None:
     """Say what is wrong with a capture while you are still there; what a run would take."""
     page = page.expanduser()
-    with Ending(page, as_json) as done:
+    with CommandSummary(page, as_json) as done:
         from splatpipe.pipeline.app.console import RunConsole, say
         from splatpipe.pipeline.app.preflight.examination import examine_capture
-        from splatpipe.pipeline.app.preflight.findings import as_json as told_as_json
+        from splatpipe.pipeline.app.preflight.findings import as_json as preflight_as_json
         from splatpipe.pipeline.app.preflight.page import write_page
         from splatpipe.pipeline.engine.config import load_preset
         from splatpipe.pipeline.engine.events import EventReporter
@@ -51,7 +51,7 @@ def check(
             preflight = examine_capture(photos, configs, threads or available_cores(), report)
         finally:
             console.close()
-        done.told = told = told_as_json(preflight)
+        done.details = facts = preflight_as_json(preflight)
         _show(preflight)  # first: what was found is told also where the page cannot be written
         try:
             write_page(preflight, page)
@@ -60,7 +60,7 @@ def check(
                 f"Cannot write the page {page}: {error.strerror}.", hint="Name another place for it: -o FILE."
             ) from error
         failed = preflight.worst == "error"
-        done.told = {**told, "exit_code": EXIT_INPUT if failed else 0, "outputs": [str(page)]}
+        done.details = {**facts, "exit_code": EXIT_INPUT if failed else 0, "outputs": [str(page)]}
         say(str(page))
     if failed:
         raise typer.Exit(EXIT_INPUT)

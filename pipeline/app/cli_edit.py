@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 from splatpipe.pipeline.app.cli_options import JsonOption, ThreadsOption, expanded
-from splatpipe.pipeline.app.ending import Ending
+from splatpipe.pipeline.app.command_summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
 ORDER = "splatpipe.order"
@@ -113,7 +113,7 @@ def edit(
 
     Coordinates are of the splat's CRS, or its own where it lies nowhere on the earth.
     """
-    with Ending(out, as_json) as done:
+    with CommandSummary(out, as_json) as done:
         options = {
             "crop_box": crop_box,
             "crop_polygon": crop_polygon,
@@ -131,8 +131,8 @@ def edit(
             "reduce": reduce,
         }
         given = steps_in_order(context.meta[ORDER], options)
-        done.told = told = _edit(source, (out, format_name), given, (local, pictures, threads))
-        _show(told)
+        done.details = facts = _edit(source, (out, format_name), given, (local, pictures, threads))
+        _show(facts)
 
 
 def steps_in_order(order: Sequence[str], options: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -160,21 +160,21 @@ def _edit(
     source: Path, target: tuple[Path, str | None], given: Sequence[tuple[str, Any]], how: tuple[bool, bool, int]
 ) -> dict[str, Any]:
     from splatpipe.pipeline.app.console import RunConsole
-    from splatpipe.pipeline.edit.size import Output
+    from splatpipe.pipeline.edit.editing import EditTask, edit_splat
+    from splatpipe.pipeline.edit.size import OutputFile
     from splatpipe.pipeline.edit.sources import open_source
     from splatpipe.pipeline.edit.steps import parse_steps
-    from splatpipe.pipeline.edit.work import Task, edit_splat
     from splatpipe.pipeline.engine.events import EventReporter
     from splatpipe.pipeline.engine.machine import available_cores
     from splatpipe.pipeline.raster.threads import same_bits
     from splatpipe.pipeline.splat.formats.files import format_of_name
 
     local, pictures, threads = how
-    output = Output(target[0], format_of_name(*target))
+    output = OutputFile(target[0], format_of_name(*target))
     parse_steps(given, output, local)  # what makes no sense is told before anything is looked for
     found = open_source(source)
     steps = parse_steps(given, output, local, found.trained_on())
-    task = Task(found, output, steps, pictures)
+    task = EditTask(found, output, steps, pictures)
     console = RunConsole()
     try:
         with same_bits(threads or available_cores()):
@@ -183,12 +183,12 @@ def _edit(
         console.close()
 
 
-def _show(told: Mapping[str, Any]) -> None:
+def _show(facts: Mapping[str, Any]) -> None:
     from splatpipe.pipeline.app.console import say
 
-    for step in told["steps"]:
+    for step in facts["steps"]:
         before, after = step["gaussians"]
         change = f"{before:,} Gaussians" if before == after else f"{before:,} → {after:,} Gaussians"
         say(f"{step['step']}: {change}")
-    for path in told["outputs"]:
+    for path in facts["outputs"]:
         say(path)

@@ -18,7 +18,7 @@ from splatpipe.pipeline.app.cli_options import (
     expanded,
 )
 from splatpipe.pipeline.app.cli_runs import RunSession, existing, overrides
-from splatpipe.pipeline.app.ending import Ending
+from splatpipe.pipeline.app.command_summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
 FormatsOption = Annotated[
@@ -48,7 +48,7 @@ def export(
     """Hand a finished run over in more formats, into OUT/export: docs/formats.md says which program reads which."""
     from splatpipe.pipeline.app.formats import check_possible, with_formats
 
-    with Ending(out, as_json) as done:
+    with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
         check_possible(out, formats)
@@ -64,7 +64,7 @@ def convert(
     as_json: JsonOption = False,
 ) -> None:
     """Write a splat in another format; what it says of its place on the earth goes along."""
-    with Ending(target, as_json) as done:
+    with CommandSummary(target, as_json) as done:
         from splatpipe.pipeline.app.console import say
         from splatpipe.pipeline.app.formats import convert_file
         from splatpipe.pipeline.splat.formats.files import format_of_name
@@ -72,6 +72,6 @@ def convert(
         kind = format_of_name(target, format_name)
         if target.exists() and target.samefile(source):
             raise UsageError(f"{target} is what is read.", hint="Name another file to write.")
-        told: dict[str, Any] = convert_file(source, target, kind)
-        done.told = {"convert": told}
-        say(f"{told['gaussians']:,} Gaussians, {told['bytes'] / 1e6:.1f} MB: {target}")
+        facts: dict[str, Any] = convert_file(source, target, kind)
+        done.details = {"convert": facts}
+        say(f"{facts['gaussians']:,} Gaussians, {facts['bytes'] / 1e6:.1f} MB: {target}")

@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.machine import available_cores
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.engine.line import Standing
+    from splatpipe.pipeline.engine.line import StageStatus
     from splatpipe.pipeline.engine.runner import Runner
     from splatpipe.pipeline.engine.session import Request
     from splatpipe.stages.options import LineConfig
@@ -102,16 +102,16 @@ def spent_s() -> float:
         return 0.0
 
 
-def tell_beforehand(request: Request, until: str | None) -> None:
+def print_forecast(request: Request, until: str | None) -> None:
     """Say what the whole line will take, before its first training."""
+    from splatpipe.pipeline.app.command_summary import PART_VARIABLE
     from splatpipe.pipeline.app.console import say
-    from splatpipe.pipeline.app.ending import PART_VARIABLE
-    from splatpipe.pipeline.app.preflight.start import told_beforehand
+    from splatpipe.pipeline.app.preflight.start import forecast_text
 
     trained = any((request.out / "stages").glob("train-*"))
     if trained or until is not None or PART_VARIABLE in os.environ:
         return
-    if told := told_beforehand(request):
+    if told := forecast_text(request):
         say(told)
 
 
@@ -142,19 +142,19 @@ def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | N
     return frozenset([*rerun, *(names[names.index(rerun_from) :] if rerun_from else [])])
 
 
-def told_standing(standing: Standing) -> dict[str, Any]:
+def status_as_json(status: StageStatus) -> dict[str, Any]:
     """Where a stage stands, and its shards if it has some, for ``status --json``."""
     from splatpipe.pipeline.engine.needs import used_and_forecast
 
-    artifact = standing.artifact
+    artifact = status.artifact
     return {
-        "name": standing.stage.name,
-        "state": standing.state,
-        "reason": standing.reason,
+        "name": status.stage.name,
+        "state": status.state,
+        "reason": status.reason,
         "seconds": artifact.manifest["seconds"] if artifact else None,
         "summary": artifact.summary if artifact else None,
         **(used_and_forecast(artifact.manifest) if artifact else {}),
-        **({"shards": [told_standing(shard) for shard in standing.shards]} if standing.shards else {}),
+        **({"shards": [status_as_json(shard) for shard in status.shards]} if status.shards else {}),
     }
 
 

@@ -28,7 +28,7 @@ from splatpipe.pipeline.app.report.verdict import Verdict
 from splatpipe.pipeline.app.sentences import sentence
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.line import Standing
+from splatpipe.pipeline.engine.line import StageStatus
 from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
@@ -218,17 +218,17 @@ def show_error(error: SplatpipeError) -> None:
     Console(file=sys.stderr, highlight=False).print(Panel("\n".join(lines), title="splatpipe", border_style="red"))
 
 
-def show_standings(standings: Iterable[Standing]) -> None:
+def show_status(statuses: Iterable[StageStatus]) -> None:
     """The table of ``splatpipe status``."""
     table = Table(box=None, pad_edge=False)
     for title in ("stage", "state", "took", "what"):
         table.add_column(title, overflow="fold")
-    for standing in standings:
-        for row in (standing, *standing.shards):
+    for status in statuses:
+        for row in (status, *status.shards):
             artifact = row.artifact
             took = _duration(float(artifact.manifest["seconds"])) if artifact else ""
             what = sentence(row.stage.name, artifact.summary) if artifact else row.reason
-            name = row.stage.name if row is standing else f"  {row.stage.name}"
+            name = row.stage.name if row is status else f"  {row.stage.name}"
             table.add_row(name, f"[{COLOURS[row.state]}]{row.state}[/]", took, Text(what), end_section=False)
     Console(highlight=False).print(table)
 

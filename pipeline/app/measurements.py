@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from splatpipe.pipeline.app.page_file import shown
+from splatpipe.pipeline.app.page_file import printable
 from splatpipe.pipeline.engine.durable import write_durably
 
 MEASURED = Path("stages/measured.json")
@@ -73,8 +73,8 @@ def outdated(out: Path, surface: str) -> bool:
 def title_of(item: Mapping[str, Any]) -> str:
     """What pages call a section or a volume."""
     if "polygon" in item:
-        return shown(item["name"]) or f"Volume {item['polygon']}"
-    return shown(item["name"]).replace("-", " ").capitalize()
+        return printable(item["name"]) or f"Volume {item['polygon']}"
+    return printable(item["name"]).replace("-", " ").capitalize()
 
 
 def write_measurements(out: Path, kind: Kind, digests: tuple[str, str], items: Sequence[Mapping[str, Any]]) -> None:

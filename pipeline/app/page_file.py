@@ -12,7 +12,7 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from splatpipe.pipeline.app.places import Places
+from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.web import asset
 
 SHARED = Path(__file__).resolve().parent / "templates"
@@ -23,7 +23,7 @@ REPLACED = "\ufffd"  # stands for what would be invisible, or turn the text arou
 
 
 def page_text(
-    templates: Path, template: str, places: Places, *, style: str, script: str | None = None, **content: object
+    templates: Path, template: str, places: PathLabels, *, style: str, script: str | None = None, **content: object
 ) -> str:
     """A page as one HTML text that needs nothing else.
 
@@ -46,7 +46,7 @@ def page_text(
         lstrip_blocks=True,
         finalize=places.plain_value,
     )
-    environment.filters |= {"shown": shown, "told": told}
+    environment.filters |= {"printable": printable, "one_line": one_line}
     code = asset(script).replace("</", "<\\/") if script else ""
     text = environment.get_template(template).render(
         style=Markup(asset(style).replace("</", "<\\/")),
@@ -57,15 +57,15 @@ def page_text(
     return text.encode("utf-8", "replace").decode()  # a file's name may be no UTF-8
 
 
-def shown(name: object) -> str:
+def printable(name: object) -> str:
     """A name as people can read it: nothing in it is invisible, breaks its line or turns it around."""
     text = str(name)
     return "".join(REPLACED if unicodedata.category(c) in UNPRINTABLE or c in TURNING else c for c in text)
 
 
-def told(message: object) -> str:
+def one_line(message: object) -> str:
     """A message likewise, in which names may be; its own lines become one."""
-    return shown(" ".join(str(message).split()))
+    return printable(" ".join(str(message).split()))
 
 
 def relative_link(path: str) -> Markup:

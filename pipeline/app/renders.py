@@ -17,12 +17,12 @@ from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.film.camera_path import Lens, Route, cameras_along
+from splatpipe.pipeline.film.camera_path import FilmCamera, Route, cameras_along
 from splatpipe.pipeline.film.filming import (
     LEAST_SIDE,
     MOST_SIDE,
     FilmFile,
-    Pictures,
+    FrameRenderer,
     TrainedScene,
     What,
     depth_range,
@@ -49,7 +49,7 @@ UP = np.array([0.0, 0.0, 1.0])  # of the world of `splat.ply`
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RenderRequest:
     """What to render.
 
     Attributes:
@@ -132,7 +132,7 @@ class RenderTask:
 
     scene: TrainedScene
     world_from_model: Similarity
-    wanted: Wanted
+    wanted: RenderRequest
     keyframes: Keyframes | None
     size: tuple[int, int] | None
 
@@ -160,13 +160,13 @@ class RenderTask:
             cameras = [camera.scaled(*self.size) if self.size else camera for camera in self.scene.cameras]
         return flat_stems([camera.name for camera in cameras]), cameras
 
-    def _lenses(self, angles_deg: np.ndarray | None, count: int) -> list[Lens]:
+    def _lenses(self, angles_deg: np.ndarray | None, count: int) -> list[FilmCamera]:
         lens = self.scene.lens(self.size)
         if angles_deg is None:
             return [lens] * count
-        return [Lens.of_angle(lens.width, lens.height, float(angle)) for angle in angles_deg]
+        return [FilmCamera.of_angle(lens.width, lens.height, float(angle)) for angle in angles_deg]
 
-    def _from_world(self, route: Route, lenses: Sequence[Lens]) -> list[Camera]:
+    def _from_world(self, route: Route, lenses: Sequence[FilmCamera]) -> list[Camera]:
         """A way in the world of `splat.ply` as cameras in the model's frame."""
         similarity = self.world_from_model
         cameras = []
@@ -179,7 +179,7 @@ class RenderTask:
         return cameras
 
 
-def render_run(out: Path, wanted: Wanted, threads: int, device: str = "auto") -> dict[str, Any]:
+def render_run(out: Path, wanted: RenderRequest, threads: int, device: str = "auto") -> dict[str, Any]:
     """Render a run that has been trained.
 
     Args:
@@ -214,7 +214,7 @@ def render_run(out: Path, wanted: Wanted, threads: int, device: str = "auto") ->
 
 
 def _render(task: RenderTask, what: What, target: Path, report: Reporter) -> dict[str, Any]:
-    pictures = Pictures(task.scene, what, task.world_from_model.rotation, task.world_from_model.scale)
+    pictures = FrameRenderer(task.scene, what, task.world_from_model.rotation, task.world_from_model.scale)
     if not task.wanted.stills:
         cameras = task.film()
         pictures = replace(pictures, depths=depth_range(pictures, cameras))
@@ -229,7 +229,7 @@ def _render(task: RenderTask, what: What, target: Path, report: Reporter) -> dic
     return told if what != "depth" else told | {"nearest": pictures.depths[0], "farthest": pictures.depths[1]}
 
 
-def write_still(stem: Path, pictures: Pictures, camera: Camera) -> None:
+def write_still(stem: Path, pictures: FrameRenderer, camera: Camera) -> None:
     """Write a picture as PNG, and depths or normals as they are as TIFF beside it, float32.
 
     Args:

@@ -36,7 +36,7 @@ Line = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Wanted:
+class MeasurementRequest:
     """What is to be measured.
 
     Attributes:
@@ -55,7 +55,7 @@ class Wanted:
         return bool(self.lines) or self.polygons is not None
 
     @staticmethod
-    def of(sections: Sequence[str], polygons: Path | None, base: str) -> Wanted:
+    def of(sections: Sequence[str], polygons: Path | None, base: str) -> MeasurementRequest:
         """As it stands on a command line.
 
         Raises:
@@ -69,7 +69,7 @@ class Wanted:
         if polygons is not None and not polygons.is_file():  # told now: the products may take minutes
             raise UsageError(f"There is no file {polygons}.", hint="Give --volume a GeoJSON file of polygons.")
         plane: Base = height if height is not None else "rim" if base == "rim" else "lowest"
-        return Wanted(tuple(_line(text) for text in sections), polygons, plane)
+        return MeasurementRequest(tuple(_line(text) for text in sections), polygons, plane)
 
 
 def _line(text: str) -> Line:
@@ -91,7 +91,7 @@ def _number(text: str) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
+class _SurfaceModel:
     """A finished surface model, and what it was made from.
 
     Attributes:
@@ -159,7 +159,7 @@ def measured_lines(out: Path, told: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def measure_surface(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
+def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict[str, Any]:
     """Cut sections and measure volumes; each kind takes the place of what was measured before, or nothing changes.
 
     Only who holds the lock of OUT may call this.
@@ -201,7 +201,7 @@ def measure_surface(out: Path, wanted: Wanted, threads: int) -> dict[str, Any]:
     return told
 
 
-def _open_surface(out: Path) -> _Surface:
+def _open_surface(out: Path) -> _SurfaceModel:
     from splatpipe.pipeline.surface.map_crs import open_map
     from splatpipe.pipeline.surface.surface_file import open_surface
     from splatpipe.pipeline.survey.frames import load_frame
@@ -211,10 +211,10 @@ def _open_surface(out: Path) -> _Surface:
     if files is None or not (files / "dsm.tif").is_file():
         raise SplatpipeError("The run has no surface model.", hint=f"Make it first: splatpipe surface {out}")
     frame = load_frame(parts["georef.frame"].path)
-    return _Surface(parts, frame, open_map(frame), open_surface(files / "dsm.tif", files / "dsm_confidence.tif"))
+    return _SurfaceModel(parts, frame, open_map(frame), open_surface(files / "dsm.tif", files / "dsm_confidence.tif"))
 
 
-def _sections(surface: _Surface, lines: Sequence[Line], folder: Path, threads: int) -> Items:
+def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threads: int) -> Items:
     """Cut all of them, their files into a folder."""
     from splatpipe.pipeline.mvs.depth_maps import kept_depth_maps
     from splatpipe.pipeline.photos.dataset import load_views
@@ -248,7 +248,7 @@ def _publish(aside: Path, folder: Path) -> None:
     sync_folder(folder)
 
 
-def _volumes(surface: _Surface, wanted: Wanted) -> Items:
+def _volumes(surface: _SurfaceModel, wanted: MeasurementRequest) -> Items:
     from splatpipe.pipeline.geometry.plan_area import PlanArea
     from splatpipe.pipeline.surface.traces import polygon_trace
     from splatpipe.pipeline.surface.volume_file import volume_facts

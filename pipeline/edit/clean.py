@@ -8,7 +8,7 @@ from typing import Any
 
 from splatpipe.pipeline.edit.cleaning import clean_scene
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
-from splatpipe.pipeline.edit.sightings import Photos
+from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.edit.workpiece import Workpiece
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
@@ -38,7 +38,7 @@ class Clean:
         photos = None
         if self.cameras and not piece.merged:
             options = rasterizer.RenderOptions(sh_degree=gaussians.sh_degree, antialias=piece.facts.antialias)
-            photos = Photos([_seen_by(camera, piece) for camera in self.cameras], options)
+            photos = TrainingPhotos([_seen_by(camera, piece) for camera in self.cameras], options)
         elif self.cameras:
             piece.notes.append("Photos of one run know nothing of a merged splat: it is cleaned without. Clean first.")
         cleaned = clean_scene(gaussians, photos)

@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from splatpipe.pipeline.edit.floaters import LOOKS, LOOSE, Suspects, likely_floaters
-from splatpipe.pipeline.edit.isolation import Shapes, far_groups, held
-from splatpipe.pipeline.edit.sightings import Photos, Sightings, look_through
+from splatpipe.pipeline.edit.isolation import GaussianShapes, far_groups, held
+from splatpipe.pipeline.edit.visibility import GaussianVisibility, TrainingPhotos, look_through
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 Flags = Bool[np.ndarray, " n"]
@@ -43,7 +43,7 @@ FEW = 100  # that hang together and are no scene
 
 
 @dataclass(frozen=True, eq=False)
-class Cleaned:
+class CleaningResult:
     """What is to be removed.
 
     Attributes:
@@ -55,7 +55,7 @@ class Cleaned:
     removed: dict[str, int]
 
 
-def clean_scene(gaussians: Gaussians, photos: Photos | None = None, told: Told | None = None) -> Cleaned:
+def clean_scene(gaussians: Gaussians, photos: TrainingPhotos | None = None, told: Told | None = None) -> CleaningResult:
     """Tell which Gaussians are floaters, haze, or beyond the photos.
 
     Args:
@@ -72,10 +72,10 @@ def clean_scene(gaussians: Gaussians, photos: Photos | None = None, told: Told |
     for reason, flags in _found(gaussians, photos, told or _untold):
         removed[reason] = int((flags & keep).sum())
         keep &= ~flags
-    return Cleaned(torch.from_numpy(keep), removed)
+    return CleaningResult(torch.from_numpy(keep), removed)
 
 
-def told_in_a_line(cleaned: Cleaned) -> str:
+def removals_in_words(cleaned: CleaningResult) -> str:
     """What was removed and why, for people; that nothing was, where it is so."""
     count, total = sum(cleaned.removed.values()), len(cleaned.keep)
     if not count:
@@ -89,11 +89,11 @@ def _untold(_done: int, _total: int) -> None:
     """Where nobody listens."""
 
 
-def _found(gaussians: Gaussians, photos: Photos | None, told: Told) -> Iterator[tuple[str, Flags]]:
+def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> Iterator[tuple[str, Flags]]:
     """Reasons, and whom they hit."""
     opacity = torch.sigmoid(gaussians.opacity_logits.detach()).numpy(force=True)
     yield "transparent", opacity < TRANSPARENT
-    shapes, solid = Shapes.of(gaussians), opacity >= SOLID
+    shapes, solid = GaussianShapes.of(gaussians), opacity >= SOLID
     if photos is None or not photos.cameras:
         yield "oversized", _haze(shapes, opacity)
         yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
@@ -121,7 +121,7 @@ def _found(gaussians: Gaussians, photos: Photos | None, told: Told) -> Iterator[
     told(steps, steps)
 
 
-def _oversized(shapes: Shapes, photos: Photos) -> Flags:
+def _oversized(shapes: GaussianShapes, photos: TrainingPhotos) -> Flags:
     """Which Gaussians are very large for where they are."""
     nearest = np.full(len(shapes.centres), np.inf)
     for camera in photos.cameras:
@@ -129,13 +129,13 @@ def _oversized(shapes: Shapes, photos: Photos) -> Flags:
     return np.asarray(shapes.largest > OVERSIZED * nearest)
 
 
-def _haze(shapes: Shapes, opacity: Float32[np.ndarray, " n"]) -> Flags:
+def _haze(shapes: GaussianShapes, opacity: Float32[np.ndarray, " n"]) -> Flags:
     """Which Gaussians are very large for the scene and hardly there; large solid ones may be its sky."""
     low, high = np.quantile(shapes.centres, EXTENT, axis=0) if len(shapes.centres) else (np.zeros(3), np.zeros(3))
     return np.asarray((shapes.largest > OVERSIZED * float(np.linalg.norm(high - low))) & (opacity < HAZE))
 
 
-def _at_edges(found: Sightings, shapes: Shapes, solid: Flags) -> Flags:
+def _at_edges(found: GaussianVisibility, shapes: GaussianShapes, solid: Flags) -> Flags:
     """Which Gaussians only the borders of a photo or two show, and what is better covered does not hold."""
     rough = solid & (found.border > BORDER) & (found.photos < FEW_PHOTOS)
     return np.asarray(rough & ~held(shapes, LOOSE, solid & ~rough, rough))

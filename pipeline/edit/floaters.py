@@ -16,17 +16,17 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 
-from splatpipe.pipeline.edit.isolation import NEIGHBOURS, Shapes, Touch, held
-from splatpipe.pipeline.edit.sightings import Photos, Sightings
-from splatpipe.pipeline.edit.worth import worth_in_photos
+from splatpipe.pipeline.edit.error_change import error_change_in_photos
+from splatpipe.pipeline.edit.isolation import NEIGHBOURS, GaussianShapes, TouchRule, held
+from splatpipe.pipeline.edit.visibility import GaussianVisibility, TrainingPhotos
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 Flags = Bool[np.ndarray, " n"]
 Figures = Float32[np.ndarray, " n"]
 
-LOOSE = Touch(sigmas=2.0, size_ratio=4.0)
+LOOSE = TouchRule(sigmas=2.0, size_ratio=4.0)
 """What does not hang together even like this with the scene hangs apart."""
-LIGHTLY_HELD = Touch(sigmas=2.0, size_ratio=1.0, needed=3)
+LIGHTLY_HELD = TouchRule(sigmas=2.0, size_ratio=1.0, needed=3)
 """What does not hang together like this does at most as leaves and edges do, and floaters near a surface."""
 LIMITS = ((0.02, 0.05), (0.008, 0.015), (0.003, 0.005))
 """Squared error of a pixel (0..3), by a Gaussian's mean weight, look after look: what makes photos worse by more than
@@ -61,10 +61,10 @@ class Suspects:
     """
 
     gaussians: Gaussians
-    shapes: Shapes
+    shapes: GaussianShapes
     suspected: Flags
     ground: Flags
-    sightings: Sightings
+    sightings: GaussianVisibility
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class Verdicts:
     better: Figures
 
 
-def likely_floaters(suspects: Suspects, photos: Photos, told: Callable[[int], None]) -> Flags:
+def likely_floaters(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int], None]) -> Flags:
     """Which of the suspects are floaters rather than not.
 
     Args:
@@ -96,7 +96,7 @@ def likely_floaters(suspects: Suspects, photos: Photos, told: Callable[[int], No
     if not likely.any():
         return likely
     looks = len(LIMITS) * len(photos.cameras)
-    worth = worth_in_photos(suspects.gaussians, likely, photos, partial(_after, told, looks))
+    worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, told, looks))
     missed = (worth.better - worth.worse) / _pixels(suspects) > LIMITS[-1][1]
     return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # what hangs apart may hide more of its own kind
 
@@ -124,7 +124,7 @@ def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
     }
 
 
-def verdicts_of(suspects: Suspects, photos: Photos, told: Callable[[int], None]) -> Verdicts:
+def verdicts_of(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int], None]) -> Verdicts:
     """Ask the photos, the worst suspects first."""
     gaussians, pixels = suspects.gaussians, _pixels(suspects)
     n = len(gaussians)
@@ -136,7 +136,7 @@ def verdicts_of(suspects: Suspects, photos: Photos, told: Callable[[int], None])
         rows = np.flatnonzero(shown)
         model = gaussians if len(rows) == n else gaussians.select(torch.from_numpy(rows).to(gaussians.means.device))
         looks = number * len(photos.cameras)
-        worth = worth_in_photos(model, asked[rows], photos, partial(_after, told, looks))
+        worth = error_change_in_photos(model, asked[rows], photos, partial(_after, told, looks))
         of_pixel = np.full(n, np.inf, np.float32)
         of_pixel[rows] = (worth.better - worth.worse) / pixels[rows]
         lower = asked[rows] & (of_pixel[rows] < least[rows])

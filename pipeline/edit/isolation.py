@@ -25,7 +25,7 @@ CHUNK = 1 << 16  # Gaussians at a time: tens of megabytes
 
 
 @dataclass(frozen=True)
-class Touch:
+class TouchRule:
     """What touching is.
 
     Attributes:
@@ -41,7 +41,7 @@ class Touch:
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class GaussianShapes:
     """Where Gaussians are and how large, on the CPU.
 
     Attributes:
@@ -55,13 +55,15 @@ class Shapes:
     largest: Float32[np.ndarray, " n"]
 
     @staticmethod
-    def of(gaussians: Gaussians) -> Shapes:
+    def of(gaussians: Gaussians) -> GaussianShapes:
         """Of finite Gaussians, on the CPU or a device."""
         largest = np.exp(gaussians.log_scales.detach().amax(1).numpy(force=True))
-        return Shapes(gaussians.means.detach().double().numpy(force=True), half_axes(gaussians), largest)
+        return GaussianShapes(gaussians.means.detach().double().numpy(force=True), half_axes(gaussians), largest)
 
 
-def far_groups(shapes: Shapes, touch: Touch, solid: Bool[np.ndarray, " n"], few: int) -> Bool[np.ndarray, " n"]:
+def far_groups(
+    shapes: GaussianShapes, touch: TouchRule, solid: Bool[np.ndarray, " n"], few: int
+) -> Bool[np.ndarray, " n"]:
     """Which Gaussians hang together in few, far from all others.
 
     Args:
@@ -88,7 +90,7 @@ def far_groups(shapes: Shapes, touch: Touch, solid: Bool[np.ndarray, " n"], few:
 
 
 def _near(
-    shapes: Shapes, touch: Touch, asked: Int64[np.ndarray, " m"], scene: Int64[np.ndarray, " s"]
+    shapes: GaussianShapes, touch: TouchRule, asked: Int64[np.ndarray, " m"], scene: Int64[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " m"]:
     """Which of a few Gaussians are near the scene: they touch it, or are no farther than a gap in it may be wide."""
     distance = cKDTree(shapes.centres[scene]).query(shapes.centres[asked])[0]
@@ -96,7 +98,7 @@ def _near(
 
 
 def held(
-    shapes: Shapes, touch: Touch, ground: Bool[np.ndarray, " n"], asked: Bool[np.ndarray, " n"]
+    shapes: GaussianShapes, touch: TouchRule, ground: Bool[np.ndarray, " n"], asked: Bool[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """Which Gaussians hold on to the ground, by as many others as are needed that are ground or hold on to it.
 
@@ -125,7 +127,7 @@ def held(
 
 
 def touch_any(
-    shapes: Shapes, touch: Touch, asked: Int64[np.ndarray, " m"], others: Int64[np.ndarray, " s"]
+    shapes: GaussianShapes, touch: TouchRule, asked: Int64[np.ndarray, " m"], others: Int64[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " m"]:
     """Which Gaussians touch any of others, the large ones with far centres among them.
 
@@ -154,7 +156,7 @@ def half_axes(gaussians: Gaussians) -> Float32[np.ndarray, "n 3 3"]:
 
 
 def _contacts(
-    shapes: Shapes, touch: Touch, rows: Int64[np.ndarray, " m"], others: Int64[np.ndarray, " s"]
+    shapes: GaussianShapes, touch: TouchRule, rows: Int64[np.ndarray, " m"], others: Int64[np.ndarray, " s"]
 ) -> tuple[Int32[np.ndarray, "m k"], Bool[np.ndarray, "m k"]]:
     """The nearest others of some Gaussians, and whether they touch; a Gaussian does not touch itself."""
     tree = cKDTree(shapes.centres[others])
@@ -167,7 +169,7 @@ def _contacts(
 
 
 def _touching(
-    shapes: Shapes, touch: Touch, one: Int64[np.ndarray, " c"], others: Int64[np.ndarray, "c k"]
+    shapes: GaussianShapes, touch: TouchRule, one: Int64[np.ndarray, " c"], others: Int64[np.ndarray, "c k"]
 ) -> Bool[np.ndarray, "c k"]:
     """Whether Gaussians touch others, k of which are asked of each."""
     apart = (shapes.centres[others] - shapes.centres[one, None]).astype(np.float32)

@@ -57,7 +57,7 @@ class Pivot:
             return piece.middle()
         return np.asarray(Coordinates.of(piece.facts, self.local).in_frame(np.array([self.point]))[0])
 
-    def told(self) -> str | list[float]:
+    def as_text(self) -> str | list[float]:
         """For the record."""
         return "middle" if self.point is None else list(self.point)
 
@@ -141,7 +141,7 @@ class MoveTo:
         return {
             "step": "move",
             "to": list(self.point),
-            "what": self.pivot.told(),
+            "what": self.pivot.as_text(),
             "coordinates": coordinates.name,
         }
 
@@ -191,12 +191,12 @@ class Rotate:
             "step": "rotate",
             "degrees": self.degrees,
             "axis": "up" if self.axis is None else list(self.axis),
-            "about": self.pivot.told(),
+            "about": self.pivot.as_text(),
         }
 
 
 @dataclass(frozen=True)
-class Scale:
+class ScaleBy:
     """By a factor about the pivot. What a metre is is not known any more, so neither is where it lies.
 
     Attributes:
@@ -208,7 +208,7 @@ class Scale:
     pivot: Pivot = Pivot()
 
     @staticmethod
-    def parse(text: str, option: str, pivot: Pivot) -> Scale:
+    def parse(text: str, option: str, pivot: Pivot) -> ScaleBy:
         """A factor.
 
         Raises:
@@ -219,7 +219,7 @@ class Scale:
             raise UsageError(
                 f"Cannot scale by {text[:60]}.", hint=f"A factor is between {FACTORS[0]:g} and {FACTORS[1]:g}."
             )
-        return Scale(factor, pivot)
+        return ScaleBy(factor, pivot)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
         """Scale; what is recorded of it."""
@@ -230,7 +230,7 @@ class Scale:
                 "--scale-from A B LENGTH keeps it."
             )
         piece.facts = facts_without_place(piece.facts)
-        return {"step": "scale", "factor": self.factor, "about": self.pivot.told()}
+        return {"step": "scale", "factor": self.factor, "about": self.pivot.as_text()}
 
 
 @dataclass(frozen=True)

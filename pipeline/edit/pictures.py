@@ -34,14 +34,14 @@ Points = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class PictureCameras:
     """Cameras of the two pictures, in the frame, z up."""
 
     before: Camera
     after: Camera
 
 
-def choose_views(cameras: Sequence[Camera], before: Points, after: Float64[np.ndarray, "m 3"]) -> Views:
+def choose_views(cameras: Sequence[Camera], before: Points, after: Float64[np.ndarray, "m 3"]) -> PictureCameras:
     """Where a splat is looked at from: both pictures from one place if that shows both.
 
     Args:
@@ -52,12 +52,12 @@ def choose_views(cameras: Sequence[Camera], before: Points, after: Float64[np.nd
     photo = _best_photo(cameras, after)
     if photo is not None:
         first = photo if _share(photo, before) >= SEEN else _best_photo(cameras, before)
-        return Views(first or oblique_view(_box(before)), photo)
+        return PictureCameras(first or oblique_view(_box(before)), photo)
     boxes = [_box(before), _box(after)]
     both = np.array([np.minimum(*[box[0] for box in boxes]), np.maximum(*[box[1] for box in boxes])])
     if _size(both) <= LARGER * min(_size(box) for box in boxes):
-        return Views(oblique_view(both), oblique_view(both))
-    return Views(oblique_view(boxes[0]), oblique_view(boxes[1]))
+        return PictureCameras(oblique_view(both), oblique_view(both))
+    return PictureCameras(oblique_view(boxes[0]), oblique_view(boxes[1]))
 
 
 def _best_photo(cameras: Sequence[Camera], points: Points) -> Camera | None:

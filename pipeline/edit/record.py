@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.edit.sources import Source
+from splatpipe.pipeline.edit.sources import SplatSource
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.splat.scene import MOST_EDITS, SceneFacts
@@ -39,7 +39,9 @@ def _fits(facts: SceneFacts) -> bool:
     return True
 
 
-def write_record(path: Path, source: Source, digest: str, edits: Sequence[Edit], output: Mapping[str, Any]) -> None:
+def write_record(
+    path: Path, source: SplatSource, digest: str, edits: Sequence[Edit], output: Mapping[str, Any]
+) -> None:
     """Write `<stem>.edits.json`.
 
     Args:

@@ -32,7 +32,7 @@ _BYTES = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?) ?([KMG]B)", re.ASCII | re.IG
 
 
 @dataclass(frozen=True)
-class Output:
+class OutputFile:
     """What is going to be written.
 
     Attributes:
@@ -54,12 +54,12 @@ class Reduce:
         size_bytes: Of the output; 0 where Gaussians are asked for.
     """
 
-    output: Output
+    output: OutputFile
     count: int = 0
     size_bytes: int = 0
 
     @staticmethod
-    def parse(text: str, option: str, output: Output) -> Reduce:
+    def parse(text: str, option: str, output: OutputFile) -> Reduce:
         """A number of Gaussians, or bytes with their unit.
 
         Raises:

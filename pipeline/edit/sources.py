@@ -22,7 +22,7 @@ LARGEST_PICTURE = 65_536  # pixels a side
 
 
 @dataclass(frozen=True)
-class Source:
+class SplatSource:
     """A splat that is there.
 
     Attributes:
@@ -61,7 +61,7 @@ class Source:
         return [camera for camera in self.cameras() if camera.name not in held_out]
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path) -> SplatSource:
     """Find a splat.
 
     Args:
@@ -73,11 +73,11 @@ def open_source(path: Path) -> Source:
     if is_run(path):
         if not (path / SPLAT).is_file():
             raise SplatpipeError(f"{path} has no {SPLAT} yet.", hint=f"Finish the run: splatpipe run PHOTOS {path}")
-        return Source(path / SPLAT, path)
+        return SplatSource(path / SPLAT, path)
     if not path.exists():
         raise SplatpipeError(f"There is no {path}.", hint="Name a splat's file, or the OUT of a run.")
     beside = path.name == SPLAT and is_run(path.parent)
-    return Source(path, path.parent if beside else None)
+    return SplatSource(path, path.parent if beside else None)
 
 
 def is_run(path: Path) -> bool:

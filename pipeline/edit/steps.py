@@ -8,10 +8,10 @@ from typing import Any
 
 from splatpipe.pipeline.edit.clean import Clean
 from splatpipe.pipeline.edit.crops import CropBox, CropHeights, CropPolygon
+from splatpipe.pipeline.edit.editing import Step
 from splatpipe.pipeline.edit.merge import Merge
-from splatpipe.pipeline.edit.motions import Move, MoveTo, Pivot, Rotate, Scale, ScaleFrom
-from splatpipe.pipeline.edit.size import Output, Reduce
-from splatpipe.pipeline.edit.work import Step
+from splatpipe.pipeline.edit.motions import Move, MoveTo, Pivot, Rotate, ScaleBy, ScaleFrom
+from splatpipe.pipeline.edit.size import OutputFile, Reduce
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 
@@ -19,7 +19,7 @@ MOST_STEPS = 100
 
 
 def parse_steps(
-    given: Sequence[tuple[str, Any]], output: Output, local: bool, cameras: Sequence[Camera] = ()
+    given: Sequence[tuple[str, Any]], output: OutputFile, local: bool, cameras: Sequence[Camera] = ()
 ) -> list[Step]:
     """Steps from the options that ask for them.
 
@@ -51,7 +51,7 @@ def _polygon(value: Path, option: str, local: bool, inside: bool) -> CropPolygon
     return CropPolygon(value, local, inside)
 
 
-_PARSERS: dict[str, Callable[[Any, str, Pivot, Output], Step]] = {
+_PARSERS: dict[str, Callable[[Any, str, Pivot, OutputFile], Step]] = {
     "crop_box": lambda value, option, pivot, _: CropBox.parse(value, option, pivot.local, True),
     "cut_box": lambda value, option, pivot, _: CropBox.parse(value, option, pivot.local, False),
     "crop_polygon": lambda value, option, pivot, _: _polygon(value, option, pivot.local, True),
@@ -60,7 +60,7 @@ _PARSERS: dict[str, Callable[[Any, str, Pivot, Output], Step]] = {
     "move": lambda value, option, _, __: Move.parse(value, option),
     "move_to": lambda value, option, pivot, _: MoveTo.parse(value, option, pivot, pivot.local),
     "rotate": lambda value, option, pivot, _: Rotate.parse(value, option, pivot),
-    "scale": lambda value, option, pivot, _: Scale.parse(value, option, pivot),
+    "scale": lambda value, option, pivot, _: ScaleBy.parse(value, option, pivot),
     "scale_from": lambda value, option, pivot, _: ScaleFrom.parse(value, option, pivot.local),
     "merge": lambda value, _, __, ___: Merge(value),
     "reduce": lambda value, option, _, output: Reduce.parse(value, option, output),

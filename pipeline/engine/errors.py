@@ -49,7 +49,7 @@ class MachineError(SplatpipeError):
 ERRORS = {error.__name__: error for error in (SplatpipeError, UsageError, StageError, MachineError)}
 
 
-class Stopped(BaseException):
+class StopSignal(BaseException):
     """Ctrl-C, SIGTERM or SIGHUP. Not an Exception, so that nothing mistakes it for a failure.
 
     Args:
@@ -67,7 +67,7 @@ def exit_code(error: BaseException | None) -> int:
     """What a command ends with that ended by this; None: as it should."""
     if error is None:
         return 0
-    if isinstance(error, SplatpipeError | Stopped):
+    if isinstance(error, SplatpipeError | StopSignal):
         return error.exit_code
     if isinstance(error, KeyboardInterrupt):
         return EXIT_INTERRUPTED

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO
 
-from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, StageError, Stopped
+from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, StageError, StopSignal
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.worker import Task, peak_memory_of
@@ -135,7 +135,7 @@ class Executor:
 
     def _raise(self, failure: Mapping[str, str]) -> None:
         if failure["type"] == "KeyboardInterrupt":
-            raise Stopped(EXIT_TERMINATED)  # somebody ended the worker alone
+            raise StopSignal(EXIT_TERMINATED)  # somebody ended the worker alone
         raise ERRORS[failure["type"]](failure["message"], failure["hint"])
 
 

@@ -108,7 +108,7 @@ def _counted(path: Path, stage: str) -> int:
 
 
 @dataclass(frozen=True)
-class Standing:
+class StageStatus:
     """Where a stage stands without running anything: its artifact where it is valid, else why it is not.
 
     Attributes:
@@ -125,7 +125,7 @@ class Standing:
     key: str = ""
     reason: str = ""
     artifact: Artifact | None = None
-    shards: tuple[Standing, ...] = ()
+    shards: tuple[StageStatus, ...] = ()
 
     @property
     def wanted(self) -> list[tuple[str, str]]:
@@ -133,7 +133,7 @@ class Standing:
         return [(self.stage.name, self.key), *((shard.stage.name, shard.key) for shard in self.shards)]
 
 
-def survey(line: Line, store: Store) -> Iterator[Standing]:
+def line_status(line: Line, store: Store) -> Iterator[StageStatus]:
     """Say of every needed stage whether it is valid, and if not why, without running anything."""
     parts = dict(line.source)
     for stage in line.needed():
@@ -141,25 +141,25 @@ def survey(line: Line, store: Store) -> Iterator[Standing]:
         if missing:
             behind = sorted(set(map(stage_name, missing)))
             reason = f"waits for {', '.join(behind)}"
-            waiting = tuple(Standing(piece, "waiting", reason=reason) for piece in line.pieces_of(stage, parts))
-            yield Standing(stage, "waiting", reason=reason, shards=waiting)
+            waiting = tuple(StageStatus(piece, "waiting", reason=reason) for piece in line.pieces_of(stage, parts))
+            yield StageStatus(stage, "waiting", reason=reason, shards=waiting)
             continue
-        shards = tuple(_standing(job, store) for job in line.shards_of(stage, parts))
-        standing = replace(_standing(Job(stage, line.inputs_of(stage, parts)), store), shards=shards)
-        if standing.artifact is not None:
-            parts.update(standing.artifact.parts)
-        yield standing
+        shards = tuple(_status(job, store) for job in line.shards_of(stage, parts))
+        status = replace(_status(Job(stage, line.inputs_of(stage, parts)), store), shards=shards)
+        if status.artifact is not None:
+            parts.update(status.artifact.parts)
+        yield status
 
 
-def _standing(job: Job, store: Store) -> Standing:
+def _status(job: Job, store: Store) -> StageStatus:
     stage, key = job.stage, job.inputs.key
     artifact = store.find(stage, key)
     if artifact is not None:
-        return Standing(stage, "valid", key, artifact=artifact)
+        return StageStatus(stage, "valid", key, artifact=artifact)
     earlier = store.artifacts(stage.name)
     if job.shard is not None and is_locked(store.out, stage.name):
-        return Standing(stage, "missing", key, "is being made")
-    return Standing(stage, "stale" if earlier else "missing", key, explain(job.inputs, earlier))
+        return StageStatus(stage, "missing", key, "is being made")
+    return StageStatus(stage, "stale" if earlier else "missing", key, explain(job.inputs, earlier))
 
 
 def explain(inputs: StageInputs, earlier: Iterable[Artifact]) -> str:

@@ -164,7 +164,7 @@ def locked_shard(out: Path, shard: str, *, wait: bool = False, tell: Tell = lamb
         MachineError: if its file system has no locks, or cannot be written.
     """
     path = out / "stages" / LOCK_FILE
-    waiting = _Waiting(path, tell, wait)
+    waiting = _Queue(path, tell, wait)
     with _explained(out):
         shared = os.open(path, FLAGS, 0o666)
     try:
@@ -243,7 +243,7 @@ def shards_being_made(out: Path) -> list[str]:
 
 def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
     """Lock the file against this machine and others, and sign it."""
-    waiting = _Waiting(path, tell, wait)
+    waiting = _Queue(path, tell, wait)
     _wait_for(descriptor, waiting, fcntl.LOCK_EX)
     _outlast(path, waiting)
     holder = Holder.here()
@@ -259,13 +259,13 @@ def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
 
 
 @dataclass
-class _Waiting:
+class _Queue:
     """What is said to the user of another who works there, once."""
 
     path: Path
     tell: Tell
     allowed: bool
-    told: bool = False
+    announced: bool = False
 
     def begin(self, other: Holder | None) -> None:
         """Say whom for.
@@ -275,12 +275,12 @@ class _Waiting:
         """
         if not self.allowed:
             raise _refusal(self.path, other)
-        if not self.told:
+        if not self.announced:
             self.tell(f"Another splatpipe ({other or 'unknown'}) is {_doing(self.path)}: waiting for it to end.")
-            self.told = True
+            self.announced = True
 
 
-def _wait_for(descriptor: int, waiting: _Waiting, kind: int) -> None:
+def _wait_for(descriptor: int, waiting: _Queue, kind: int) -> None:
     """Get the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``; who is waited for where shards are made is one of theirs."""
     path = waiting.path
     deadline_s = time.monotonic() + PATIENCE_S
@@ -291,7 +291,7 @@ def _wait_for(descriptor: int, waiting: _Waiting, kind: int) -> None:
         time.sleep(LOOK_S if waiting.allowed else LOOK_S / 2)
 
 
-def _outlast(path: Path, waiting: _Waiting) -> Holder | None:
+def _outlast(path: Path, waiting: _Queue) -> Holder | None:
     """Wait until what another boot has signed is taken back, or has not been touched for too long.
 
     Returns:

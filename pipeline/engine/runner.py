@@ -18,13 +18,13 @@ from splatpipe.pipeline.engine.errors import (
     MachineError,
     SplatpipeError,
     StageError,
-    Stopped,
+    StopSignal,
     UsageError,
     exit_code,
 )
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
-from splatpipe.pipeline.engine.line import Job, Line, explain, survey
+from splatpipe.pipeline.engine.line import Job, Line, explain, line_status
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
 from splatpipe.pipeline.engine.needs import Foresight, of_shard, unforeseen, used_with_shards
 from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary, stage_name
@@ -95,7 +95,7 @@ class Runner:
         parts = dict(self.line.source)
         outcome = self.outcome
         needed = self.line.needed(until)
-        with self._told([stage.name for stage in needed]):
+        with self._reported([stage.name for stage in needed]):
             for stage in needed:
                 job = Job(stage, self.line.inputs_of(stage, parts))
                 artifact = self._found(job, anew=stage.name in rerun)
@@ -120,7 +120,7 @@ class Runner:
         with self._explained():
             self.save_config(self.line.config)
         needed = [*counting, stage]
-        with self._told([each.name for each in needed]):
+        with self._reported([each.name for each in needed]):
             for each in needed:
                 artifact = self._make(Job(each, self.line.inputs_of(each, parts)), parts)
                 parts.update(artifact.parts)
@@ -151,7 +151,7 @@ class Runner:
                 hint=f"Leave --shard out, or see splatpipe status {self.store.out}",
             )
         job = jobs[number - 1]
-        with self._told([job.stage.name]):
+        with self._reported([job.stage.name]):
             self._found(job) or self._run(job, parts)
         return self.outcome
 
@@ -162,12 +162,12 @@ class Runner:
             UsageError: if one of them is not valid.
         """
         parts = dict(self.line.source)
-        for standing in survey(self.line, self.store):
-            if standing.stage.name == name:
+        for status in line_status(self.line, self.store):
+            if status.stage.name == name:
                 break
-            if standing.artifact is not None:
-                self.outcome.artifacts[standing.stage.name] = standing.artifact
-                parts.update(standing.artifact.parts)
+            if status.artifact is not None:
+                self.outcome.artifacts[status.stage.name] = status.artifact
+                parts.update(status.artifact.parts)
         stage = next(stage for stage in self.line.stages if stage.name == name)
         absent = {stage_name(part) for part in self.line.reads_of(stage) if part not in parts}
         missing = [earlier for earlier in self.line.stages if earlier.name in absent]
@@ -186,7 +186,7 @@ class Runner:
         )
 
     @contextmanager
-    def _told(self, stages: Sequence[str]) -> Iterator[None]:
+    def _reported(self, stages: Sequence[str]) -> Iterator[None]:
         """The events of a run's beginning and end, the bad one, too."""
         began_s = time.monotonic()
         machine = {**asdict(self.machine), **describe_machine()}
@@ -258,7 +258,7 @@ class Runner:
                     **self._forecast(job),
                 }
                 artifact = self.store.commit(stage, inputs, partial, summary, run)
-        except (SplatpipeError, Stopped, KeyboardInterrupt) as error:
+        except (SplatpipeError, StopSignal, KeyboardInterrupt) as error:
             with suppress(OSError, MachineError):  # what cannot be logged has been shown
                 self.sink(self._failed(inputs, time.monotonic() - began_s, error))
             raise

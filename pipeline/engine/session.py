@@ -105,7 +105,7 @@ def _open_log(store: Store, path: Path) -> EventLog:
         raise unwritable(store.out, error) from error
 
 
-def survey_line(request: Request) -> tuple[Line, Store]:
+def status_of(request: Request) -> tuple[Line, Store]:
     """The line and the store of an existing OUT, for looking and not for running."""
     store = open_store(request.out, create=False)
     return _open_line(request, _digests(request, store, EventReporter("source", _unheard), remember=False)), store

@@ -21,7 +21,7 @@ ABSENT = Path(os.devnull)  # where a part without a file lies: no file, and empt
 
 
 @dataclass(frozen=True)
-class Source:
+class RunSource:
     """Where a run starts from.
 
     Attributes:
@@ -78,7 +78,7 @@ class Source:
         }
 
 
-def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: BaseModel | None = None) -> Source:
+def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: BaseModel | None = None) -> RunSource:
     """Look at what the user named as PHOTOS.
 
     Args:
@@ -113,7 +113,7 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
         named[file.part] = _choose(file, f"{section}.{option}", setting, beside)
     passed = {path for paths in beside.values() for path in paths.values()}
     passed |= {path for path in named.values() if path is not None}
-    return Source(folder, find_model(folder), named, frozenset(passed))
+    return RunSource(folder, find_model(folder), named, frozenset(passed))
 
 
 def with_absolute_files(config: BaseModel, stages: Sequence[Stage]) -> BaseModel:

@@ -89,7 +89,7 @@ def angles_between(first: Float64[np.ndarray, "n 3"], second: Float64[np.ndarray
 
 
 @dataclass(frozen=True)
-class Lens:
+class FilmCamera:
     """The pinhole camera of a film: principal point in the middle, square pixels.
 
     Attributes:
@@ -103,9 +103,9 @@ class Lens:
     focal_px: float
 
     @staticmethod
-    def of_angle(width: int, height: int, angle_deg: float) -> Lens:
+    def of_angle(width: int, height: int, angle_deg: float) -> FilmCamera:
         """The lens that sees so many degrees along the picture's longer side."""
-        return Lens(width, height, 0.5 * max(width, height) / math.tan(math.radians(0.5 * angle_deg)))
+        return FilmCamera(width, height, 0.5 * max(width, height) / math.tan(math.radians(0.5 * angle_deg)))
 
 
 def angle_of(cameras: Sequence[Camera]) -> float:
@@ -151,7 +151,9 @@ def _common_axis(axes: Float64[np.ndarray, "n 3"], ahead: Float64[np.ndarray, " 
     return azimuth if sense >= 0.0 else azimuth + math.pi
 
 
-def cameras_along(route: Route, lenses: Lens | Sequence[Lens], up: Float64[np.ndarray, " 3"]) -> list[Camera]:
+def cameras_along(
+    route: Route, lenses: FilmCamera | Sequence[FilmCamera], up: Float64[np.ndarray, " 3"]
+) -> list[Camera]:
     """The cameras of a way, level.
 
     Args:
@@ -160,7 +162,7 @@ def cameras_along(route: Route, lenses: Lens | Sequence[Lens], up: Float64[np.nd
         up: As for ``upright_route``; the cameras' world is its frame.
     """
     upright = rotation_to_up(up)
-    each = [lenses] * len(route) if isinstance(lenses, Lens) else lenses
+    each = [lenses] * len(route) if isinstance(lenses, FilmCamera) else lenses
     cameras = []
     level = replace(route, leans=np.zeros(len(route))).directions()
     each_one = zip(route.places, route.directions(), np.cross(level, route.rights()), each, strict=True)

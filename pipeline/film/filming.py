@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.film.camera_path import Lens, angle_of
+from splatpipe.pipeline.film.camera_path import FilmCamera, angle_of
 from splatpipe.pipeline.film.clearance import Clearance, solid_places
 from splatpipe.pipeline.film.options import MOST_FILM_MEGAPIXELS
-from splatpipe.pipeline.film.photo_route import Capture
+from splatpipe.pipeline.film.photo_route import PhotoTrack
 from splatpipe.pipeline.film.video import VideoWriter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_views
@@ -51,15 +51,15 @@ class TrainedScene:
     model: Model
     options: rasterizer.RenderOptions
     cameras: Sequence[Camera]
-    capture: Capture
+    capture: PhotoTrack
 
-    def lens(self, size: tuple[int, int] | None) -> Lens:
+    def lens(self, size: tuple[int, int] | None) -> FilmCamera:
         """The photos' angle on a picture of some size; else 16:9, as many pixels as in training, Full HD at most."""
         if size is None:
             pixels = float(np.median([camera.width * camera.height for camera in self.cameras]))
             width = _even(math.sqrt(min(pixels, 1e6 * MOST_FILM_MEGAPIXELS) * ASPECT))
             size = (width, _even(width / ASPECT))
-        return Lens.of_angle(*size, angle_of(self.cameras))
+        return FilmCamera.of_angle(*size, angle_of(self.cameras))
 
 
 def _even(length: float) -> int:
@@ -85,7 +85,7 @@ def open_scene(parts: Mapping[str, Path], threads: int, device: Device) -> Train
     cameras = [reduced_camera(view.camera, megapixels) for view in views]
     up = _up(views, cameras, points.xyz, threads) if sky is None else sky.up
     seen = [tracks[camera.name] for camera in cameras]
-    capture = Capture(cameras, seen, points.xyz, up, Clearance(solid_places(gaussians)))
+    capture = PhotoTrack(cameras, seen, points.xyz, up, Clearance(solid_places(gaussians)))
     return TrainedScene(placed((gaussians, sky), device), options, cameras, capture)
 
 
@@ -100,7 +100,7 @@ def _up(
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class FrameRenderer:
     """Makes the pictures of a scene.
 
     Attributes:
@@ -135,7 +135,7 @@ class Pictures:
         return coloured_depth(values, self.depths) if self.what == "depth" else coloured_normals(values)
 
 
-def depth_range(pictures: Pictures, cameras: Sequence[Camera]) -> tuple[float, float]:
+def depth_range(pictures: FrameRenderer, cameras: Sequence[Camera]) -> tuple[float, float]:
     """The depths that most of a way's pictures show, nearest and farthest."""
     found = []
     for index in np.unique(np.linspace(0, len(cameras) - 1, min(SAMPLED, len(cameras))).round().astype(int)):

@@ -9,7 +9,7 @@ import numpy as np
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.film.camera_path import STEEP, Route, upright_route
 from splatpipe.pipeline.film.clearance import Clearance
-from splatpipe.pipeline.film.photo_route import Capture, followed_photos
+from splatpipe.pipeline.film.photo_route import PhotoTrack, followed_photos
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
 LOOKED_AT = 72  # places of a circle at which it has to be clear
@@ -21,7 +21,7 @@ OVER_A_MAP_DEG = 50.0  # elevation where all photos look down: walls that no pho
 LEAST_ELEVATION_DEG = 5.0
 
 
-def orbit(capture: Capture, frames: int) -> Route:
+def orbit(capture: PhotoTrack, frames: int) -> Route:
     """One turn around the middle of what the photos show, at their distance and height; its end joins its beginning.
 
     Where something is in the way the circle is raised, then widened.

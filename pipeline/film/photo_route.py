@@ -37,7 +37,7 @@ SOFTER = 5  # halvings of the rounding, should a rounded corner come too near
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
+class PhotoTrack:
     """What a film needs to know of a capture.
 
     Attributes:
@@ -64,7 +64,7 @@ class Capture:
         return medians
 
 
-def photo_film(capture: Capture, frames: int, seconds: float) -> Route:
+def photo_film(capture: PhotoTrack, frames: int, seconds: float) -> Route:
     """A film along a capture's photos.
 
     Args:
@@ -99,7 +99,7 @@ def photo_film(capture: Capture, frames: int, seconds: float) -> Route:
     return sampled(way, evenly_timed(way, distance, frames, seconds))
 
 
-def _clear_way(capture: Capture, route: Route, distance: float, width: float) -> Route:
+def _clear_way(capture: PhotoTrack, route: Route, distance: float, width: float) -> Route:
     """A route smoothed as far as it stays away from what is solid."""
     upright = rotation_to_up(capture.up)
     wanted = CLEAR * float(capture.clearance.at(route.places @ upright).min())
@@ -123,7 +123,7 @@ def _no_detours(route: Route, distance: float) -> Int64[np.ndarray, " k"]:
     return np.flatnonzero(~np.concatenate(([False], odd, [False])))
 
 
-def followed_photos(capture: Capture) -> tuple[Int64[np.ndarray, " k"], float]:
+def followed_photos(capture: PhotoTrack) -> tuple[Int64[np.ndarray, " k"], float]:
     """The photos that are no strays, in name order, and how far away what they see is."""
     depths = capture.depths()
     enough = np.array([len(rows) >= FEWEST_SEEN for rows in capture.seen]) & np.isfinite(depths)
@@ -171,7 +171,9 @@ def _order(route: Route, distance: float) -> Int64[np.ndarray, " n"]:
     return other if typical(named) > LONGER * typical(other) else named
 
 
-def _open(capture: Capture, photos: Int64[np.ndarray, " n"], legs: Float64[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+def _open(
+    capture: PhotoTrack, photos: Int64[np.ndarray, " n"], legs: Float64[np.ndarray, " m"]
+) -> Bool[np.ndarray, " m"]:
     """Whether a film may go from each photo to the next."""
     near = (legs <= LONG_LEG * max(float(np.median(legs)), 1e-9)) & (legs <= LONGEST_LEG)
     places = np.array([capture.cameras[int(index)].centre() for index in photos])
@@ -185,7 +187,7 @@ def _open(capture: Capture, photos: Int64[np.ndarray, " n"], legs: Float64[np.nd
 
 
 def _stretch(
-    capture: Capture,
+    capture: PhotoTrack,
     photos: Int64[np.ndarray, " n"],
     legs: Float64[np.ndarray, " m"],
     lengths: Float64[np.ndarray, " m"],

@@ -40,7 +40,7 @@ class FrameSize:
 
 
 @dataclass(frozen=True)
-class Room:
+class FrameAllocation:
     """What a frame gets.
 
     Attributes:
@@ -69,7 +69,7 @@ class FrameFacts:
     chunks: int
 
 
-class Reading:
+class PendingFacts:
     """Facts on their way from the device.
 
     Args:
@@ -107,20 +107,20 @@ class Forecast:
 
     def __init__(self, most_pairs: int = FEWEST_PAIRS) -> None:
         self.most_pairs = most_pairs
-        self._readings: deque[Reading] = deque()
+        self._readings: deque[PendingFacts] = deque()
         self._recent: FrameFacts | None = None  # the most of this window's frames
         self._before: FrameFacts | None = None  # of the one before it
         self._seen = 0  # frames in this window
-        self._last = Room(0, 0)
+        self._last = FrameAllocation(0, 0)
         self._last_count = 0
         self._lock = threading.Lock()  # pages of the viewer are rendered by several threads
 
-    def room(self, size: FrameSize) -> Room:
+    def room(self, size: FrameSize) -> FrameAllocation:
         """What the next frame gets; never waits."""
         with self._lock:
             return self._room(size)
 
-    def _room(self, size: FrameSize) -> Room:
+    def _room(self, size: FrameSize) -> FrameAllocation:
         while self._readings and self._readings[0].arrived():
             self.learn(self._readings.popleft().facts())
         known = [facts for facts in (self._before, self._recent) if facts is not None]
@@ -134,13 +134,13 @@ class Forecast:
         if chunks > 1:
             chunks += 1  # chunks end with a tile, so that each has a little less than fits
         as_before = (facts.chunks for facts in known if facts.capacity >= capacity and facts.size.tiles == size.tiles)
-        self._last = Room(capacity, max(passes, chunks, *as_before))
+        self._last = FrameAllocation(capacity, max(passes, chunks, *as_before))
         self._last_count = size.count
         return self._last
 
     def read_later(self, memory: Tensor, size: FrameSize, capacity: int) -> None:
         """Learn from a frame that was enqueued, when its facts have arrived."""
-        self._readings.append(Reading(memory, size, capacity))
+        self._readings.append(PendingFacts(memory, size, capacity))
 
     def learn(self, facts: FrameFacts) -> None:
         """Learn from a frame."""

@@ -141,7 +141,7 @@ class NoCuda:
 
 
 @dataclass(frozen=True)
-class Installed:
+class CudaInstallation:
     """What decides whether CUDA can be used here.
 
     Attributes:
@@ -177,7 +177,7 @@ _TORCH_CPU = NoCuda(
 )
 
 
-def reason_of(installed: Installed) -> NoCuda | None:
+def reason_of(installed: CudaInstallation) -> NoCuda | None:
     """The first thing that is in the way of using CUDA, or None if nothing is."""
     if installed.driver == 0:
         return _NO_DRIVER
@@ -215,7 +215,7 @@ def why_not(path: Path = LIBRARY) -> NoCuda | None:
         path: Of the library.
     """
     code, known = driver()
-    installed = Installed(known, code, path.exists())
+    installed = CudaInstallation(known, code, path.exists())
     if reason := reason_of(installed):
         return reason
     try:
@@ -225,12 +225,12 @@ def why_not(path: Path = LIBRARY) -> NoCuda | None:
     import torch
 
     built_with = torch.version.cuda or ""
-    if reason := reason_of(Installed(known, code, True, library, built_with)):
+    if reason := reason_of(CudaInstallation(known, code, True, library, built_with)):
         return reason
     with warnings.catch_warnings():  # of an old driver torch warns at length: what is returned says it
         warnings.simplefilter("ignore")
         works = torch.cuda.is_available()
-    return reason_of(Installed(known, code, True, library, built_with, works))
+    return reason_of(CudaInstallation(known, code, True, library, built_with, works))
 
 
 def cannot_compute() -> NoCuda | None:
@@ -258,7 +258,7 @@ def _major(version: str) -> int:
     return int(version.split(".")[0] or 0)
 
 
-def _too_old(installed: Installed) -> NoCuda:
+def _too_old(installed: CudaInstallation) -> NoCuda:
     """Told with the least driver that will do: for the kernels and for torch, which are not built alike."""
     kernels = 0 if installed.library is None else installed.library[1].runtime // 1000
     built = {"the CUDA kernels": kernels, "the installed torch": _major(installed.torch_cuda or "")}

@@ -17,7 +17,7 @@ from splatpipe.pipeline.splat.panorama import STEP_PX, between_nodes, composite_
 
 
 @dataclass(frozen=True, eq=False)
-class Behind:
+class SkyLayer:
     """What is to be behind a render, interpolated from nodes as ``splat.panorama.between_nodes`` does.
 
     Attributes:
@@ -36,7 +36,10 @@ class Behind:
 
 
 def laid_over_nodes(
-    colour: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], nodes: Float[Tensor, "rows columns 3"], behind: Behind
+    colour: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    nodes: Float[Tensor, "rows columns 3"],
+    behind: SkyLayer,
 ) -> Float[Tensor, "h w 3"]:
     """A render over something else than its background: ``laid_over_nodes_reference``, by kernels for float32.
 
@@ -53,12 +56,15 @@ def laid_over_nodes(
     fits = kernels is not None or colour.device.type == "cpu"
     if not fits or any(tensor.dtype != torch.float32 for tensor in (colour, alpha, nodes)):
         return laid_over_nodes_reference(colour, alpha, nodes, behind)
-    result: Tensor = _LaidOver.apply(kernels, colour, alpha, nodes, behind)  # type: ignore[no-untyped-call]
+    result: Tensor = _SkyComposite.apply(kernels, colour, alpha, nodes, behind)  # type: ignore[no-untyped-call]
     return result
 
 
 def laid_over_nodes_reference(
-    colour: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], nodes: Float[Tensor, "rows columns 3"], behind: Behind
+    colour: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    nodes: Float[Tensor, "rows columns 3"],
+    behind: SkyLayer,
 ) -> Float[Tensor, "h w 3"]:
     """The same by its definition, in any dtype and on any device."""
     height, width = alpha.shape
@@ -72,10 +78,10 @@ def laid_over_nodes_reference(
     return composite_over(colour, alpha, behind.background, shown)
 
 
-class _LaidOver(torch.autograd.Function):
+class _SkyComposite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, kernels: CudaKernels | None, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: Behind
+        ctx: Any, kernels: CudaKernels | None, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: SkyLayer
     ) -> Tensor:
         ctx.kernels, ctx.behind = kernels, behind
         colour, alpha, nodes = (tensor.detach().contiguous() for tensor in (colour, alpha, nodes))
@@ -103,7 +109,7 @@ class _LaidOver(torch.autograd.Function):
         return None, given, by_alpha, by_nodes, None
 
 
-def _contiguous(behind: Behind) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+def _contiguous(behind: SkyLayer) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """Nodes elsewhere, what is around and the mask, as kernels read them."""
     elsewhere = None if behind.elsewhere is None else behind.elsewhere.detach().contiguous()
     around, mask = (
@@ -112,13 +118,13 @@ def _contiguous(behind: Behind) -> tuple[Tensor | None, Tensor | None, Tensor | 
     return elsewhere, around, mask
 
 
-def _sky(alpha: Tensor, nodes: Tensor, behind: Behind) -> tuple[Any, ...]:
+def _sky(alpha: Tensor, nodes: Tensor, behind: SkyLayer) -> tuple[Any, ...]:
     """The argument of the CPU's kernels."""
     return alpha, nodes, *_contiguous(behind), behind.step, behind.background
 
 
 def _cuda_sky(
-    kernels: CudaKernels, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: Behind
+    kernels: CudaKernels, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: SkyLayer
 ) -> tuple[SplatSky, tuple[Tensor | None, ...]]:
     """The argument of a device's kernels, and what has to live as long as it does."""
     elsewhere, around, mask = kept = _contiguous(behind)

@@ -29,7 +29,7 @@ PAIRS = 12  # of neighbours: enough for the median, and a few seconds of renderi
 
 
 @dataclass(frozen=True)
-class Disagreement:
+class DepthDisagreement:
     """How far median depths of neighbouring views are apart.
 
     Attributes:
@@ -113,7 +113,7 @@ def _best_around(
     return best
 
 
-def disagreement(differences: Sequence[Float64[np.ndarray, " _"]]) -> Disagreement:
+def depth_disagreement(differences: Sequence[Float64[np.ndarray, " _"]]) -> DepthDisagreement:
     """The figures of all compared pixels.
 
     Args:
@@ -121,5 +121,5 @@ def disagreement(differences: Sequence[Float64[np.ndarray, " _"]]) -> Disagreeme
     """
     every = np.concatenate([np.empty(0), *differences])
     if every.size == 0:
-        return Disagreement(None, None, 0)
-    return Disagreement(float(np.median(np.abs(every))), float(np.mean(every > AGREEMENT)), int(every.size))
+        return DepthDisagreement(None, None, 0)
+    return DepthDisagreement(float(np.median(np.abs(every))), float(np.mean(every > AGREEMENT)), int(every.size))

@@ -18,7 +18,7 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.render.consistency import depth_differences, disagreement, neighbouring_pairs
+from splatpipe.pipeline.render.consistency import depth_differences, depth_disagreement, neighbouring_pairs
 from splatpipe.pipeline.render.veil import measure_veil
 from splatpipe.pipeline.splat.free_space import free_space, near_or_free, share_of_opacity
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -65,7 +65,7 @@ def measure_floaters(
         depths[place], of_view = _look(flagged, small[place], options)
         light += of_view
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
-    apart = disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
+    apart = depth_disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
     return {
         "veil": measure_veil(gaussians, cameras, (points.xyz, counted), held_out, options),
         "free_space_opacity": _rounded(floating) if space.known else None,

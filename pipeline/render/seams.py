@@ -110,7 +110,7 @@ class Seam:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _BorderRows:
     """Rows of a picture that show the border, about its column.
 
     Attributes:
@@ -264,7 +264,7 @@ def _rows(
     line: PlanLine,
     camera: Camera,
     how: tuple[rasterizer.RenderOptions, float],
-) -> _Rows:
+) -> _BorderRows:
     """What a camera over a border shows of it, less what it shows of the second model."""
     options, height = how
     stacks = [_stack(model, camera, options, height) for model in models]
@@ -285,7 +285,7 @@ def _rows(
         part[2] /= pixel
         channels += sign * part
     backward = bool((line.direction @ plan.axes) @ np.cross(plan.up, camera.cam_from_world[0, :3]) < 0.0)
-    return _Rows(along, channels[..., ::-1] if backward else channels)  # the line's left is always on the left
+    return _BorderRows(along, channels[..., ::-1] if backward else channels)  # the line's left is always on the left
 
 
 def _stack(

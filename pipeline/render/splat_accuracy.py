@@ -45,7 +45,7 @@ class Observation:
 
 
 @dataclass(frozen=True)
-class Surveyed:
+class ObservedPoint:
     """A surveyed point and the photos that show it.
 
     Attributes:
@@ -120,7 +120,7 @@ def georef_points(control: Path) -> list[dict[str, Any]]:
     return told
 
 
-def read_surveyed(control: Path, photos: Sequence[str]) -> list[Surveyed]:
+def read_surveyed(control: Path, photos: Sequence[str]) -> list[ObservedPoint]:
     """The points of `control.json`, with their observations in these photos.
 
     Raises:
@@ -138,7 +138,7 @@ def read_surveyed(control: Path, photos: Sequence[str]) -> list[Surveyed]:
                     ray = np.array(seen["ray"], dtype=np.float64).reshape(2)
                     observations.append(Observation(photo, ray))
             place = np.array([east, north, math.nan if up is None else up], dtype=np.float64)
-            points.append(Surveyed(str(point["name"]), str(point["role"]), place, tuple(observations)))
+            points.append(ObservedPoint(str(point["name"]), str(point["role"]), place, tuple(observations)))
     except (KeyError, TypeError, ValueError) as error:
         raise StageError(f"{control.name} is broken: {error!r}.", hint="Run again with --rerun georef.") from error
     return points
@@ -170,7 +170,7 @@ def depth_at(depth: DepthMap, pixel: Float64[np.ndarray, " 2"]) -> float | None:
     return float(1.0 / (weights / four).sum())
 
 
-def _chosen(point: Surveyed, held_out: Sequence[str]) -> list[Observation]:
+def _chosen(point: ObservedPoint, held_out: Sequence[str]) -> list[Observation]:
     """Those in held-out photos; all of them where these are too few for a median."""
     unseen = [seen for seen in point.observations if seen.photo in set(held_out)]
     return unseen if len(unseen) >= ENOUGH else list(point.observations)
@@ -187,7 +187,7 @@ def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Fram
 
 
 def _splat(
-    points: Sequence[Surveyed], places: Mapping[str, list[dict[str, Any]]], held_out: set[str]
+    points: Sequence[ObservedPoint], places: Mapping[str, list[dict[str, Any]]], held_out: set[str]
 ) -> dict[str, Any]:
     told: list[dict[str, Any]] = []
     residuals: dict[str, list[Float64[np.ndarray, " 3"]]] = {"control": [], "check": []}

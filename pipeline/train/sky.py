@@ -24,7 +24,7 @@ from splatpipe.pipeline.photos.dataset import View, load_points
 from splatpipe.pipeline.photos.images import reduced_sky
 from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.raster.sky import Behind, laid_over_nodes
+from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
 from splatpipe.pipeline.train.draws import ELSEWHERE
@@ -161,9 +161,9 @@ class SkyModel(SideModel, Technique):
             elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
         """
         look = self.panorama.look(camera)
-        nodes, how = look.at_nodes(self.panorama.colours, background), Behind(background)
+        nodes, how = look.at_nodes(self.panorama.colours, background), SkyLayer(background)
         if seen is not None:
-            how = Behind(background, look.flat_at_nodes(elsewhere, background), seen.around, seen.mask)
+            how = SkyLayer(background, look.flat_at_nodes(elsewhere, background), seen.around, seen.mask)
         return laid_over_nodes(rendered.colour, rendered.alpha, nodes, how)
 
     def loss(

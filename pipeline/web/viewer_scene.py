@@ -38,7 +38,7 @@ CLEARLY_TILTED = 0.6  # of the upward direction, in the picture: seen from rathe
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewerRendering:
     """How a model was trained to be rendered.
 
     Attributes:
@@ -54,13 +54,18 @@ class Look:
     sky: Panorama | None = None
 
 
-def look_of(options: RenderOptions, sky: Panorama | None) -> Look:
+def viewer_rendering(options: RenderOptions, sky: Panorama | None) -> ViewerRendering:
     """What of the rasterizer's options (see `as_trained`) counts in the page as well."""
-    return Look(options.antialias, options.background, options.near, sky)
+    return ViewerRendering(options.antialias, options.background, options.near, sky)
 
 
 def viewer_scene(
-    dataset: Path, frame: Frame, look: Look, held_out: Collection[str] = (), gaussians: int = 0, title: str = "3D model"
+    dataset: Path,
+    frame: Frame,
+    look: ViewerRendering,
+    held_out: Collection[str] = (),
+    gaussians: int = 0,
+    title: str = "3D model",
 ) -> ViewerScene:
     """Collect what the page shows besides the splat.
 

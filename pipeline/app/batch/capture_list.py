@@ -34,7 +34,7 @@ TOML_HINT = 'Write a table [[capture]] for each, with photos = "folder" and, if 
 
 
 @dataclass(frozen=True)
-class Capture:
+class ListedCapture:
     """A capture as it was listed.
 
     Attributes:
@@ -52,7 +52,7 @@ class Capture:
     trouble: SplatpipeError | None = None
 
 
-def read_captures(captures: Path, out: Path) -> tuple[Capture, ...]:
+def read_captures(captures: Path, out: Path) -> tuple[ListedCapture, ...]:
     """The captures that a batch is to run, in the order of the list, or of their names.
 
     Args:
@@ -82,7 +82,7 @@ def read_captures(captures: Path, out: Path) -> tuple[Capture, ...]:
     return tuple(found)
 
 
-def _of_folder(folder: Path, out: Path) -> list[Capture]:
+def _of_folder(folder: Path, out: Path) -> list[ListedCapture]:
     try:
         entries = sorted(folder.iterdir())
     except OSError as error:
@@ -99,7 +99,7 @@ def _of_folder(folder: Path, out: Path) -> list[Capture]:
             f"{folder} has the photos of one capture.",
             hint=f"Name the folder above it, or run this one alone: splatpipe run {folder} OUT",
         )
-    return [Capture(entry.name, entry) for entry in folders]
+    return [ListedCapture(entry.name, entry) for entry in folders]
 
 
 def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
@@ -160,7 +160,7 @@ def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]
         )
 
 
-def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> Capture:
+def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> ListedCapture:
     """A capture from its row or table; paths in it count from the list's folder."""
     if not told.get("photos"):
         raise UsageError("A capture of the list names no photos.", hint="Name its folder under photos.")
@@ -171,9 +171,9 @@ def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -
     name = str(told.get("name") or photos.resolve().name)
     preset = str(told.get("preset", ""))
     try:
-        return Capture(name, photos, preset, tuple(_tables(told, folder, options)))
+        return ListedCapture(name, photos, preset, tuple(_tables(told, folder, options)))
     except SplatpipeError as error:
-        return Capture(name, photos, preset, trouble=error)
+        return ListedCapture(name, photos, preset, trouble=error)
 
 
 def _tables(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> Iterator[Table]:
@@ -214,7 +214,7 @@ def with_files_from(folder: Path, table: Table) -> Table:
     return taken
 
 
-def _check_places(captures: Sequence[Capture], out: Path) -> None:
+def _check_places(captures: Sequence[ListedCapture], out: Path) -> None:
     """One capture's results must not lie among another's photos: its pictures would count as such."""
     around = {out, *out.parents}
     for capture in captures:
@@ -225,7 +225,7 @@ def _check_places(captures: Sequence[Capture], out: Path) -> None:
             )
 
 
-def _check_names(captures: Sequence[Capture], listed: Path) -> None:
+def _check_names(captures: Sequence[ListedCapture], listed: Path) -> None:
     """Each becomes a folder, on any file system."""
     if len(captures) > MAX_CAPTURES:
         raise UsageError(f"{listed} names {len(captures):,} captures.", hint=f"At most {MAX_CAPTURES:,} make a batch.")

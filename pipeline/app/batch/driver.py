@@ -12,8 +12,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.account import Account
-from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, Plan
+from splatpipe.pipeline.app.batch.monitor import BatchMonitor
+from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, BatchPlan, Call
 from splatpipe.pipeline.app.batch.publication import PAGE_FILE, publish
 from splatpipe.pipeline.app.batch.snakemake_process import (
     Profile,
@@ -29,7 +29,7 @@ from splatpipe.pipeline.app.batch.workflow import write_workflow
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, notify
 from splatpipe.pipeline.app.report import REPORT_FILE
 from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, Stopped, UsageError, exit_code
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, StopSignal, UsageError, exit_code
 from splatpipe.pipeline.engine.lock import locked
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.store import unwritable
@@ -91,7 +91,7 @@ def fresh_call(out: Path, name: str = "call") -> Call:
     return Call(folder)
 
 
-def with_unlisted(plan: Plan) -> Plan:
+def with_unlisted(plan: BatchPlan) -> BatchPlan:
     """The plan with the captures of earlier calls that are not listed any more; this call's names are kept."""
     path = Path(plan.out) / BATCH_FOLDER / NAMES_FILE
     known: list[JSON] = []
@@ -104,7 +104,7 @@ def with_unlisted(plan: Plan) -> Plan:
 
 
 @dataclass(frozen=True)
-class Told:
+class Notifications:
     """Who is told, besides the files.
 
     Attributes:
@@ -122,13 +122,13 @@ class Driver:
     Args:
         call: Whose plan is written.
         profile: Where Snakemake runs jobs.
-        told: Who is told.
+        notifications: Where changes are reported.
     """
 
-    def __init__(self, call: Call, profile: Profile, told: Told) -> None:
-        self._call, self._profile, self._told = call, profile, told
+    def __init__(self, call: Call, profile: Profile, notifications: Notifications) -> None:
+        self._call, self._profile, self._notifications = call, profile, notifications
         self._plan = call.plan()
-        self._account = Account(call)
+        self._account = BatchMonitor(call)
         self._before: dict[str, CaptureState] = {}
         self._published_s = 0.0
         self._last: BatchState | None = None
@@ -156,7 +156,7 @@ class Driver:
             succeeded = self._account.state().all_succeeded
             return self._finish(0 if succeeded else EXIT_INPUT, "")
         except BaseException as error:
-            if isinstance(error, Stopped | KeyboardInterrupt):
+            if isinstance(error, StopSignal | KeyboardInterrupt):
                 self._notice_s = STOPPED_NOTICE_S
             self._finish(exit_code(error), str(error))
             raise
@@ -180,7 +180,7 @@ class Driver:
                     self._tell(self._account.state())
                     time.sleep(POLL_S)
             except BaseException:
-                self._told.say("Ending the batch: what runs is asked to end, and keeps what it has.")
+                self._notifications.say("Ending the batch: what runs is asked to end, and keeps what it has.")
                 end_group(self._call, process.pid, local=self._profile.local, gone=lambda: process.poll() is not None)
                 process.wait()
                 raise
@@ -200,7 +200,7 @@ class Driver:
         changed = [capture for capture in state.captures if _moved(self._before.get(capture.name), capture)]
         for capture in changed:
             if capture.state != "waiting":
-                self._told.say(_line(capture))
+                self._notifications.say(_line(capture))
         waited_s = time.time() - self._published_s
         other = self._last is None or replace(state, as_of_s=0.0) != replace(self._last, as_of_s=0.0)
         if changed or not state.at_work or waited_s >= (CHANGED_EVERY_S if other else RENEWED_EVERY_S):
@@ -219,17 +219,17 @@ class Driver:
         except (OSError, MachineError) as error:
             if str(error) != self._unwritten:
                 self._unwritten = str(error)
-                self._told.say(f"Cannot write where the batch stands: {error}")
+                self._notifications.say(f"Cannot write where the batch stands: {error}")
         self._published_s, self._last = time.time(), state
 
     def _notify(self, state: str, name: str, page: str) -> None:
-        if not self._told.command:
+        if not self._notifications.command:
             return
         path = self._call.out / page
         report = path if path.is_file() else None
-        trouble = notify(self._told.command, state, name, report, self._call.out, self._notice_s)  # type: ignore[arg-type]
+        trouble = notify(self._notifications.command, state, name, report, self._call.out, self._notice_s)  # type: ignore[arg-type]
         if trouble:
-            self._told.say(trouble)
+            self._notifications.say(trouble)
 
 
 class WorkflowError(MachineError):

@@ -31,11 +31,11 @@ def main() -> None:
         if told.get("done"):
             return
         group, local = int(told["group"]), bool(told["local"])
-    _mourn(call, group, local)
+    _clean_up(call, group, local)
 
 
-def _mourn(call: Call, group: int, local: bool) -> None:
-    from splatpipe.pipeline.app.batch.account import Account
+def _clean_up(call: Call, group: int, local: bool) -> None:
+    from splatpipe.pipeline.app.batch.monitor import BatchMonitor
     from splatpipe.pipeline.app.batch.publication import publish
     from splatpipe.pipeline.app.batch.snakemake_process import end_group, group_gone
 
@@ -43,7 +43,7 @@ def _mourn(call: Call, group: int, local: bool) -> None:
         end_group(call, group, local=local, gone=lambda: group_gone(group))
     with suppress(OSError):
         call.write_end(time.time(), None, KILLED)
-        publish(Account(call).state(), call.out)
+        publish(BatchMonitor(call).state(), call.out)
 
 
 if __name__ == "__main__":

@@ -19,12 +19,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 
-from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
 from splatpipe.pipeline.app.batch.shards import counts_shards, tell_shards
-from splatpipe.pipeline.app.batch.tries import HOPELESS, Ending, TryLog, read_tries, spent_s
+from splatpipe.pipeline.app.batch.tries import HOPELESS, TryLog, TryResult, read_tries, spent_s
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
-from splatpipe.pipeline.app.ending import PART_VARIABLE
-from splatpipe.pipeline.app.report.story import read_story
+from splatpipe.pipeline.app.command_summary import PART_VARIABLE
+from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.engine.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
@@ -60,13 +60,13 @@ def main() -> None:
     marker.touch()
 
 
-def _lacking(out: Path, job: StageJob) -> Ending | None:
+def _lacking(out: Path, job: StageJob) -> TryResult | None:
     """Why the stage must not begin; None where it may."""
     free = shutil.disk_usage(out).free
     if free >= job.disk_bytes + RESERVE_BYTES:
         return None
     needed = (job.disk_bytes + RESERVE_BYTES) / 1e9
-    return Ending(
+    return TryResult(
         EXIT_MACHINE,
         f"The disk has {free / 1e9:.1f} GB free, and the stage {job.stage} needs about {needed:.1f}.",
         "Make room, then repeat the command: what is finished is kept.",
@@ -74,7 +74,7 @@ def _lacking(out: Path, job: StageJob) -> Ending | None:
     )
 
 
-def _run(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads: int) -> Ending:
+def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> TryResult:
     log = call.log(capture.name, job.stage)
     log.parent.mkdir(parents=True, exist_ok=True)
     spent = spent_s(read_tries(call.tries_files(capture.key)))
@@ -96,7 +96,7 @@ def _run(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads
     return _ending(process.returncode, told, shard_events(out, job.stage) if shard else out / EVENTS_FILE)
 
 
-def command_of(call: Call, plan: Plan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
+def command_of(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
     """The `splatpipe run` of a job, of a shard's the `splatpipe stage`.
 
     The last stage's asks for all that the line has: export, which the film's stage does not need, is told of again.
@@ -137,21 +137,21 @@ def _pass_on_signals(process: subprocess.Popen[bytes]) -> None:
         signal.signal(number, pass_on)
 
 
-def _ending(code: int, told: bytes, events: Path) -> Ending:
+def _ending(code: int, told: bytes, events: Path) -> TryResult:
     if code < 0:
         name = signal.Signals(-code).name
         hint = "Its log has what it said last; run out of memory is what SIGKILL mostly means."
-        return Ending(128 - code, f"The command died of {name}.", hint)
+        return TryResult(128 - code, f"The command died of {name}.", hint)
     if code == 0:
-        return Ending(0)
+        return TryResult(0)
     error = _error(told)
     message = str(error.get("message", "")) or f"It ended with exit code {code}."
-    return Ending(code, message, str(error.get("hint", "")), code in HOPELESS and not _may_pass(events))
+    return TryResult(code, message, str(error.get("hint", "")), code in HOPELESS and not _may_pass(events))
 
 
 def _may_pass(events: Path) -> bool:
     """Whether it failed for photos that were changed, or gone for a while, as they are on a network disk."""
-    culprit = read_story(events, running=False).culprit
+    culprit = read_history(events, running=False).culprit
     return culprit is not None and culprit.state == "failed" and not culprit.lasting
 
 

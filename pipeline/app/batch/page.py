@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 from markupsafe import Markup
 
 from splatpipe.pipeline.app.batch.state import FINISHED, STALE_S, BatchState, CaptureState, Level, State
-from splatpipe.pipeline.app.page_file import page_text, relative_link, shown
-from splatpipe.pipeline.app.places import Places
+from splatpipe.pipeline.app.page_file import page_text, printable, relative_link
+from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.app.report.wording import duration, plural, roughly, size
 from splatpipe.pipeline.app.thumbnails import Thumbnail, thumbnail
 from splatpipe.pipeline.engine.durable import write_durably
@@ -114,7 +114,7 @@ def batch_page(state: BatchState, folder: Path) -> str:
     return page_text(
         TEMPLATES,
         "batch.html.j2",
-        Places.of(folder),
+        PathLabels.of(folder),
         style="batch.css",
         script="batch.js" if state.at_work else None,
         name=state.name,
@@ -185,7 +185,7 @@ def _card(capture: CaptureState, folder: Path, side: int) -> Card:
     reason, *more = [line.strip() for line in capture.reason.splitlines() if line.strip()] or [""]
     begun = capture.state != "waiting" or capture.progress > 0.0
     return Card(
-        name=shown(capture.name),
+        name=printable(capture.name),
         state=capture.state,
         picture=_picture(capture.picture, folder, side),
         stage=STAGE_WORDS.get(capture.state, "").format(capture.stage) if capture.stage and begun else "",

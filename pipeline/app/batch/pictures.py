@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.app.report.holdings import open_holdings
+from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.thumbnails import thumbnail
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -56,9 +56,9 @@ def capture_picture(out: Path, photos: Path, kept: Path) -> Path | None:
 def _render(out: Path) -> tuple[Path, int] | None:
     """Of the held-out views that are like their photos the one with most to see, and how to turn it."""
     try:
-        holdings = open_holdings(out)
-        folder = holdings.part("evaluate.views")
-        views: Sequence[Mapping[str, Any]] = holdings.read("evaluate.metrics").get("per_view", [])
+        inputs = read_report_inputs(out)
+        folder = inputs.part("evaluate.views")
+        views: Sequence[Mapping[str, Any]] = inputs.read("evaluate.metrics").get("per_view", [])
         if folder is None or not views:
             return None
         views = sorted(views, key=_likeness, reverse=True)
@@ -68,7 +68,7 @@ def _render(out: Path) -> tuple[Path, int] | None:
         if not good:
             return None
         path, view = max(good, key=lambda render: render[0].stat().st_size)
-        photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
+        photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
         turned = {photo["name"]: int(photo.get("orientation") or 1) for photo in photos}
         return path, turned.get(view["name"], 1)
     except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # of a run that is not whole yet

@@ -73,7 +73,7 @@ class PlannedCapture:
 
 
 @dataclass(frozen=True)
-class Plan:
+class BatchPlan:
     """What a call is to do.
 
     Attributes:
@@ -206,12 +206,12 @@ class Call:
             return {}
         return told
 
-    def write_plan(self, plan: Plan) -> None:
+    def write_plan(self, plan: BatchPlan) -> None:
         write_durably(self.folder / PLAN_FILE, json.dumps(asdict(plan), indent=1))
 
-    def plan(self) -> Plan:
+    def plan(self) -> BatchPlan:
         told = json.loads((self.folder / PLAN_FILE).read_text(encoding="utf-8"))
-        return Plan(**{**told, "captures": tuple(_capture(each) for each in told["captures"]), **_tuples(told)})
+        return BatchPlan(**{**told, "captures": tuple(_capture(each) for each in told["captures"]), **_tuples(told)})
 
     def write_end(self, ended_s: float, exit_code: int | None, message: str) -> None:
         told = {"ended_s": ended_s, "exit_code": exit_code, "message": message}

@@ -10,22 +10,22 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.capture_list import Capture
-from splatpipe.pipeline.app.batch.plan import Call, Plan, PlannedCapture
+from splatpipe.pipeline.app.batch.capture_list import ListedCapture
+from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture
 from splatpipe.pipeline.app.batch.shards import MEMORY_MARGIN, NOTHING, missing_shards, shard_jobs, stage_job
 from splatpipe.pipeline.app.cli_runs import Overrides, request_of
 from splatpipe.pipeline.app.preflight.sizing import size_of
 from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
-from splatpipe.pipeline.app.report.story import read_story
+from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
-from splatpipe.pipeline.engine.line import Line, Standing, survey
+from splatpipe.pipeline.engine.line import Line, StageStatus, line_status
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
-from splatpipe.pipeline.engine.session import Request, survey_line
+from splatpipe.pipeline.engine.session import Request, status_of
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Shard, stage_name
 from splatpipe.pipeline.engine.store import Part, is_copy
@@ -64,7 +64,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class _Outlook:
+class _CaptureForecast:
     """A capture before threads are divided.
 
     Attributes:
@@ -82,7 +82,7 @@ class _Outlook:
     shards: Mapping[str, Sequence[Shard]] = field(default_factory=dict)
 
 
-def make_plan(captures: Sequence[Capture], call: Call, settings: Settings) -> Plan:
+def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings) -> BatchPlan:
     """Look at every capture and say what is to be done; nothing is run, and no capture's trouble is another's.
 
     Args:
@@ -99,7 +99,7 @@ def make_plan(captures: Sequence[Capture], call: Call, settings: Settings) -> Pl
     for outlook in outlooks:
         if outlook.shards:
             call.write_shards(outlook.planned.key, shard_jobs(outlook.shards, outlook.foresee(threads), threads))
-    return Plan(
+    return BatchPlan(
         out=str(call.out),
         began_s=began_s,
         captures=planned,
@@ -115,20 +115,20 @@ def _slug(name: str) -> str:
     return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-")[:LONGEST_SLUG]
 
 
-def _look(capture: Capture, key: str, call: Call, settings: Settings) -> _Outlook:
+def _look(capture: ListedCapture, key: str, call: Call, settings: Settings) -> _CaptureForecast:
     planned = PlannedCapture(capture.name, key, str(capture.photos), capture.preset or settings.preset)
     try:
         if capture.trouble is not None:
             raise capture.trouble
         return _outlook(capture, planned, call, settings)
     except SplatpipeError as error:
-        return _Outlook(replace(planned, message=error.message, hint=error.hint))
+        return _CaptureForecast(replace(planned, message=error.message, hint=error.hint))
     except OSError as error:
         trouble = MachineError(f"Cannot read {error.filename or capture.photos}: {error.strerror}.", "Check the disk.")
-        return _Outlook(replace(planned, message=trouble.message, hint=trouble.hint))
+        return _CaptureForecast(replace(planned, message=trouble.message, hint=trouble.hint))
 
 
-def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Settings) -> _Outlook:
+def _outlook(capture: ListedCapture, planned: PlannedCapture, call: Call, settings: Settings) -> _CaptureForecast:
     tables = (*settings.tables, *capture.tables)
     config = Overrides(tables).resolve(load_preset(planned.preset))
     request = request_of(capture.photos.absolute(), call.out / capture.name, config)
@@ -140,9 +140,9 @@ def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Se
     path = call.config_file(planned.key)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_durably(path, dump(merge(tables)))
-    standings = _standings(request, needed)
-    names = _to_run(request, needed, standings)
-    first = next((each for each in standings if each.stage.name in names and each.artifact is None), None)
+    statuses = _statuses(request, needed)
+    names = _to_run(request, needed, statuses)
+    first = next((each for each in statuses if each.stage.name in names and each.artifact is None), None)
     if first is not None and not settings.retry_failed:
         planned = _with_kept_failure(planned, first, request.out)
     if names and not planned.message:
@@ -150,9 +150,9 @@ def _outlook(capture: Capture, planned: PlannedCapture, call: Call, settings: Se
     memory = available_memory_bytes() if settings.local else 0
     foresee = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
     # Where the stage that counts them is to run, it says how many there are then.
-    counted = [each for each in standings if each.stage.name in names] if first else []
+    counted = [each for each in statuses if each.stage.name in names] if first else []
     shards = {} if planned.message else missing_shards(counted)
-    return _Outlook(planned, tuple(needed), () if planned.message else names, foresee, shards)
+    return _CaptureForecast(planned, tuple(needed), () if planned.message else names, foresee, shards)
 
 
 def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCapture:
@@ -165,49 +165,49 @@ def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCaptu
     return planned
 
 
-def _standings(request: Request, needed: Sequence[str]) -> list[Standing]:
+def _statuses(request: Request, needed: Sequence[str]) -> list[StageStatus]:
     if not (request.out / "stages").is_dir():
         return []
-    return [standing for standing in survey(*survey_line(request)) if standing.stage.name in needed]
+    return [status for status in line_status(*status_of(request)) if status.stage.name in needed]
 
 
-def _to_run(request: Request, needed: Sequence[str], standings: Sequence[Standing]) -> tuple[str, ...]:
+def _to_run(request: Request, needed: Sequence[str], statuses: Sequence[StageStatus]) -> tuple[str, ...]:
     """Stages that are not valid; the last one where all are, but not all of what it delivered lies in OUT.
 
     Before shards comes the stage that counts them, a moment's work where it is valid: it leaves the options for them.
     """
-    if not standings:
+    if not statuses:
         return tuple(needed)
-    names = {standing.stage.name for standing in standings if standing.artifact is None}
+    names = {status.stage.name for status in statuses if status.artifact is None}
     if names:
         divided = (stage.shards for stage in request.stages if stage.name in names and stage.shards is not None)
         names |= {stage_name(shards.counted_by) for shards in divided}
         return tuple(name for name in needed if name in names)
     delivered = all(
         (request.out / name).is_file() and is_copy(file, request.out / name)
-        for standing in standings
-        if standing.artifact is not None
-        for name, file in standing.artifact.deliverables(standing.stage).items()
+        for status in statuses
+        if status.artifact is not None
+        for name, file in status.artifact.deliverables(status.stage).items()
     )
     return () if delivered else (needed[-1],)
 
 
-def _with_kept_failure(planned: PlannedCapture, first: Standing, out: Path) -> PlannedCapture:
+def _with_kept_failure(planned: PlannedCapture, first: StageStatus, out: Path) -> PlannedCapture:
     """A stage that could do nothing with its input gets the same input: what it said then holds, and nothing runs."""
-    for standing in (first, *first.shards):
-        for path in (out / EVENTS_FILE, shard_events(out, standing.stage.name)):
-            story = read_story(path, running=is_locked(out))
-            culprit = story.culprit
-            alike = story.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
+    for status in (first, *first.shards):
+        for path in (out / EVENTS_FILE, shard_events(out, status.stage.name)):
+            history = read_history(path, running=is_locked(out))
+            culprit = history.culprit
+            alike = history.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
             if culprit is None or culprit.state != "failed" or not culprit.lasting or not alike:
                 continue
-            if (culprit.name, culprit.key) == (standing.stage.name, standing.key):
+            if (culprit.name, culprit.key) == (status.stage.name, status.key):
                 hint = f"{culprit.hint} {UNTRIED}".strip()
                 return replace(planned, message=culprit.message, hint=hint, stage=culprit.name)
     return planned
 
 
-def _threads(outlooks: Sequence[_Outlook], *, local: bool) -> int:
+def _threads(outlooks: Sequence[_CaptureForecast], *, local: bool) -> int:
     """Threads of a job: the machine divided by the captures that can be under way at once.
 
     Many captures side by side are done sooner than one after the other with all threads, of which some always wait.
@@ -223,7 +223,7 @@ def _threads(outlooks: Sequence[_Outlook], *, local: bool) -> int:
     return max(1, cores // max(1, min(len(peaks), fitting, cores)))
 
 
-def _of(outlook: _Outlook, threads: int, names: Sequence[str]) -> dict[str, Need]:
+def _of(outlook: _CaptureForecast, threads: int, names: Sequence[str]) -> dict[str, Need]:
     """What stages need; one that the forecast does not know costs next to nothing."""
     foreseen = outlook.foresee(threads)
     return {name: foreseen.get(name, NOTHING) for name in names}
@@ -233,7 +233,7 @@ def _memory(need: Need) -> int:
     return need.memory_bytes
 
 
-def _with_jobs(outlook: _Outlook, threads: int) -> PlannedCapture:
+def _with_jobs(outlook: _CaptureForecast, threads: int) -> PlannedCapture:
     needs = _of(outlook, threads, outlook.needed)
     jobs = tuple(stage_job(name, needs[name], threads) for name in outlook.names)
     return replace(outlook.planned, jobs=jobs, weights={name: need.seconds(threads) for name, need in needs.items()})

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from splatpipe.pipeline.app.batch.plan import Call, StageJob
 from splatpipe.pipeline.app.cli_runs import existing
-from splatpipe.pipeline.engine.line import Standing, survey
+from splatpipe.pipeline.engine.line import StageStatus, line_status
 from splatpipe.pipeline.engine.needs import Need, of_shard
-from splatpipe.pipeline.engine.session import survey_line
+from splatpipe.pipeline.engine.session import status_of
 from splatpipe.pipeline.engine.stage import Shard, Stage, stage_name
 
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
@@ -21,16 +21,16 @@ def stage_job(name: str, need: Need, threads: int) -> StageJob:
     return StageJob(name, threads, memory, need.seconds(threads), need.disk_bytes + need.scratch_bytes)
 
 
-def missing_shards(standings: Iterable[Standing]) -> dict[str, list[Shard]]:
+def missing_shards(statuses: Iterable[StageStatus]) -> dict[str, list[Shard]]:
     """Shards that are still to be made, by stage, of stages whose number of shards is known."""
     return {
-        standing.stage.name: [
-            Shard(number, len(standing.shards))
-            for number, shard in enumerate(standing.shards, 1)
-            if shard.artifact is None and standing.artifact is None
+        status.stage.name: [
+            Shard(number, len(status.shards))
+            for number, shard in enumerate(status.shards, 1)
+            if shard.artifact is None and status.artifact is None
         ]
-        for standing in standings
-        if standing.stage.shards is not None and (standing.shards or standing.state != "waiting")
+        for status in statuses
+        if status.stage.shards is not None and (status.shards or status.state != "waiting")
     }
 
 
@@ -66,6 +66,6 @@ def tell_shards(call: Call, key: str, threads: int) -> None:
         threads: Of a job.
     """
     request = existing(call.out / call.plan().capture(key).name)
-    standings = list(survey(*survey_line(request)))
-    summaries = {each.stage.name: each.artifact.summary for each in standings if each.artifact is not None}
-    call.write_shards(key, shard_jobs(missing_shards(standings), request.foresee(summaries), threads))
+    statuses = list(line_status(*status_of(request)))
+    summaries = {each.stage.name: each.artifact.summary for each in statuses if each.artifact is not None}
+    call.write_shards(key, shard_jobs(missing_shards(statuses), request.foresee(summaries), threads))

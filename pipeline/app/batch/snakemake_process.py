@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.job import end_with_parent
-from splatpipe.pipeline.app.batch.plan import MEGABYTE, Call, Plan
+from splatpipe.pipeline.app.batch.plan import MEGABYTE, BatchPlan, Call
 from splatpipe.pipeline.app.batch.workflow import SNAKEFILE
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
@@ -82,7 +82,7 @@ def require_snakemake() -> None:
         raise MachineError("Snakemake is not installed.", hint="Install it: pip install 'splatpipe[batch]'.")
 
 
-def snakemake_command(call: Call, plan: Plan, profile: Profile) -> list[str]:
+def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str]:
     """The command that runs a call's workflow."""
     command = [sys.executable, "-m", "splatpipe.pipeline.app.batch.snakemake_process"]
     command += ["--snakefile", str(call.folder / SNAKEFILE)]
@@ -108,7 +108,7 @@ def snakemake_environment(call: Call) -> dict[str, str]:
     return {**nobody, **environment, "XDG_CACHE_HOME": str(call.folder / "cache")}
 
 
-def start_snakemake(call: Call, plan: Plan, profile: Profile) -> subprocess.Popen[bytes]:
+def start_snakemake(call: Call, plan: BatchPlan, profile: Profile) -> subprocess.Popen[bytes]:
     """Begin a call's workflow; the terminal's Ctrl-C does not reach it."""
     with call.snakemake_log.open("ab") as log:
         return subprocess.Popen(

@@ -18,7 +18,7 @@ NO_WORD = "It ended without a word: its process was killed, as a system does tha
 
 
 @dataclass(frozen=True)
-class Ending:
+class TryResult:
     """How a go at a stage ended; the fields are those of ``Try``."""
 
     exit_code: int
@@ -111,7 +111,7 @@ class TryLog:
         self._append({"begun": asdict(begun)})
         return begun
 
-    def end(self, ending: Ending) -> None:
+    def end(self, ending: TryResult) -> None:
         """Tell how what was begun last ended."""
         self._append({"ended": {"ended_s": time.time(), **asdict(ending)}})
 

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.plan import SHARDS_FOLDER, Call, Plan
+from splatpipe.pipeline.app.batch.plan import SHARDS_FOLDER, BatchPlan, Call
 from splatpipe.pipeline.app.batch.shards import counts_shards
 from splatpipe.pipeline.engine.stage import JSON, Stage, stage_name
 
@@ -78,7 +78,7 @@ _RULE = """
 """
 
 
-def workflow_text(call: Call, plan: Plan, stages: Sequence[Stage]) -> str:
+def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
     """The Snakefile of a plan.
 
     Args:
@@ -122,11 +122,11 @@ def _shard_rule(stage: str, rule: Mapping[str, JSON], after: str) -> str:
     return _RULE.format(**rule, **names, kind="rule", after=after, jobs=own)
 
 
-def _gpu(stage: str, plan: Plan) -> str:
+def _gpu(stage: str, plan: BatchPlan) -> str:
     return "        gpu=1,\n" if plan.gpu and stage in GPU_STAGES else ""
 
 
-def write_workflow(call: Call, plan: Plan, stages: Sequence[Stage]) -> Path:
+def write_workflow(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> Path:
     """Write the Snakefile into the call's folder."""
     path = call.folder / SNAKEFILE
     path.write_text(workflow_text(call, plan, stages), encoding="utf-8")

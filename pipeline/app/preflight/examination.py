@@ -25,15 +25,15 @@ from splatpipe.pipeline.app.preflight.findings import (
     worst_first,
 )
 from splatpipe.pipeline.app.preflight.intake import LEAST_PHOTOS, Intake, take_in
-from splatpipe.pipeline.app.preflight.look import find_blurred, find_copies, find_exposures, sharpness
 from splatpipe.pipeline.app.preflight.overlap import (
-    Overlap,
+    MatchGraph,
     flight_of,
     gap_findings,
     match_quickly,
     overlap_findings,
     swap_findings,
 )
+from splatpipe.pipeline.app.preflight.photo_quality import find_blurred, find_copies, find_exposures, sharpness
 from splatpipe.pipeline.app.preflight.places import (
     control_findings,
     focal_findings,
@@ -44,7 +44,7 @@ from splatpipe.pipeline.app.preflight.places import (
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
 from splatpipe.pipeline.engine.needs import whole
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.engine.source import Source, open_source
+from splatpipe.pipeline.engine.source import RunSource, open_source
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.comparison import brighter_ev, duller
@@ -54,11 +54,11 @@ from splatpipe.pipeline.sfm.quick_match import QuickFeatures, glimpse
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
 
-NOTHING = Overlap({}, ())
+NOTHING = MatchGraph({}, ())
 
 
 @dataclass(frozen=True)
-class Look:
+class PhotoExamination:
     """What the photos themselves say.
 
     Attributes:
@@ -71,7 +71,7 @@ class Look:
     """
 
     findings: tuple[Finding, ...]
-    overlap: Overlap
+    overlap: MatchGraph
     gaps: tuple[Gap, ...]
     sharpness: Float64[np.ndarray, " n"]
     brighter_ev: Float64[np.ndarray, " n"]
@@ -99,7 +99,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     # No OUT is written: any folder that does not lie in the photos stands for one.
     source = open_source(photos, folder.parent / f"{folder.name}-out", LINE, config)
     intake, findings = take_in(source, config, threads, report)
-    look = look_at(intake, threads, report)
+    look = examine_photos(intake, threads, report)
     control, told = _control(source, config, intake)
     findings += [*look.findings, *focal_findings(intake), *told]
     if (boundary := source.part_path("source.boundary")).is_file():
@@ -123,12 +123,12 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     )
 
 
-def look_at(intake: Intake, threads: int, report: Reporter) -> Look:
+def examine_photos(intake: Intake, threads: int, report: Reporter) -> PhotoExamination:
     """Read the photos, match them quickly, and compare them where they match."""
     count = len(intake.photos)
     unknown = np.full(count, np.nan)
     if count < LEAST_PHOTOS:
-        return Look((), NOTHING, (), unknown, unknown, (float("nan"),) * count)
+        return PhotoExamination((), NOTHING, (), unknown, unknown, (float("nan"),) * count)
     names = [photo.name for photo in intake.photos]
     glimpses: list[QuickFeatures] = []
     with single_threaded_opencv():
@@ -150,10 +150,10 @@ def look_at(intake: Intake, threads: int, report: Reporter) -> Look:
         *missing,
     ]
     levels = tuple(found.brightness.mean_level for found in glimpses)
-    return Look(tuple(findings), overlap, tuple(gaps), sharpness(dull), steps, levels)
+    return PhotoExamination(tuple(findings), overlap, tuple(gaps), sharpness(dull), steps, levels)
 
 
-def _control(source: Source, config: LineConfig, intake: Intake) -> tuple[tuple[ControlPlace, ...], list[Finding]]:
+def _control(source: RunSource, config: LineConfig, intake: Intake) -> tuple[tuple[ControlPlace, ...], list[Finding]]:
     path = source.part_path("source.control")
     bars = scale_bar_findings(source.part_path("source.scale_bars"))
     if not path.is_file():
@@ -169,7 +169,7 @@ def forecast_presets(
     """What a run with each preset would need, and whether this machine has it."""
     from splatpipe.stages.costs import REFERENCE
     from splatpipe.stages.forecast import machine_speed, needs_of
-    from splatpipe.stages.work import CaptureSize, Work
+    from splatpipe.stages.work import CaptureSize, CaptureWork
 
     disk = shutil.disk_usage(Path.cwd())
     machine = MachineFacts(available_memory_bytes(), available_cores(), disk.free)
@@ -181,7 +181,7 @@ def forecast_presets(
     speed = machine_speed()
     told = []
     for preset, config in configs.items():
-        work = Work.of(size, config, REFERENCE, threads, machine.memory_bytes)
+        work = CaptureWork.of(size, config, REFERENCE, threads, machine.memory_bytes)
         need, blocks = whole(needs_of(work, speed)), work.blocks
         disk_bytes = need.disk_bytes + need.scratch_bytes
         lacking = []
@@ -205,7 +205,7 @@ def forecast_presets(
     return tuple(told), machine
 
 
-def _facts(intake: Intake, look: Look) -> tuple[PhotoFacts, ...]:
+def _facts(intake: Intake, look: PhotoExamination) -> tuple[PhotoFacts, ...]:
     places = intake.layout.positions_m
     partners = look.overlap.partners(len(intake.photos))
     return tuple(

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatpipe.pipeline.app.page_file import shown
+from splatpipe.pipeline.app.page_file import printable
 from splatpipe.pipeline.app.preflight.findings import Finding, PhotoFacts, Preflight
 from splatpipe.pipeline.app.report.wording import number
 from splatpipe.pipeline.app.thumbnails import Thumbnail, cut_out, thumbnail
@@ -99,7 +99,7 @@ def _pictured(
     picture = None
     if inside:
         picture = cut_out(path, *CUT) if close else thumbnail(path, SIDE)
-    return FindingPicture(shown(name), picture, facts_in_words(finding, photo), beside)
+    return FindingPicture(printable(name), picture, facts_in_words(finding, photo), beside)
 
 
 def _sharp_neighbour(preflight: Preflight, name: str) -> PhotoFacts | None:

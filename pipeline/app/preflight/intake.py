@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.app.preflight.findings import Finding, LeftOutPhoto
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.source import Source
+from splatpipe.pipeline.engine.source import RunSource
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.photos.camera_doubts import camera_doubts
 from splatpipe.pipeline.photos.camera_groups import CameraGroup, group_cameras
@@ -56,7 +56,7 @@ class Intake:
     layout: Layout
 
 
-def take_in(source: Source, config: LineConfig, threads: int, report: Reporter) -> tuple[Intake, list[Finding]]:
+def take_in(source: RunSource, config: LineConfig, threads: int, report: Reporter) -> tuple[Intake, list[Finding]]:
     """Check every photo whole, and what their metadata say.
 
     Args:
@@ -130,7 +130,7 @@ def _layout(
 
 
 def _file_places(
-    source: Source, config: LineConfig, photos: Sequence[CheckedPhoto]
+    source: RunSource, config: LineConfig, photos: Sequence[CheckedPhoto]
 ) -> tuple[Mapping[str, FilePlace], list[Finding]]:
     """What the file of positions says, where there is one; a run would end with what is wrong with it."""
     path = source.part_path("source.geo")

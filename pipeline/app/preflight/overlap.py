@@ -37,7 +37,7 @@ OUTLINE_SHARE = 0.35  # of a gap's length: half the width that is drawn for it
 
 
 @dataclass(frozen=True)
-class Overlap:
+class MatchGraph:
     """What the quick match found.
 
     Attributes:
@@ -62,7 +62,9 @@ class Overlap:
         return own
 
 
-def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: int, report: Reporter) -> Overlap:
+def match_quickly(
+    layout: Layout, glimpses: Sequence[QuickFeatures], threads: int, report: Reporter
+) -> MatchGraph:
     """Match neighbours by what is known of the photos, look-alikes, and more of them for those that find no partner."""
     count = len(layout)
 
@@ -83,7 +85,7 @@ def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: in
         more = nearest(lonely, alike(), AGAIN) - pairs
         found |= match_glimpses(glimpses, more, threads)
     report.progress(1, 1, "matching quickly", "rounds")
-    return Overlap(found, pieces_of(found, count))
+    return MatchGraph(found, pieces_of(found, count))
 
 
 def pieces_of(found: Mapping[Pair, InlierMatches], count: int) -> tuple[tuple[int, ...], ...]:
@@ -95,7 +97,7 @@ def pieces_of(found: Mapping[Pair, InlierMatches], count: int) -> tuple[tuple[in
     return tuple(sorted((tuple(piece) for piece in pieces.values()), key=lambda piece: (-len(piece), piece)))
 
 
-def overlap_findings(names: Sequence[str], overlap: Overlap) -> list[Finding]:
+def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]:
     """Orphans, pieces, and overlap that is thin throughout."""
     count = len(names)
     pieces = overlap.pieces
@@ -126,7 +128,7 @@ def overlap_findings(names: Sequence[str], overlap: Overlap) -> list[Finding]:
     return findings
 
 
-def flight_of(layout: Layout, overlap: Overlap) -> PositionEvidence:
+def flight_of(layout: Layout, overlap: MatchGraph) -> PositionEvidence:
     """The way of the flight; without places where these scatter no wider than their errors."""
     places = layout.positions_m if positions_tell(layout) else np.full_like(layout.positions_m, np.nan)
     return PositionEvidence(places, layout.times, overlap.matches)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
-from splatpipe.pipeline.app.page_file import shown, told
+from splatpipe.pipeline.app.page_file import one_line, printable
 from splatpipe.pipeline.app.preflight.coverage import covered, shades
 from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
@@ -30,7 +30,7 @@ LONGEST_TITLE = 120  # characters of a name that a pointer is told
 
 
 @dataclass(frozen=True)
-class Drawing:
+class OverlapMap:
     """A map.
 
     Attributes:
@@ -68,7 +68,7 @@ class Labels:
         return True
 
 
-def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> Drawing | None:
+def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> OverlapMap | None:
     """Draw a capture.
 
     Args:
@@ -107,7 +107,7 @@ def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> Drawing | 
         "photos": "photos",
         "control": "control points",
     }
-    return Drawing(
+    return OverlapMap(
         svg=_svg(
             size, _summary(preflight, kind), len(places) > MANY, groups + (_scale(frame) if frame is not None else "")
         ),
@@ -129,13 +129,13 @@ def _svg(size: tuple[int, int], summary: str, many: bool, inner: str) -> Markup:
 def _summary(preflight: Preflight, kind: str) -> str:
     """What the picture shows, for those who cannot see it."""
     what = "Map of the photos" if kind == "map" else "The photos in a ring, in the order of their names"
-    told = [plural(len(preflight.photos), "photo"), plural(len(preflight.pairs), "pair") + " compared"]
-    told += [plural(len(preflight.gaps), "gap"), plural(len(preflight.orphans), "photo") + " that match no other"]
-    return f"{what}: {', '.join(told)}."
+    parts = [plural(len(preflight.photos), "photo"), plural(len(preflight.pairs), "pair") + " compared"]
+    parts += [plural(len(preflight.gaps), "gap"), plural(len(preflight.orphans), "photo") + " that match no other"]
+    return f"{what}: {', '.join(parts)}."
 
 
 def _path(name: str, d: str, title: str = "") -> str:
-    inner = f"<title>{escape(told(title))}</title>" if title else ""
+    inner = f"<title>{escape(one_line(title))}</title>" if title else ""
     return f'<path class="{name}" d="{d}">{inner}</path>' if d else ""
 
 
@@ -195,7 +195,7 @@ def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtfu
     drawn: dict[str, list[str]] = {"plain": [], "doubtful": [], "apart": [], "orphan": []}
     for i, (x, y) in places.items():
         photo = preflight.photos[i]
-        title = shown(photo.name)[:LONGEST_TITLE]
+        title = printable(photo.name)[:LONGEST_TITLE]
         kind = "plain"
         if photo.name in doubtful:
             kind, title = "doubtful", f"{title}: {doubtful[photo.name]}"
@@ -216,7 +216,7 @@ def _control(frame: MapFrame, preflight: Preflight) -> str:
     for point in preflight.control:
         inside = frame.holds(point.position_m)
         x, y = frame.point(point.position_m) if inside else frame.at_edge(point.position_m)
-        name = shown(point.name)[:LONGEST_TITLE]
+        name = printable(point.name)[:LONGEST_TITLE]
         title = f"{point.kind} point {name}"
         if not inside:
             off = math.dist(point.position_m, (frame.west + frame.metres / 2, frame.north - _tall(frame) / 2))

@@ -10,8 +10,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from splatpipe.pipeline.app.page_file import page_text, shown
-from splatpipe.pipeline.app.places import Places
+from splatpipe.pipeline.app.page_file import page_text, printable
+from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.app.preflight.finding_pictures import FindingPicture, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, PresetForecast, Severity
 from splatpipe.pipeline.app.preflight.overlap_map import overlap_map
@@ -27,7 +27,7 @@ SIGNS = {"bad": "✗", "doubt": "!", "note": "i"}
 
 
 @dataclass(frozen=True)
-class Told:
+class FindingCard:
     """A finding as it is drawn.
 
     Attributes:
@@ -69,11 +69,11 @@ def check_page(preflight: Preflight) -> str:
     """
     level, headline, text = _verdict(preflight)
     pictures = finding_pictures(preflight)
-    findings = [_told(it, shown_of) for it, shown_of in zip(preflight.findings, pictures, strict=True)]
+    findings = [_card(it, shown_of) for it, shown_of in zip(preflight.findings, pictures, strict=True)]
     return page_text(
         TEMPLATES,
         "check.html.j2",
-        Places.of(preflight.folder, preflight.folder),
+        PathLabels.of(preflight.folder, preflight.folder),
         style="check.css",
         name=preflight.folder.resolve().name or "photos",
         version=importlib.metadata.version("splatpipe"),
@@ -125,10 +125,10 @@ def _named(forecast: PresetForecast) -> str:
     return forecast.preset if forecast.blocks == 1 else f"{forecast.preset}, in {forecast.blocks} blocks"
 
 
-def _told(finding: Finding, pictures: list[FindingPicture]) -> Told:
+def _card(finding: Finding, pictures: list[FindingPicture]) -> FindingCard:
     level = LEVELS[finding.severity]
-    names = [shown(name) for name in finding.photos]
-    return Told(finding, level, SIGNS[level], pictures, names[:MOST_NAMES], max(0, len(names) - MOST_NAMES))
+    names = [printable(name) for name in finding.photos]
+    return FindingCard(finding, level, SIGNS[level], pictures, names[:MOST_NAMES], max(0, len(names) - MOST_NAMES))
 
 
 def _doubts(preflight: Preflight) -> dict[str, str]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
-from splatpipe.pipeline.engine.source import Source
+from splatpipe.pipeline.engine.source import RunSource
 from splatpipe.pipeline.photos.names import is_photo
 from splatpipe.stages.forecast import has_control
 from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
@@ -16,7 +16,7 @@ from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
 SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly alike
 
 
-def size_of(source: Source) -> CaptureSize:
+def size_of(source: RunSource) -> CaptureSize:
     """The size of a user's folder of photos."""
     paths = [path for path in source.part_files["source.photos"].values() if is_photo(path)]
     found = capture_size(paths, has_file=source.named.get("source.geo") is not None)

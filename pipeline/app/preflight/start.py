@@ -49,7 +49,7 @@ def require_memory(request: Request) -> None:
         )
 
 
-def told_beforehand(request: Request) -> str:
+def forecast_text(request: Request) -> str:
     """What the whole line takes of this machine, in a sentence; empty where nothing is known of the capture."""
     from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.app.report.wording import roughly
@@ -58,7 +58,7 @@ def told_beforehand(request: Request) -> str:
     from splatpipe.pipeline.engine.source import open_source
     from splatpipe.stages.costs import REFERENCE
     from splatpipe.stages.forecast import machine_speed, needs_of
-    from splatpipe.stages.work import Work
+    from splatpipe.stages.work import CaptureWork
 
     config, threads = cast("LineConfig", request.config), request.machine.threads
     source = open_source(request.photos, request.out, request.stages, config)
@@ -66,7 +66,7 @@ def told_beforehand(request: Request) -> str:
     if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request):
         return ""
     memory = available_memory_bytes()
-    work = Work.of(size, config, REFERENCE, threads, memory)
+    work = CaptureWork.of(size, config, REFERENCE, threads, memory)
     needs = needs_of(work, machine_speed())
     need = whole(needs)
     seconds = sum(each.seconds(threads) for each in needs.values())
@@ -79,13 +79,13 @@ def told_beforehand(request: Request) -> str:
     training = sum(needs[stage].seconds(threads) for stage in ("blocks", "train"))
     told += f": training {roughly(training)}, {work.iterations:,} iterations"
     if work.blocks is not None:
-        told += f", {told_of_blocks(work.blocks)}"
+        told += f", {blocks_text(work.blocks)}"
     elif config.train.max_memory_bytes and work.most_gaussians < work.grown:
         told += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos ask for more"
     return f"{told}."
 
 
-def told_of_blocks(blocks: BlockWork) -> str:
+def blocks_text(blocks: BlockWork) -> str:
     """How a scene is cut, and what a block takes, in words."""
     division = blocks.division
     told = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians and "

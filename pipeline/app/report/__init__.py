@@ -36,11 +36,11 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
         OSError: if it cannot be written.
         MachineError: if this installation lacks the page's script or style.
     """
-    from splatpipe.pipeline.app.report.holdings import open_holdings
     from splatpipe.pipeline.app.report.page import report_page
+    from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 
     path = out / REPORT_FILE
-    write_durably(path, report_page(open_holdings(out), drawn=drawn))
+    write_durably(path, report_page(read_report_inputs(out), drawn=drawn))
     return path
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, length, number, share
 
 if TYPE_CHECKING:
@@ -17,18 +17,18 @@ MOST_LISTED = 200  # rows of a table of photos
 LEAST_POINTS = 100  # observed by a photo that is placed well
 
 
-def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: bool) -> Chapter:
+def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: bool) -> Chapter:
     """What was captured: photos, cameras, positions, map, overlap, and what was left out and why.
 
     Args:
-        holdings: What there is.
+        inputs: What there is.
         geometry: Of the model, if there is one.
         drawn: Whether to draw maps.
     """
-    summary = holdings.summary("ingest")
-    photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
-    left_out = holdings.read("ingest.left_out").get("left_out", [])
-    positions = holdings.read("ingest.positions").get("positions", [])
+    summary = inputs.summary("ingest")
+    photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
+    left_out = inputs.read("ingest.left_out").get("left_out", [])
+    positions = inputs.read("ingest.positions").get("positions", [])
     times = sorted(str(photo["time"]) for photo in photos if photo.get("time"))
     facts = [
         ("Photos", f"{count(summary.get('photos'))} used, {count(summary.get('left_out'))} left out"),
@@ -37,7 +37,7 @@ def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: boo
         ("Positions", _positions(summary, positions)),
         ("Masks", _masks(summary)),
     ]
-    cameras = holdings.read("ingest.cameras").get("cameras", [])
+    cameras = inputs.read("ingest.cameras").get("cameras", [])
     told = summary.get("camera_groups") or [{}] * len(cameras)
     chapter: Chapter = {
         "facts": [fact for fact in facts if fact[1]],
@@ -46,7 +46,7 @@ def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: boo
         "left_out_more": max(0, len(left_out) - MOST_LISTED),
     }
     if geometry is not None:
-        chapter |= _mapped(holdings, geometry)
+        chapter |= _mapped(inputs, geometry)
     elif drawn and len(positions) > 1:
         from splatpipe.pipeline.app.report.charts import stated_map
 
@@ -56,10 +56,10 @@ def capture_chapter(holdings: Holdings, geometry: Geometry | None, *, drawn: boo
     return chapter
 
 
-def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter:
+def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter:
     """How the cameras were found: matches, tracks, reprojection errors, calibration."""
-    sparse, matches, features = (holdings.summary(name) for name in ("sparse", "matches", "features"))
-    models = holdings.read("sparse.summary")
+    sparse, matches, features = (inputs.summary(name) for name in ("sparse", "matches", "features"))
+    models = inputs.read("sparse.summary")
     facts = [
         ("Photos placed", f"{count(sparse.get('registered'))} of {count(sparse.get('photos'))}"),
         ("Keypoints", f"{count(features.get('keypoints'))}, {count(features.get('keypoints_per_photo'))} a photo"),
@@ -84,29 +84,29 @@ def registration_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapt
         "rungs": [_rung(row) for row in sparse.get("ladder", [])],
     }
     if geometry is not None:
-        chapter |= _registration_charts(holdings, geometry)
+        chapter |= _registration_charts(inputs, geometry)
     return chapter
 
 
-def unit_of(holdings: Holdings) -> str:
+def unit_of(inputs: ReportInputs) -> str:
     """``m`` of a model that has its place, ``metres`` of one that has a scale alone, else nothing."""
-    frame = holdings.read("georef.frame")
+    frame = inputs.read("georef.frame")
     if frame.get("kind") == "enu":
         return "m"
     return "metres" if frame.get("metres") else ""
 
 
-def held_out(holdings: Holdings) -> list[str]:
+def held_out(inputs: ReportInputs) -> list[str]:
     """Names of the photos that training never saw, as far as it is known."""
-    return [str(name) for name in holdings.read("split.views").get("held_out", [])]
+    return [str(name) for name in inputs.read("split.views").get("held_out", [])]
 
 
-def _mapped(holdings: Holdings, geometry: Geometry) -> Chapter:
+def _mapped(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     from splatpipe.pipeline.app.report.charts import overlap_map, survey_map
 
-    unit, shares = unit_of(holdings), geometry.overlap.shares
-    gsd = holdings.read("georef.accuracy").get("gsd_m")
-    heights = sorted(float(height) for height in geometry.taken.centres[:, 2] - geometry.ground)
+    unit, shares = unit_of(inputs), geometry.overlap.shares
+    gsd = inputs.read("georef.accuracy").get("gsd_m")
+    heights = sorted(float(height) for height in geometry.photos.centres[:, 2] - geometry.ground)
     west, east, south, north = geometry.box
     facts = [
         (
@@ -127,7 +127,7 @@ def _mapped(holdings: Holdings, geometry: Geometry) -> Chapter:
         ]
     maps = [
         {
-            "svg": survey_map(geometry, unit, held_out(holdings)),
+            "svg": survey_map(geometry, unit, held_out(inputs)),
             "text": "Where the photos were taken, whereto they look, and the ground that each shows (footprint), up to "
             "where its points end; that walls and trees are in the way is not counted.",
         },
@@ -136,10 +136,10 @@ def _mapped(holdings: Holdings, geometry: Geometry) -> Chapter:
     return {"map_facts": facts, "maps": maps}
 
 
-def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
+def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     from splatpipe.pipeline.app.report import charts
 
-    found = holdings.read("matches.pairs")
+    found = inputs.read("matches.pairs")
     pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])]
     drawn = [
         (charts.observations_bars(geometry), f"Photos with fewer than {LEAST_POINTS} points (red) are placed poorly."),
@@ -153,7 +153,7 @@ def _registration_charts(holdings: Holdings, geometry: Geometry) -> Chapter:
         text = "Mean residuals over the picture, much enlarged: a pattern would tell that the lens model does not fit."
         drawn.append((charts.residual_field(field, number_of), text))
     if pairs:
-        drawn.append((charts.match_map(geometry, pairs, unit_of(holdings)), "Which photos were matched with which."))
+        drawn.append((charts.match_map(geometry, pairs, unit_of(inputs)), "Which photos were matched with which."))
     return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
 
 

@@ -28,7 +28,7 @@ from splatpipe.pipeline.app.report.drawing import (
     new_figure,
     to_svg,
 )
-from splatpipe.pipeline.app.report.geometry import Field, Geometry, Overlap
+from splatpipe.pipeline.app.report.geometry import Geometry, OverlapGrid, ResidualField
 
 POINTS_DRAWN = 20_000  # of a cloud: more add nothing at this size
 PAIRS_DRAWN = 3_000  # lines, the strongest
@@ -43,21 +43,21 @@ Residual = tuple[str, Sequence[float], Sequence[float]]  # name; place and resid
 
 def survey_map(geometry: Geometry, unit: str, held_out: Sequence[str]) -> Markup:
     """Where the photos were taken, whereto they look and what ground they show, over the sparse points."""
-    taken, box = geometry.taken, _with_cameras(geometry)
+    photos, box = geometry.photos, _with_cameras(geometry)
     figure, axes = new_figure(*map_size(box))
     _draw_points(axes, geometry)
-    faint = min(0.03, 0.6 / len(taken.names))
-    outlines = PolyCollection(list(taken.footprints), facecolor=(*_rgb(BLUE), faint), edgecolor=(*_rgb(BLUE), 0.18))
+    faint = min(0.03, 0.6 / len(photos.names))
+    outlines = PolyCollection(list(photos.footprints), facecolor=(*_rgb(BLUE), faint), edgecolor=(*_rgb(BLUE), 0.18))
     outlines.set_linewidth(0.5)
     axes.add_collection(outlines)
-    out = np.isin(np.array(taken.names, dtype=object), list(held_out))
+    out = np.isin(np.array(photos.names, dtype=object), list(held_out))
     span = 0.035 * max(box[1] - box[0], box[3] - box[2])
-    heads = taken.centres[:, :2] + span * taken.axes[:, :2]
-    lines = list(np.stack([taken.centres[:, :2], heads], axis=1))
+    heads = photos.centres[:, :2] + span * photos.axes[:, :2]
+    lines = list(np.stack([photos.centres[:, :2], heads], axis=1))
     axes.add_collection(LineCollection(lines, colors=INK, linewidths=0.7))
     for chosen, colour, label in ((~out, BLUE, "photo"), (out, ORANGE, "held-out photo")):
         if chosen.any():
-            axes.plot(*taken.centres[chosen, :2].T, "o", ms=4, mfc=colour, mec="white", mew=0.5, label=label)
+            axes.plot(*photos.centres[chosen, :2].T, "o", ms=4, mfc=colour, mec="white", mew=0.5, label=label)
     axes.legend(loc="upper right", fontsize=8)
     as_map(axes, box, unit)
     return to_svg(figure, "Map of the photos' positions, viewing directions and footprints")
@@ -79,7 +79,7 @@ def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
     return to_svg(figure, "Map of where the photos say that they were taken")
 
 
-def overlap_map(overlap: Overlap, unit: str) -> Markup:
+def overlap_map(overlap: OverlapGrid, unit: str) -> Markup:
     """How many footprints cover each place."""
     figure, axes = new_figure(*map_size(overlap.box), right=1.15)
     norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
@@ -97,16 +97,16 @@ def overlap_map(overlap: Overlap, unit: str) -> Markup:
 
 def match_map(geometry: Geometry, pairs: Sequence[tuple[str, str, int]], unit: str) -> Markup:
     """The verified pairs as lines between the photos, darker with more matches."""
-    box = _about(geometry.taken.centres[:, :2])
+    box = _about(geometry.photos.centres[:, :2])
     figure, axes = new_figure(*map_size(box))
-    places = dict(zip(geometry.taken.names, geometry.taken.centres[:, :2], strict=True))
+    places = dict(zip(geometry.photos.names, geometry.photos.centres[:, :2], strict=True))
     known = [pair for pair in pairs if pair[0] in places and pair[1] in places]
     strongest = sorted(known, key=lambda pair: -pair[2])[:PAIRS_DRAWN][::-1]
     lines = LineCollection([(places[a], places[b]) for a, b, _ in strongest], cmap="Blues", linewidths=0.9)
     lines.set_array(np.log10([max(1, pair[2]) for pair in strongest]))
     lines.set_clim(0.5, 3.0)
     axes.add_collection(lines)
-    axes.plot(*geometry.taken.centres[:, :2].T, "o", ms=3.5, color=INK)
+    axes.plot(*geometry.photos.centres[:, :2].T, "o", ms=3.5, color=INK)
     for matches in (10, 100, 1000):
         colour = lines.cmap(lines.norm(np.log10(matches)))
         axes.plot([], [], "-", color=colour, lw=2.5, label=f"{matches:,} matches")
@@ -118,7 +118,7 @@ def match_map(geometry: Geometry, pairs: Sequence[tuple[str, str, int]], unit: s
 def observations_bars(geometry: Geometry) -> Markup:
     """Sparse points that each photo observes, in name order."""
     figure, axes = new_figure(WIDTH, 2.6)
-    counts = geometry.taken.points
+    counts = geometry.photos.points
     axes.bar(np.arange(len(counts)) + 1, counts, width=0.85, color=np.where(counts < 100, RED, BLUE))
     axes.axhline(float(np.median(counts)), color=FAINT, lw=0.8, ls="--")
     axes.set_xlabel("photo, in name order")
@@ -155,7 +155,7 @@ def error_histogram(geometry: Geometry) -> Markup:
     return to_svg(figure, "Reprojection errors of the sparse points")
 
 
-def residual_field(field: Field, camera: int) -> Markup:
+def residual_field(field: ResidualField, camera: int) -> Markup:
     """Mean residuals over the picture: a pattern tells that the lens model does not fit."""
     width, height = field.size
     figure, axes = new_figure(*map_size((0.0, float(width), 0.0, float(height))))
@@ -254,7 +254,7 @@ def _draw_points(axes: Axes, geometry: Geometry) -> None:
 
 def _with_cameras(geometry: Geometry) -> tuple[float, float, float, float]:
     west, east, south, north = geometry.box
-    low, high = geometry.taken.centres[:, :2].min(axis=0), geometry.taken.centres[:, :2].max(axis=0)
+    low, high = geometry.photos.centres[:, :2].min(axis=0), geometry.photos.centres[:, :2].max(axis=0)
     margin = 0.06 * float(max(high - low))
     return (
         min(west, float(low[0]) - margin),

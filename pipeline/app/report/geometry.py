@@ -30,7 +30,7 @@ LEAST_IN_CELL = 5  # observations, for a mean that says something
 
 
 @dataclass(frozen=True)
-class Taken:
+class RegisteredPhotos:
     """The registered photos, by name.
 
     Attributes:
@@ -49,7 +49,7 @@ class Taken:
 
 
 @dataclass(frozen=True)
-class Field:
+class ResidualField:
     """Mean residuals of the sparse points by their place in one camera's pictures.
 
     Attributes:
@@ -64,7 +64,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Overlap:
+class OverlapGrid:
     """In how many photos' footprints each place lies.
 
     Attributes:
@@ -83,7 +83,7 @@ class Geometry:
     """What the sparse model tells.
 
     Attributes:
-        taken: The photos.
+        photos: The registered photos.
         points: Sparse points in the world, (n, 3).
         colours: Theirs, 0 to 255.
         tracks: In how many photos each was found.
@@ -94,15 +94,15 @@ class Geometry:
         fields: Of each camera with enough observations.
     """
 
-    taken: Taken
+    photos: RegisteredPhotos
     points: Float64[np.ndarray, "m 3"]
     colours: Int64[np.ndarray, "m 3"]
     tracks: Int64[np.ndarray, " m"]
     errors_px: Float64[np.ndarray, " m"]
     box: tuple[float, float, float, float]
     ground: float
-    overlap: Overlap
-    fields: Sequence[Field]
+    overlap: OverlapGrid
+    fields: Sequence[ResidualField]
 
 
 def read_geometry(model_path: Path, frame_path: Path | None) -> Geometry:
@@ -125,16 +125,16 @@ def read_geometry(model_path: Path, frame_path: Path | None) -> Geometry:
     points = similarity.apply(np.array([point.xyz for point in listed], np.float64))
     errors = np.array([point.error for point in listed], np.float64)
     box, ground = _box(points), float(np.percentile(points[:, 2], GROUND_PERCENTILE))
-    taken = _taken(images, points, similarity, ground)
+    photos = _photos(images, points, similarity, ground)
     return Geometry(
-        taken=taken,
+        photos=photos,
         points=points,
         colours=np.array([point.color for point in listed], np.int64),
         tracks=np.array([point.track.length() for point in listed], np.int64),
         errors_px=np.where(errors >= 0.0, errors, np.nan),
         box=box,
         ground=ground,
-        overlap=_overlap(taken.footprints, points, box),
+        overlap=_overlap(photos.footprints, points, box),
         fields=_fields(model, images),
     )
 
@@ -150,9 +150,9 @@ def _box(points: Float64[np.ndarray, "m 3"]) -> tuple[float, float, float, float
     return float(low[0]) - margin, float(high[0]) + margin, float(low[1]) - margin, float(high[1]) + margin
 
 
-def _taken(
+def _photos(
     images: Sequence[pycolmap.Image], points: Float64[np.ndarray, "m 3"], similarity: Similarity, ground: float
-) -> Taken:
+) -> RegisteredPhotos:
     poses = np.stack([np.asarray(image.cam_from_world().matrix(), np.float64) for image in images])
     world_from_cam = similarity.rotation @ poses[:, :, :3].transpose(0, 2, 1)
     centres = similarity.apply(-np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3]))
@@ -163,7 +163,7 @@ def _taken(
         reach = _reach(some, centre, rotation, float(np.linalg.norm(middle - centre)))
         footprints.append(_footprint(_border_rays(image.camera) @ rotation.T, centre, ground, reach))
     counts = np.array([image.num_points3D for image in images], np.int64)
-    return Taken([image.name for image in images], centres, world_from_cam[:, :, 2], counts, footprints)
+    return RegisteredPhotos([image.name for image in images], centres, world_from_cam[:, :, 2], counts, footprints)
 
 
 def _reach(
@@ -204,7 +204,7 @@ def _overlap(
     footprints: Sequence[Float64[np.ndarray, "_ 2"]],
     points: Float64[np.ndarray, "m 3"],
     box: tuple[float, float, float, float],
-) -> Overlap:
+) -> OverlapGrid:
     west, east, south, north = box
     cell = max(east - west, north - south) / GRID_CELLS or 1.0
     columns, rows = max(1, round((east - west) / cell)), max(1, round((north - south) / cell))
@@ -221,10 +221,10 @@ def _overlap(
     there = np.unique(down[inside] * columns + across[inside])
     seen = counts.ravel()[there]
     shares = {least: float((seen >= least).mean()) if len(seen) else 0.0 for least in (1, 3, 5)}
-    return Overlap(counts, box, shares)
+    return OverlapGrid(counts, box, shares)
 
 
-def _fields(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> list[Field]:
+def _fields(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> list[ResidualField]:
     step = max(1, len(images) // FIELD_PHOTOS)
     by_camera: dict[int, list[tuple[Any, Any]]] = {}
     for image in images[::step]:
@@ -243,7 +243,9 @@ def _fields(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) ->
     return [field for field in fields if len(field.places)]
 
 
-def _field(size: tuple[int, int], observed: Float64[np.ndarray, "n 2"], residuals: Float64[np.ndarray, "n 2"]) -> Field:
+def _field(
+    size: tuple[int, int], observed: Float64[np.ndarray, "n 2"], residuals: Float64[np.ndarray, "n 2"]
+) -> ResidualField:
     cell = max(size) / FIELD_CELLS
     columns = int(np.ceil(size[0] / cell))
     good = np.isfinite(residuals).all(axis=1)
@@ -253,4 +255,4 @@ def _field(size: tuple[int, int], observed: Float64[np.ndarray, "n 2"], residual
     sums = np.stack([np.bincount(flat, weights=residuals[good][:, axis]) for axis in range(2)], axis=1)
     full = np.flatnonzero(number >= LEAST_IN_CELL)
     places = np.stack([full % columns + 0.5, full // columns + 0.5], axis=1) * cell
-    return Field(size, places, sums[full] / number[full, None])
+    return ResidualField(size, places, sums[full] / number[full, None])

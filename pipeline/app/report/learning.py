@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, number, share, size
 
 Chapter = dict[str, Any]
@@ -20,45 +20,46 @@ MEASURES = {  # of a held-out photo: title, digits, which way is better
 MOST_ROWS = 200  # of the table of held-out photos
 
 
-def training_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
+def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     """The plan, what came of it, and the curves; None where training was not reached.
 
     Args:
-        holdings: What there is.
+        inputs: What there is.
         drawn: Whether to draw charts.
     """
-    story = holdings.story.stages.get("train")
-    in_blocks = any(name.startswith("train.") for name in holdings.story.stages)
-    if "train" not in holdings.artifacts and (story is None or story.state == "not reached") and not in_blocks:
+    stage = inputs.history.stages.get("train")
+    in_blocks = any(name.startswith("train.") for name in inputs.history.stages)
+    if "train" not in inputs.artifacts and (stage is None or stage.state == "not reached") and not in_blocks:
         return None
-    summary, history = holdings.summary("train"), holdings.read("train.history")
-    plan, split = summary.get("plan") or {}, holdings.read("split.views")
-    trained = story if story is not None and story.told.progress.get("unit") == "iterations" else None  # not decoding
-    planned = summary.get("planned_iterations") or (None if trained is None else trained.told.progress.get("total"))
+    summary, history = inputs.summary("train"), inputs.read("train.history")
+    plan, split = summary.get("plan") or {}, inputs.read("split.views")
+    # not while it decodes photos
+    trained = stage if stage is not None and stage.messages.progress.get("unit") == "iterations" else None
+    planned = summary.get("planned_iterations") or (None if trained is None else trained.messages.progress.get("total"))
     reached = summary.get("iterations") or (None if trained is None else trained.reached)
-    curves = _curves(holdings, history)
+    curves = _curves(inputs, history)
     gaussians = summary.get("gaussians") or _last(curves.get("gaussians", {}))
     facts = [
-        ("Blocks", _blocks(holdings)),
+        ("Blocks", _blocks(inputs)),
         ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
-        ("Gaussians", f"{count(gaussians)}, {count(holdings.summary('initialize').get('gaussians'))} at the beginning"),
-        ("Cleaned", removed_in_words(holdings.summary("clean"))),
+        ("Gaussians", f"{count(gaussians)}, {count(inputs.summary('initialize').get('gaussians'))} at the beginning"),
+        ("Cleaned", removed_in_words(inputs.summary("clean"))),
         (
             "Size of the photos",
             f"{number(summary.get('train_megapixels'), 2)} megapixels",
         ),
         ("Photos", f"{len(split.get('train', []))} trained on, {len(split.get('held_out', []))} held out"),
         ("Last loss", number(summary.get("loss") or _last(curves.get("loss", {})), 4)),
-        ("Time", duration(summary.get("train_seconds") or (story.seconds if story else None))),
-        ("Memory", size(summary.get("peak_memory_bytes") or (story.memory_bytes if story else None))),
+        ("Time", duration(summary.get("train_seconds") or (stage.seconds if stage else None))),
+        ("Memory", size(summary.get("peak_memory_bytes") or (stage.memory_bytes if stage else None))),
         ("Device", " ".join(str(summary[name]) for name in ("device", "instruction_set") if summary.get(name))),
-        ("Seed", _seed(holdings)),
+        ("Seed", _seed(inputs)),
     ]
     if not split:
         facts = [fact for fact in facts if fact[0] != "Photos"]
     chapter: Chapter = {
         "facts": [fact for fact in facts if fact[1] and not fact[1].startswith("–")],
-        "finished": "train" in holdings.artifacts,
+        "finished": "train" in inputs.artifacts,
         "plan": sorted((str(name), str(value)) for name, value in plan.items()),
         "charts": [],
     }
@@ -80,11 +81,11 @@ def removed_in_words(summary: Mapping[str, Any]) -> str:
     return f"{count(sum(reasons.values()))} removed: {why}" if why else "none removed"
 
 
-def views_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
+def views_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     """The held-out photos, the worst first; None where evaluate did not finish."""
-    if "evaluate" not in holdings.artifacts:
+    if "evaluate" not in inputs.artifacts:
         return None
-    metrics = holdings.read("evaluate.metrics")
+    metrics = inputs.read("evaluate.metrics")
     views = sorted(metrics["per_view"], key=lambda view: view["psnr"] if view.get("psnr") is not None else -1.0)
     if "whole" in metrics:  # what shows nothing inside the boundary is not the worst, but no witness
         views = sorted(views, key=lambda view: view.get("psnr") is None)
@@ -102,18 +103,18 @@ def views_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
         "charts": [],
     }
     if drawn and views:
-        chapter |= _views_drawn(holdings, views, measures)
+        chapter |= _views_drawn(inputs, views, measures)
     return chapter
 
 
 def _views_drawn(
-    holdings: Holdings, views: Sequence[Mapping[str, Any]], measures: Sequence[tuple[str, str, int]]
+    inputs: ReportInputs, views: Sequence[Mapping[str, Any]], measures: Sequence[tuple[str, str, int]]
 ) -> Chapter:
     from splatpipe.pipeline.app.report.charts import view_bars
     from splatpipe.pipeline.app.report.pictures import chosen_views, view_pictures
 
-    folder = holdings.part("evaluate.views")
-    photos = holdings.read_in_part("ingest.photos", "photos.json").get("photos", [])
+    folder = inputs.part("evaluate.views")
+    photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
     turned = {str(photo["name"]): int(photo.get("orientation") or 1) for photo in photos}
     shown = []
     for view in chosen_views(views):
@@ -151,7 +152,7 @@ def _floaters(floaters: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _curves(holdings: Holdings, history: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+def _curves(inputs: ReportInputs, history: Mapping[str, Any]) -> dict[str, dict[float, float]]:
     """Loss and Gaussians over the iterations: of the finished training, else as far as its events tell."""
     points = history.get("curve") or []
     if points:
@@ -159,8 +160,8 @@ def _curves(holdings: Holdings, history: Mapping[str, Any]) -> dict[str, dict[fl
         return {
             name: {float(p["iteration"]): float(p[name]) for p in points if p.get(name) is not None} for name in names
         }
-    story = holdings.story.stages.get("train")
-    return {} if story is None else {name: dict(curve) for name, curve in story.told.metrics.items()}
+    stage = inputs.history.stages.get("train")
+    return {} if stage is None else {name: dict(curve) for name, curve in stage.messages.metrics.items()}
 
 
 def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | None) -> list[dict[str, Any]]:
@@ -199,17 +200,17 @@ def _why_earlier(summary: Mapping[str, Any]) -> str:
     return f": the loss was flat {', '.join(told)}" if told else ""
 
 
-def _blocks(holdings: Holdings) -> str:
+def _blocks(inputs: ReportInputs) -> str:
     """How many blocks it was trained in, or how far they are; empty where it is trained whole."""
-    blocks = holdings.summary("blocks").get("blocks", 1)
+    blocks = inputs.summary("blocks").get("blocks", 1)
     if blocks == 1:
         return ""
-    if "train" in holdings.artifacts:
+    if "train" in inputs.artifacts:
         return f"trained in {count(blocks)}, after a coarse pass over the whole"
-    stages = holdings.story.stages.items()
+    stages = inputs.history.stages.items()
     done = [name for name, stage in stages if name.startswith("train.") and stage.state in ("finished", "reused")]
     return f"{count(len(done))} of {count(blocks)} trained"
 
 
-def _seed(holdings: Holdings) -> str:
-    return "" if holdings.config is None else str(holdings.config.train.seed)
+def _seed(inputs: ReportInputs) -> str:
+    return "" if inputs.config is None else str(inputs.config.train.seed)

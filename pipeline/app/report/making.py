@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, duration, moment, plural, size
 from splatpipe.pipeline.engine.stage import shards_first, stage_name
 from splatpipe.stages.line import LINE
@@ -36,22 +36,22 @@ FOLDERS = {
 RECORDS = {"config.toml": "all options", "events.jsonl": "what happened", "splatpipe.log": "what the libraries said"}
 
 
-def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
+def making_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
     """How it was made: stages, machine, versions, seeds, options.
 
     Args:
-        holdings: What there is.
+        inputs: What there is.
         drawn: Whether to draw charts.
     """
-    names = dict.fromkeys((*(stage.name for stage in LINE), *holdings.story.stages))
-    rows = [_stage_row(holdings, name) for name in shards_first(names)]
+    names = dict.fromkeys((*(stage.name for stage in LINE), *inputs.history.stages))
+    rows = [_stage_row(inputs, name) for name in shards_first(names)]
     rows = [row for row in rows if row["state"] != "not asked for" or row["made"]]
-    versions, machine = dict(holdings.story.versions), dict(holdings.story.machine)
-    for artifact in holdings.artifacts.values():
+    versions, machine = dict(inputs.history.versions), dict(inputs.history.machine)
+    for artifact in inputs.artifacts.values():
         versions = versions or dict(artifact.manifest.get("versions", {}))
         machine = machine or dict(artifact.manifest.get("machine", {}))
-    options = {} if holdings.config is None else holdings.config.model_dump(mode="json")
-    counted = [row for row in rows if not _is_in_stage(holdings, row["name"])]
+    options = {} if inputs.config is None else inputs.config.model_dump(mode="json")
+    counted = [row for row in rows if not _is_in_stage(inputs, row["name"])]
     chapter: Chapter = {
         "rows": rows,
         "total": duration(sum(row["seconds"] or 0.0 for row in counted)),
@@ -60,7 +60,7 @@ def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
         "forecast": _forecast([row["foreseen"] for row in rows if row["foreseen"]]),
         "machine": _machine(machine),
         "versions": sorted((str(name), str(value)) for name, value in versions.items()),
-        "otherwise": _made_otherwise(holdings, versions),
+        "otherwise": _made_otherwise(inputs, versions),
         "seeds": [
             (f"{name}.seed", str(section["seed"]))
             for name, section in options.items()
@@ -72,25 +72,25 @@ def making_chapter(holdings: Holdings, *, drawn: bool) -> Chapter:
     return chapter
 
 
-def files_chapter(holdings: Holdings) -> Chapter:
+def files_chapter(inputs: ReportInputs) -> Chapter:
     """Links to what lies beside the report; what an earlier run left is told as that."""
     files = [
         {"href": quote(file.name), "name": file.name, "what": WHAT.get(file.name, ""), "size": size(file.size)}
         | {"current": file.current}
-        for file in holdings.deliverables
+        for file in inputs.deliverables
     ]
     order = list(WHAT)
     files.sort(key=lambda file: (not file["current"], order.index(file["name"]) if file["name"] in order else 99))
     folders = []
     for name, what in FOLDERS.items():
-        path = holdings.part(name)
+        path = inputs.part(name)
         if path is not None:
-            relative = path.relative_to(holdings.out).as_posix()
+            relative = path.relative_to(inputs.out).as_posix()
             folders.append({"href": quote(relative) + "/", "name": relative, "what": what})
     records = [
-        {"href": quote(name), "name": name, "what": what, "size": size((holdings.out / name).stat().st_size)}
+        {"href": quote(name), "name": name, "what": what, "size": size((inputs.out / name).stat().st_size)}
         for name, what in RECORDS.items()
-        if (holdings.out / name).is_file()
+        if (inputs.out / name).is_file()
     ]
     found = {str(file["name"]): file for file in files if file["current"]}
     first = [found[name] for name in FIRST if name in found]
@@ -103,32 +103,32 @@ def files_chapter(holdings: Holdings) -> Chapter:
     }
 
 
-def said_chapter(holdings: Holdings) -> Chapter:
+def said_chapter(inputs: ReportInputs) -> Chapter:
     """Warnings and notes of the run, stage by stage."""
-    stages = holdings.story.stages
-    warnings = [(name, *told) for name, stage in stages.items() for told in stage.told.warnings]
-    notes = [(name, told) for name, stage in stages.items() for told in stage.told.notes]
+    stages = inputs.history.stages
+    warnings = [(name, *told) for name, stage in stages.items() for told in stage.messages.warnings]
+    notes = [(name, told) for name, stage in stages.items() for told in stage.messages.notes]
     return {"warnings": warnings, "notes": notes}
 
 
-def _is_in_stage(holdings: Holdings, name: str) -> bool:
+def _is_in_stage(inputs: ReportInputs, name: str) -> bool:
     """Whether a row is a shard's, of which its stage's tells already."""
-    return name != stage_name(name) and stage_name(name) in holdings.artifacts
+    return name != stage_name(name) and stage_name(name) in inputs.artifacts
 
 
-def _stage_row(holdings: Holdings, name: str) -> dict[str, Any]:
-    story, artifact = holdings.story.stages.get(name), holdings.artifacts.get(name)
+def _stage_row(inputs: ReportInputs, name: str) -> dict[str, Any]:
+    history, artifact = inputs.history.stages.get(name), inputs.artifacts.get(name)
     manifest: Mapping[str, Any] = {} if artifact is None else artifact.manifest
-    state: str = "not asked for" if story is None else story.state
-    if story is None and artifact is not None:
+    state: str = "not asked for" if history is None else history.state
+    if history is None and artifact is not None:
         state = "made before"
-    seconds = manifest.get("seconds", None if story is None else story.seconds)
-    memory = manifest.get("peak_memory_bytes", None if story is None else story.memory_bytes)
+    seconds = manifest.get("seconds", None if history is None else history.seconds)
+    memory = manifest.get("peak_memory_bytes", None if history is None else history.memory_bytes)
     return {
         "name": name,
         "state": state,
         "made": moment(manifest["finished_s"]) if manifest else "",
-        "reason": "" if story is None else story.reason,
+        "reason": "" if history is None else history.reason,
         "seconds": seconds,
         "took": duration(seconds),
         "cpu_seconds": manifest.get("cpu_seconds"),
@@ -137,7 +137,7 @@ def _stage_row(holdings: Holdings, name: str) -> dict[str, Any]:
         "peak": size(memory),
         "foreseen": manifest.get("forecast"),
         "forecast": _forecast([manifest["forecast"]] if "forecast" in manifest else []),
-        "key": (str(manifest.get("key", "")) or ("" if story is None else story.key))[:16],
+        "key": (str(manifest.get("key", "")) or ("" if history is None else history.key))[:16],
     }
 
 
@@ -149,10 +149,10 @@ def _forecast(needs: Sequence[Mapping[str, Any]]) -> str:
     return f"{duration(seconds)}, {size(max(int(need['memory_bytes']) for need in needs))}"
 
 
-def _made_otherwise(holdings: Holdings, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _made_otherwise(inputs: ReportInputs, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Stages that an earlier run made with other versions, and which."""
     told = []
-    for name, artifact in holdings.artifacts.items():
+    for name, artifact in inputs.artifacts.items():
         other = artifact.manifest.get("versions", {})
         differ = [f"{what} {value}" for what, value in other.items() if versions.get(what) != value]
         if differ:

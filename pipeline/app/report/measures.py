@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import quote
 
 from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, outdated, read_measurements, title_of
-from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import length
 
 MOST_ROWS = 200  # of volumes: all are in the file
@@ -15,22 +15,22 @@ BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated"}
 SIGMA_DIGITS = 2  # that a deviation is told with
 
 
-def measures(holdings: Holdings) -> dict[str, Any]:
+def measures(inputs: ReportInputs) -> dict[str, Any]:
     """What was measured on the surface model that the report tells of.
 
     Returns:
         ``sections`` (``picture`` is where theirs lies), ``volumes``, ``more`` volumes than these, ``volumes_file``, and
         whether what lies in OUT is ``outdated``.
     """
-    part = holdings.contents.parts.get("dsm.files")
+    part = inputs.contents.parts.get("dsm.files")
     surface = "" if part is None else part.digest
-    volumes = read_measurements(holdings.out, "volumes", surface)
+    volumes = read_measurements(inputs.out, "volumes", surface)
     return {
-        "sections": [_section(holdings.out, item) for item in read_measurements(holdings.out, "sections", surface)],
+        "sections": [_section(inputs.out, item) for item in read_measurements(inputs.out, "sections", surface)],
         "volumes": [_volume(item) for item in volumes[:MOST_ROWS]],
         "more": max(0, len(volumes) - MOST_ROWS),
         "volumes_file": VOLUMES,
-        "outdated": outdated(holdings.out, surface),
+        "outdated": outdated(inputs.out, surface),
     }
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.page_file import page_text
-from splatpipe.pipeline.app.places import Places
+from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.app.report.capturing import capture_chapter, registration_chapter
-from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.learning import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.making import files_chapter, making_chapter, said_chapter
 from splatpipe.pipeline.app.report.placing import placing_chapter
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number
@@ -25,66 +25,66 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 
 
-def report_page(holdings: Holdings, *, drawn: bool) -> str:
+def report_page(inputs: ReportInputs, *, drawn: bool) -> str:
     """The report as one HTML text that needs nothing else.
 
     Args:
-        holdings: What there is.
+        inputs: What there is.
         drawn: With charts and pictures; without, it is made within a moment.
 
     Raises:
         MachineError: if this installation lacks the page's script or style.
     """
     if not drawn:
-        return _render(holdings, None, None, drawn=False)
+        return _render(inputs, None, None, drawn=False)
     from splatpipe.pipeline.app.report.drawing import styled
 
-    geometry, trouble = _geometry(holdings)
+    geometry, trouble = _geometry(inputs)
     with styled():
-        return _render(holdings, geometry, trouble, drawn=True)
+        return _render(inputs, geometry, trouble, drawn=True)
 
 
-def _render(holdings: Holdings, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> str:
+def _render(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> str:
     chapters = {
-        "capture": _guarded(lambda: capture_chapter(holdings, geometry, drawn=drawn) if _checked(holdings) else None),
-        "registration": _guarded(lambda: registration_chapter(holdings, geometry) if _matched(holdings) else None),
-        "placing": _guarded(lambda: placing_chapter(holdings, geometry)),
-        "training": _guarded(lambda: training_chapter(holdings, drawn=drawn)),
-        "views": _guarded(lambda: views_chapter(holdings, drawn=drawn)),
-        "surfaces": _guarded(lambda: surfaces_chapter(holdings, drawn=drawn)),
-        "making": _guarded(lambda: making_chapter(holdings, drawn=drawn)),
-        "files": _guarded(lambda: files_chapter(holdings)),
-        "said": _guarded(lambda: said_chapter(holdings)),
+        "capture": _guarded(lambda: capture_chapter(inputs, geometry, drawn=drawn) if _checked(inputs) else None),
+        "registration": _guarded(lambda: registration_chapter(inputs, geometry) if _matched(inputs) else None),
+        "placing": _guarded(lambda: placing_chapter(inputs, geometry)),
+        "training": _guarded(lambda: training_chapter(inputs, drawn=drawn)),
+        "views": _guarded(lambda: views_chapter(inputs, drawn=drawn)),
+        "surfaces": _guarded(lambda: surfaces_chapter(inputs, drawn=drawn)),
+        "making": _guarded(lambda: making_chapter(inputs, drawn=drawn)),
+        "files": _guarded(lambda: files_chapter(inputs)),
+        "said": _guarded(lambda: said_chapter(inputs)),
     }
     return page_text(
         TEMPLATES,
         "report.html.j2",
-        _places(holdings),
+        _places(inputs),
         style="report.css",
         script="report.js",
-        name=holdings.out.resolve().name or str(holdings.out),
-        photos_dir="" if holdings.photos_dir is None else holdings.photos_dir.name,
-        began=moment(holdings.story.began_s) if holdings.story.began_s else "",
+        name=inputs.out.resolve().name or str(inputs.out),
+        photos_dir="" if inputs.photos_dir is None else inputs.photos_dir.name,
+        began=moment(inputs.history.began_s) if inputs.history.began_s else "",
         version=importlib.metadata.version("splatpipe"),
-        verdict=judge(holdings),
-        key_figures=_guarded(lambda: {"cards": _cards(holdings)}),
+        verdict=judge(inputs),
+        key_figures=_guarded(lambda: {"cards": _cards(inputs)}),
         drawn=drawn,
         geometry_trouble=trouble,
         **chapters,
     )
 
 
-def _places(holdings: Holdings) -> Places:
-    options = {} if holdings.config is None else holdings.config.model_dump(mode="json")
-    return Places.of(holdings.out, holdings.photos_dir, options)
+def _places(inputs: ReportInputs) -> PathLabels:
+    options = {} if inputs.config is None else inputs.config.model_dump(mode="json")
+    return PathLabels.of(inputs.out, inputs.photos_dir, options)
 
 
-def _checked(holdings: Holdings) -> bool:
-    return "ingest" in holdings.artifacts
+def _checked(inputs: ReportInputs) -> bool:
+    return "ingest" in inputs.artifacts
 
 
-def _matched(holdings: Holdings) -> bool:
-    return any(name in holdings.artifacts for name in ("features", "matches", "sparse"))
+def _matched(inputs: ReportInputs) -> bool:
+    return any(name in inputs.artifacts for name in ("features", "matches", "sparse"))
 
 
 def _guarded(build: Callable[[], dict[str, Any] | None]) -> dict[str, Any] | None:
@@ -95,10 +95,10 @@ def _guarded(build: Callable[[], dict[str, Any] | None]) -> dict[str, Any] | Non
         return {"trouble": f"This part could not be read: {type(error).__name__}: {error}"}
 
 
-def _geometry(holdings: Holdings) -> tuple[Geometry | None, str | None]:
+def _geometry(inputs: ReportInputs) -> tuple[Geometry | None, str | None]:
     """The sparse model, placed if it is; or what is wrong with it."""
-    frame = holdings.part("georef.frame")
-    path = holdings.part("georef.model") if frame is not None else holdings.part("sparse.model")
+    frame = inputs.part("georef.frame")
+    path = inputs.part("georef.model") if frame is not None else inputs.part("sparse.model")
     if path is None:
         return None, None
     from splatpipe.pipeline.app.report.geometry import read_geometry
@@ -109,10 +109,10 @@ def _geometry(holdings: Holdings) -> tuple[Geometry | None, str | None]:
         return None, f"The sparse model could not be read, so there are no maps: {error}"
 
 
-def _cards(holdings: Holdings) -> list[tuple[str, str, str]]:
+def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:
     """Title, figure and explanation of what people ask for first."""
-    sparse, train, evaluate = (holdings.summary(name) for name in ("sparse", "train", "evaluate"))
-    accuracy = holdings.read("georef.accuracy") if "georef" in holdings.artifacts else {}
+    sparse, train, evaluate = (inputs.summary(name) for name in ("sparse", "train", "evaluate"))
+    accuracy = inputs.read("georef.accuracy") if "georef" in inputs.artifacts else {}
     tables = accuracy.get("tables") or {}
     cards = []
     if sparse:
@@ -132,8 +132,8 @@ def _cards(holdings: Holdings) -> list[tuple[str, str, str]]:
         at = f", at {size} megapixels" if (size := judged_size(evaluate)) else ""
         cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text + at + inside))
     if train:
-        cards.append(("Gaussians", count(holdings.summary("clean").get("gaussians", train.get("gaussians"))), ""))
-    seconds = [float(artifact.manifest["seconds"]) for artifact in holdings.artifacts.values()]
+        cards.append(("Gaussians", count(inputs.summary("clean").get("gaussians", train.get("gaussians"))), ""))
+    seconds = [float(artifact.manifest["seconds"]) for artifact in inputs.artifacts.values()]
     if seconds:
         cards.append(("Computed in", duration(sum(seconds)), "all stages, by the clock"))
     return cards

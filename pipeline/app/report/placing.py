@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.app.report.holdings import Holdings, read_json
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs, read_json
 from splatpipe.pipeline.app.report.wording import count, interval, length, metres, number
 
 if TYPE_CHECKING:
@@ -20,21 +20,21 @@ MOST_BARS = 20
 AXES = ("east", "north", "up", "horizontal", "3d")
 
 
-def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | None:
+def placing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter | None:
     """Where the model is and how well that is known; None where georef did not finish.
 
     Args:
-        holdings: What there is.
+        inputs: What there is.
         geometry: Of the model; None for a report without pictures.
     """
-    if "georef" not in holdings.artifacts:
+    if "georef" not in inputs.artifacts:
         return None
-    frame, control, report = (holdings.read(f"georef.{name}") for name in ("frame", "control", "accuracy"))
+    frame, control, report = (inputs.read(f"georef.{name}") for name in ("frame", "control", "accuracy"))
     points = list(control.get("points", []))
-    splat = _splat(holdings)
+    splat = _splat(inputs)
     chapter: Chapter = {
         "note": str(frame.get("note", "")),
-        "facts": _frame_facts(holdings, (frame, control, report), named=geometry is not None),
+        "facts": _frame_facts(inputs, (frame, control, report), named=geometry is not None),
         "tables": _tables(report.get("tables") or {}, splat.get("tables") or {}),
         "flights": _flights(report.get("tables") or {}),
         "left_out": [str(name) for name in frame.get("left_out", [])],
@@ -45,21 +45,21 @@ def placing_chapter(holdings: Holdings, geometry: Geometry | None) -> Chapter | 
         "marks_left_out": 0,
     }
     if geometry is not None:
-        chapter |= _drawn(holdings, geometry, frame, points)
+        chapter |= _drawn(inputs, geometry, frame, points)
     return chapter
 
 
-def _splat(holdings: Holdings) -> Mapping[str, Any]:
+def _splat(inputs: ReportInputs) -> Mapping[str, Any]:
     """What evaluate found of the splat's own accuracy; nothing where that is damaged, which its own chapter tells."""
     with suppress(OSError, ValueError, AttributeError):
-        found = holdings.read("evaluate.metrics").get("accuracy", {}).get("splat")
+        found = inputs.read("evaluate.metrics").get("accuracy", {}).get("splat")
         if found:
             return dict(found)
     return {"tables": {}, "points": []}
 
 
 def _frame_facts(
-    holdings: Holdings, parts: tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], *, named: bool
+    inputs: ReportInputs, parts: tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], *, named: bool
 ) -> list[tuple[str, str]]:
     frame, control, report = parts
     if frame.get("kind") != "enu":
@@ -69,11 +69,11 @@ def _frame_facts(
         return [("Frame", "z up; scale, place and heading are arbitrary: no metres")]
     origin = frame["origin"]
     place = f"{origin['latitude']:.7f}°, {origin['longitude']:.7f}°, {number(origin['height_m'])} m"
-    summary = holdings.summary("georef")
+    summary = inputs.summary("georef")
     facts = [
         ("Frame", "local east, north, up in metres"),
         ("Origin", f"{place} (latitude, longitude, height)"),
-        ("CRS of the coordinates", _crs(holdings, frame)),
+        ("CRS of the coordinates", _crs(inputs, frame)),
         ("Vertical datum", _vertical(str(frame.get("vertical_datum", "unknown")), named=named)),
         ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel"),
     ]
@@ -117,9 +117,9 @@ def _vertical(datum: str, *, named: bool) -> str:
     return describe_vertical(datum)
 
 
-def _crs(holdings: Holdings, frame: Mapping[str, Any]) -> str:
+def _crs(inputs: ReportInputs, frame: Mapping[str, Any]) -> str:
     """As `georef.json` has it where it was written, else as the frame has it."""
-    path = holdings.part("export.georef")
+    path = inputs.part("export.georef")
     told = read_json(path) if path is not None else {}
     crs = told.get("crs") if isinstance(told, Mapping) else None
     if not isinstance(crs, Mapping):
@@ -181,7 +181,7 @@ def _rms_px(observations: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _drawn(
-    holdings: Holdings, geometry: Geometry, frame: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
+    inputs: ReportInputs, geometry: Geometry, frame: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
 ) -> Chapter:
     """The maps of residuals, and the cut-outs point by point."""
     from splatpipe.pipeline.app.report.charts import residual_map
@@ -197,7 +197,7 @@ def _drawn(
         if photos:
             text = "How far the photos' own positions are from where the model has the photos."
             charts.append({"svg": residual_map(geometry, {"photo": photos}), "text": text})
-    chips = cut_chips(points, holdings.part("ingest.photos"), holdings.photos_dir)
+    chips = cut_chips(points, inputs.part("ingest.photos"), inputs.photos_dir)
     total = sum(len(point["observations"]) for point in points)
     shown = [_marks(i, point, chips) for i, point in enumerate(points)]
     marks = [mark for mark in shown if mark["chips"]]
@@ -234,5 +234,5 @@ def _surveyed_residuals(points: Sequence[Mapping[str, Any]]) -> dict[str, list[t
 
 def _photo_residuals(geometry: Geometry, frame: Mapping[str, Any]) -> list[tuple[str, list[float], list[float]]]:
     found = (frame.get("residuals") or {}).get("photos") or {}
-    places = dict(zip(geometry.taken.names, geometry.taken.centres.tolist(), strict=True))
+    places = dict(zip(geometry.photos.names, geometry.photos.centres.tolist(), strict=True))
     return [(name, places[name], list(residual)) for name, residual in found.items() if name in places]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.app.report.holdings import Holdings
 from splatpipe.pipeline.app.report.measures import measures
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, length
 
 PICTURE_SIDE = 960  # pixels
@@ -19,14 +19,14 @@ QUALITY = 85
 Chapter = dict[str, Any]
 
 
-def surfaces_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
+def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     """The surface model and the orthophoto; None where none was made.
 
     Args:
-        holdings: What there is.
+        inputs: What there is.
         drawn: With pictures.
     """
-    dsm, ortho = holdings.summary("dsm"), holdings.summary("ortho")
+    dsm, ortho = inputs.summary("dsm"), inputs.summary("ortho")
     if not dsm.get("cells"):
         return None
     facts = [
@@ -40,36 +40,36 @@ def surfaces_chapter(holdings: Holdings, *, drawn: bool) -> Chapter | None:
     if ortho.get("pixels"):
         facts.insert(0, ("pixel of the orthophoto", length(ortho["pixel_m"])))
         facts.append(("exposures levelled over", f"{ortho['exposures_stops']:.1f} stops"))
-    cloud, mesh = holdings.summary("cloud"), holdings.summary("mesh")
+    cloud, mesh = inputs.summary("cloud"), inputs.summary("mesh")
     if cloud.get("points"):
         facts.append(("points of the cloud", f"{count(cloud['points'])}, {length(cloud['spacing_m'])} apart"))
     if mesh.get("triangles"):
         facts.append(("triangles of the mesh", f"{count(mesh['triangles'])}, of voxels of {length(mesh['voxel_m'])}"))
-    facades = _facades(holdings, drawn=drawn)
-    chapter = {"facts": facts, "pictures": _pictures(holdings) if drawn else [], "facades": facades}
-    return {**chapter, "measured": _measured(holdings, drawn=drawn)}
+    facades = _facades(inputs, drawn=drawn)
+    chapter = {"facts": facts, "pictures": _pictures(inputs) if drawn else [], "facades": facades}
+    return {**chapter, "measured": _measured(inputs, drawn=drawn)}
 
 
-def _measured(holdings: Holdings, *, drawn: bool) -> dict[str, Any]:
+def _measured(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
     """Sections and volumes, with small pictures of the first sections."""
-    told = measures(holdings)
+    told = measures(inputs)
     for number, row in enumerate(told["sections"]):
         path = row.pop("picture")
         row |= _small_picture(path, SECTION_SIDE) if drawn and path is not None and number < MOST_SECTIONS else {}
     return told
 
 
-def _facades(holdings: Holdings, *, drawn: bool) -> list[dict[str, Any]]:
+def _facades(inputs: ReportInputs, *, drawn: bool) -> list[dict[str, Any]]:
     """Elevations, the largest first, with small pictures of the first ones."""
-    if not holdings.summary("facades").get("facades"):
+    if not inputs.summary("facades").get("facades"):
         return []
-    told = holdings.read_in_part("facades.files", "facades/facades.json")["facades"]
+    told = inputs.read_in_part("facades.files", "facades/facades.json")["facades"]
     told = sorted(told, key=lambda each: -float(each["area_m2"]))
     rows = []
     for number, each in enumerate(told):
         row = {"name": str(each["name"]), "area": f"{float(each['area_m2']):.1f} m²"}
         row["known"] = f"{100.0 * float(each['share_with_depth']):.0f} %"
-        path = _file(holdings, "facades.files", f"facades/{each['picture']}")
+        path = _file(inputs, "facades.files", f"facades/{each['picture']}")
         rows.append(
             row | (_small_picture(path, FACADE_SIDE) if drawn and path is not None and number < MOST_FACADES else {})
         )
@@ -91,16 +91,16 @@ def _small_picture(path: Path, side: int) -> dict[str, Any]:
     return {"source": jpeg(small, QUALITY), "width": small.shape[1], "height": small.shape[0]}
 
 
-def _pictures(holdings: Holdings) -> list[dict[str, Any]]:
+def _pictures(inputs: ReportInputs) -> list[dict[str, Any]]:
     from splatpipe.pipeline.app.report.pictures import jpeg
     from splatpipe.pipeline.surface.pictures import ortho_picture, relief_picture
 
     found = []
-    path = _file(holdings, "ortho.files", "ortho.tif")
+    path = _file(inputs, "ortho.files", "ortho.tif")
     if path is not None:
         pixels = ortho_picture(path, PICTURE_SIDE)
         found.append(("orthophoto", "ortho.tif: true, so walls do not lean; white where nobody saw enough", pixels))
-    path = _file(holdings, "dsm.files", "dsm.tif")
+    path = _file(inputs, "dsm.files", "dsm.tif")
     relief = None if path is None else relief_picture(path, PICTURE_SIDE)
     if relief is not None:
         told = f"dsm.tif: from {relief.low:.1f} (violet) to {relief.high:.1f} (yellow), lit from the north-west"
@@ -112,6 +112,6 @@ def _pictures(holdings: Holdings) -> list[dict[str, Any]]:
     ]
 
 
-def _file(holdings: Holdings, part: str, name: str) -> Path | None:
-    folder = holdings.part(part)
+def _file(inputs: ReportInputs, part: str, name: str) -> Path | None:
+    folder = inputs.part(part)
     return folder / name if folder is not None and (folder / name).is_file() else None

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from splatpipe.pipeline.app.report.holdings import Holdings
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number, plural, share
 from splatpipe.pipeline.engine.stage import stage_name
 from splatpipe.stages.line import LINE
@@ -29,7 +29,7 @@ VEIL = 0.03  # of the light before held-out photos' points: 8 of 255 grey values
 
 
 @dataclass(frozen=True)
-class Finding:
+class VerdictLine:
     """One line of the verdict."""
 
     level: Level
@@ -44,21 +44,21 @@ class Verdict:
     level: Level
     headline: str
     text: str
-    findings: Sequence[Finding]
+    findings: Sequence[VerdictLine]
 
 
-def judge(holdings: Holdings) -> Verdict:
+def judge(inputs: ReportInputs) -> Verdict:
     """Judge a run by what there is of it; what cannot be read is passed over, and told where it belongs."""
-    findings: list[Finding] = []
+    findings: list[VerdictLine] = []
     for look in (_cameras, _photos, _reprojection, _focal, _place, _splat, _views, _floaters):
         try:
-            findings += filter(None, [look(holdings)])
+            findings += filter(None, [look(inputs)])
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
-    ended, text = _ended(holdings)
-    told = sum(len(stage.told.warnings) for stage in holdings.story.stages.values())
+    ended, text = _ended(inputs)
+    told = sum(len(stage.messages.warnings) for stage in inputs.history.stages.values())
     if told:
-        findings.append(Finding("doubt", "Warnings", f"The run gave {plural(told, 'warning')}."))
+        findings.append(VerdictLine("doubt", "Warnings", f"The run gave {plural(told, 'warning')}."))
     wrong = next((it for it in findings if it.title == CAMERAS and it.level == "bad"), None)
     if ended is not None and (ended.level == "bad" or wrong is None):
         return Verdict(ended.level, ended.title, ended.text, findings)
@@ -72,83 +72,85 @@ def judge(holdings: Holdings) -> Verdict:
     return Verdict("good", "Finished, and nothing looks doubtful", text, findings)
 
 
-def _ended(holdings: Holdings) -> tuple[Finding | None, str]:
+def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
     """How the run ended, if not as it should; else when."""
-    story = holdings.story
-    when = f"{moment(story.ended_s)}, after {duration(story.ended_s - story.began_s)}"
-    if not story.stages:
-        return Finding("bad", "Nothing has run yet", "The folder has no record of a run that began."), ""
-    if story.complete:
-        gone = [name for name in story.stages if name == stage_name(name) and name not in holdings.artifacts]
+    history = inputs.history
+    when = f"{moment(history.ended_s)}, after {duration(history.ended_s - history.began_s)}"
+    if not history.stages:
+        return VerdictLine("bad", "Nothing has run yet", "The folder has no record of a run that began."), ""
+    if history.complete:
+        gone = [name for name in history.stages if name == stage_name(name) and name not in inputs.artifacts]
         if gone:
             lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or cannot be read any more."
-            return Finding("bad", "Finished, but its results are damaged", f"{lost} The same command mends it."), ""
-        last = [stage.name for stage in LINE if stage.name in holdings.artifacts][-1:]
+            return VerdictLine("bad", "Finished, but its results are damaged", f"{lost} The same command mends it."), ""
+        last = [stage.name for stage in LINE if stage.name in inputs.artifacts][-1:]
         if last == [LINE[-1].name]:
             return None, f"The run ended on {when}."
         got = f"up to {last[0]}" if last else "without a result"
-        return Finding("doubt", f"The line was run {got}, as asked for", f"It ended on {when}."), ""
-    stage = story.culprit
+        return VerdictLine("doubt", f"The line was run {got}, as asked for", f"It ended on {when}."), ""
+    stage = history.culprit
     where = f" in {stage.name}" if stage is not None else ""
     kept = "What was finished is kept: the same command goes on from there."
-    if story.running:
-        return Finding("doubt", f"Still running{where}", f"{_far(holdings)} Events up to {moment(story.ended_s)}."), ""
+    if history.running:
+        return VerdictLine(
+            "doubt", f"Still running{where}", f"{_far(inputs)} Events up to {moment(history.ended_s)}."
+        ), ""
     if stage is not None and stage.state == "stopped":
-        return Finding("bad", f"Stopped{where} before it was finished", f"{_far(holdings)} {when}. {kept}"), ""
+        return VerdictLine("bad", f"Stopped{where} before it was finished", f"{_far(inputs)} {when}. {kept}"), ""
     if stage is not None and stage.state == "failed":
         said = " ".join(filter(None, [stage.message, stage.hint]))
-        return Finding("bad", f"Failed{where}", f"{said} ({when})"), ""
-    if story.message and story.exit_code:
-        return Finding("bad", f"Failed{where}", " ".join(filter(None, [story.message, story.hint])) + f" ({when})"), ""
-    lost = (
-        f"Its events end without a word: it was killed, or the machine went down. {_far(holdings)} Last heard {when}."
-    )
-    return Finding("bad", f"Broken off{where}", f"{lost} {kept}"), ""
+        return VerdictLine("bad", f"Failed{where}", f"{said} ({when})"), ""
+    if history.message and history.exit_code:
+        return VerdictLine(
+            "bad", f"Failed{where}", " ".join(filter(None, [history.message, history.hint])) + f" ({when})"
+        ), ""
+    lost = f"Its events end without a word: it was killed, or the machine went down. {_far(inputs)} Last heard {when}."
+    return VerdictLine("bad", f"Broken off{where}", f"{lost} {kept}"), ""
 
 
-def _far(holdings: Holdings) -> str:
+def _far(inputs: ReportInputs) -> str:
     """How far the stage came in which it ended."""
-    stage = holdings.story.culprit
-    if stage is None or not stage.told.progress:
+    stage = inputs.history.culprit
+    if stage is None or not stage.messages.progress:
         return ""
-    total, unit = stage.told.progress.get("total"), str(stage.told.progress.get("unit", ""))
+    total, unit = stage.messages.progress.get("total"), str(stage.messages.progress.get("unit", ""))
     return f"It had come to {count(stage.reached)} of {count(total)} {unit}."
 
 
-def _cameras(holdings: Holdings) -> Finding | None:
+def _cameras(inputs: ReportInputs) -> VerdictLine | None:
     """What the mapping holds of its own answer."""
-    told = holdings.read("sparse.summary").get("verdict") or {"level": "good"}
+    told = inputs.read("sparse.summary").get("verdict") or {"level": "good"}
     if told["level"] == "good":
         return None
     worst = [reason for reason in told["reasons"] if reason["level"] == told["level"]]
     text = " ".join(f"{reason['text']} {reason['hint']}".strip() for reason in worst)
-    return Finding(told["level"], CAMERAS, text)
+    return VerdictLine(told["level"], CAMERAS, text)
 
 
-def _photos(holdings: Holdings) -> Finding | None:
-    sparse = holdings.summary("sparse")
+def _photos(inputs: ReportInputs) -> VerdictLine | None:
+    sparse = inputs.summary("sparse")
     if not sparse:
         return None
     photos, placed = int(sparse["photos"]), int(sparse["registered"])
     level: Level = "good" if placed >= PLACED_GOOD * photos else "doubt" if placed >= PLACED_DOUBT * photos else "bad"
     if placed == photos:
-        return Finding(level, "Photos", f"All {photos:,} photos were placed.")
+        return VerdictLine(level, "Photos", f"All {photos:,} photos were placed.")
     lost = f"{photos - placed:,} of {photos:,} photos could not be placed ({share(1 - placed / photos)})"
-    return Finding(level, "Photos", f"{lost}: what only they show is missing.")
+    return VerdictLine(level, "Photos", f"{lost}: what only they show is missing.")
 
 
-def _reprojection(holdings: Holdings) -> Finding | None:
-    error = holdings.summary("sparse").get("mean_reprojection_error_px")
+def _reprojection(inputs: ReportInputs) -> VerdictLine | None:
+    error = inputs.summary("sparse").get("mean_reprojection_error_px")
     if error is None:
         return None
     level: Level = "good" if error <= ERROR_GOOD_PX else "doubt" if error <= ERROR_DOUBT_PX else "bad"
     told = {"good": "points and what they were made of agree", "doubt": "more than usual"}
     told["bad"] = "the cameras contradict each other"
-    return Finding(level, "Reprojection error", f"{error:.2f} pixels on average: {told[level]}.")
+    return VerdictLine(level, "Reprojection error", f"{error:.2f} pixels on average: {told[level]}.")
 
 
-def _focal(holdings: Holdings) -> Finding | None:
-    cameras = holdings.summary("sparse").get("cameras", [])
+def _focal(inputs: ReportInputs) -> VerdictLine | None:
+    cameras = inputs.summary("sparse").get("cameras", [])
     off = [
         abs(camera["focal_px"] / camera["prior_focal_px"] - 1.0)
         for camera in cameras
@@ -157,28 +159,28 @@ def _focal(holdings: Holdings) -> Finding | None:
     if not off:
         return None
     if max(off) <= FOCAL_GOOD:
-        return Finding("good", "Focal length", f"Calibrated within {share(max(off), 1)} of what the photos state.")
-    return Finding("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from what the photos state.")
+        return VerdictLine("good", "Focal length", f"Calibrated within {share(max(off), 1)} of what the photos state.")
+    return VerdictLine("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from what the photos state.")
 
 
 UNPLACED = "Lengths and heights can be measured; where on the earth it lies and where north is, nothing tells."
 SCALE_GOOD = 0.005  # relative standard deviation of scale bars: five millimetres a metre
 
 
-def _place(holdings: Holdings) -> Finding | None:
-    if "georef" not in holdings.artifacts:
+def _place(inputs: ReportInputs) -> VerdictLine | None:
+    if "georef" not in inputs.artifacts:
         return None
-    frame = holdings.read("georef.frame")
+    frame = inputs.read("georef.frame")
     if frame.get("kind") != "enu" and frame.get("metres"):
-        scale = holdings.read("georef.accuracy").get("scale") or {}
+        scale = inputs.read("georef.accuracy").get("scale") or {}
         text = f"The model is metric but not placed: {scale.get('sentence', 'its metres are of scale bars.')}"
         good = scale.get("sigma", 1.0) <= SCALE_GOOD and sum(bar["used"] for bar in scale.get("bars", [])) > 1
-        return Finding("good" if good else "doubt", "Georeferencing", f"{text} {UNPLACED}")
+        return VerdictLine("good" if good else "doubt", "Georeferencing", f"{text} {UNPLACED}")
     if frame.get("kind") != "enu":
         why = str(frame.get("note", "")).removeprefix("Arbitrary scale: ").partition(". Up is from")[0].rstrip(".")
         text = f"The model has neither scale nor place: {why or 'nothing tells them'}, and no control places it."
-        return Finding("doubt", "Georeferencing", f"{text} Nothing in it can be measured in metres.")
-    report = holdings.read("georef.accuracy")
+        return VerdictLine("doubt", "Georeferencing", f"{text} Nothing in it can be measured in metres.")
+    report = inputs.read("georef.accuracy")
     tables, gsd = report["tables"], report.get("gsd_m")
     checks, control = tables.get("check"), tables.get("control")
     if checks:
@@ -186,7 +188,7 @@ def _place(holdings: Holdings) -> Finding | None:
     if control:
         fit = f"{length(control['rmse_horizontal_m'])} horizontally, {length(control['rmse_up_m'])} in height"
         text = f"{plural(control['count'], 'control point')} fit by {fit}, but no check point proves it elsewhere."
-        return Finding("doubt", "Accuracy", text)
+        return VerdictLine("doubt", "Accuracy", text)
     gps = tables.get("gps") or {}
     off = (
         f"they scatter by {length(gps.get('rmse_horizontal_m'))} horizontally, {length(gps.get('rmse_up_m'))} in height"
@@ -194,26 +196,26 @@ def _place(holdings: Holdings) -> Finding | None:
     told = (report.get("uncertainty") or {}).get("sentence")
     worth = f", {told}" if told else ""
     text = f"Placed by the photos' own positions alone ({off}){worth}: no control or check point proves it."
-    return Finding("doubt", "Accuracy", text)
+    return VerdictLine("doubt", "Accuracy", text)
 
 
-def _checked(table: Mapping[str, Any], gsd: float | None) -> Finding:
+def _checked(table: Mapping[str, Any], gsd: float | None) -> VerdictLine:
     horizontal, vertical = table["rmse_horizontal_m"], table["rmse_up_m"]
     told = f"{plural(table['count'], 'check point')} {'are' if table['count'] > 1 else 'is'} off by "
     told += f"{length(horizontal)} horizontally and {length(vertical)} in height (root mean square)"
     if not gsd:
-        return Finding("doubt", "Accuracy", f"{told}.")
+        return VerdictLine("doubt", "Accuracy", f"{told}.")
     told += f", {number((horizontal or 0.0) / gsd, 1)} and {number((vertical or 0.0) / gsd, 1)} ground sample distances"
     good = (horizontal or 0.0) <= HORIZONTAL_GSDS * gsd and (vertical or 0.0) <= VERTICAL_GSDS * gsd
     if table["count"] < FEW_CHECKS:
-        return Finding("doubt", "Accuracy", f"{told}; so few prove little.")
+        return VerdictLine("doubt", "Accuracy", f"{told}; so few prove little.")
     bounds = f"{HORIZONTAL_GSDS:g} and {VERTICAL_GSDS:g}"
     verdict = "as a careful survey has it" if good else f"more than the {bounds} that are usual"
-    return Finding("good" if good else "doubt", "Accuracy", f"{told}: {verdict}.")
+    return VerdictLine("good" if good else "doubt", "Accuracy", f"{told}: {verdict}.")
 
 
-def _splat(holdings: Holdings) -> Finding | None:
-    accuracy = holdings.read("evaluate.metrics").get("accuracy", {})
+def _splat(inputs: ReportInputs) -> VerdictLine | None:
+    accuracy = inputs.read("evaluate.metrics").get("accuracy", {})
     splat, gsd = accuracy.get("splat"), accuracy.get("gsd_m")
     if not splat or not gsd:
         return None
@@ -225,23 +227,25 @@ def _splat(holdings: Holdings) -> Finding | None:
     if not far:
         off = length(max(lengths.values()))
         text = f"At {plural(len(points), 'surveyed point')} the splat's own surface is within {off}."
-        return Finding("good", "Surface", text)
+        return VerdictLine("good", "Surface", text)
     text = f"The splat's own surface is off at {len(far)} of {plural(len(points), 'surveyed point')}: "
     which = far[0] if len(far) == 1 else f"most of all {far[0]},"
-    return Finding("doubt", "Surface", text + f"{which} by {length(lengths[far[0]])}.")
+    return VerdictLine("doubt", "Surface", text + f"{which} by {length(lengths[far[0]])}.")
 
 
-def _views(holdings: Holdings) -> Finding | None:
-    if "evaluate" not in holdings.artifacts:
+def _views(inputs: ReportInputs) -> VerdictLine | None:
+    if "evaluate" not in inputs.artifacts:
         return None
-    metrics = holdings.read("evaluate.metrics")
+    metrics = inputs.read("evaluate.metrics")
     bounded = " inside the boundary" if "whole" in metrics else ""
     mean, views = metrics["mean"], [view for view in metrics["per_view"] if view["psnr"] is not None]
     if bounded and metrics["per_view"] and not views:
         text = "No held-out photo shows what lies inside the boundary, so nothing tells how good it is."
-        return Finding("doubt", "Held-out photos", text)
+        return VerdictLine("doubt", "Held-out photos", text)
     if not views:
-        return Finding("doubt", "Held-out photos", "No photo was held out, so nothing tells how good the pictures are.")
+        return VerdictLine(
+            "doubt", "Held-out photos", "No photo was held out, so nothing tells how good the pictures are."
+        )
     worst_of = min(views, key=_likeness)
     value, worst = _likeness(mean), _likeness(worst_of)
     level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
@@ -250,10 +254,10 @@ def _views(holdings: Holdings) -> Finding | None:
     text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded}{at} "
     text += f"({value:.1f} without what exposure did), SSIM {number(mean['ssim'], 2)}: {told}"
     if level == "good" and worst < PSNR_DOUBT_DB:
-        return Finding(
+        return VerdictLine(
             "doubt", "Held-out photos", f"{text} on average, but not of {worst_of['name']} ({worst:.1f} dB)."
         )
-    return Finding(level, "Held-out photos", f"{text}.")
+    return VerdictLine(level, "Held-out photos", f"{text}.")
 
 
 def _likeness(measures: Mapping[str, Any]) -> float:
@@ -261,9 +265,9 @@ def _likeness(measures: Mapping[str, Any]) -> float:
     return float(measures["psnr_cc"] if measures.get("psnr_cc") is not None else measures["psnr"])
 
 
-def _floaters(holdings: Holdings) -> Finding | None:
+def _floaters(inputs: ReportInputs) -> VerdictLine | None:
     """By the held-out photos, if any: what the training photos see through is cleared in training, by its own rule."""
-    veil = holdings.read("evaluate.metrics").get("floaters", {}).get("veil", {})
+    veil = inputs.read("evaluate.metrics").get("floaters", {}).get("veil", {})
     if veil.get("mean") is None:
         return None
     level: Level = "good" if veil["mean"] <= VEIL else "doubt"
@@ -271,4 +275,4 @@ def _floaters(holdings: Holdings) -> Finding | None:
     which = "that training never saw" if veil.get("held_out", True) else "of the training, since none was held out"
     text = f"{what} in the air before {plural(veil['photos'], 'photo')} {which}: it stops"
     text += f" {share(veil['mean'], 1)} of the light of the points that they see"
-    return Finding(level, "Floaters", f"{text}, at the worst {share(veil['worst'], 1)} ({veil['worst_photo']}).")
+    return VerdictLine(level, "Floaters", f"{text}, at the worst {share(veil['worst'], 1)} ({veil['worst_photo']}).")

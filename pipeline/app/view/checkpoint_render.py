@@ -27,7 +27,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.handover import in_world
 from splatpipe.pipeline.web.viewer import viewer_page
-from splatpipe.pipeline.web.viewer_scene import SPLAT, look_of, viewer_scene, viewer_splat
+from splatpipe.pipeline.web.viewer_scene import SPLAT, viewer_rendering, viewer_scene, viewer_splat
 
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
 COARSE_TOLD = "coarse.json"  # in the folder of blocks that are not laid out yet: the coarse pass is done
@@ -42,7 +42,7 @@ LEFT_SHARE = (
 
 
 @dataclass(frozen=True)
-class Source:
+class ModelSource:
     """A model that can be shown.
 
     Attributes:
@@ -63,7 +63,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Shown:
+class LoadedModel:
     """A model as it is drawn."""
 
     gaussians: Gaussians
@@ -73,32 +73,34 @@ class Shown:
     iteration: int
 
 
-def newest(opened: Contents) -> Source | None:
+def newest(opened: Contents) -> ModelSource | None:
     """The furthest that a training has come; None before it can begin."""
     if "train.model" in opened.parts:
         if "train.rendering" not in opened.parts:  # of an earlier splatpipe: how it was rendered is not known
             return None
         part = opened.parts.get("clean.model", opened.parts["train.model"])
         rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
-        return Source(part.path, "model", part.digest[:16], rendering, sky)
+        return ModelSource(part.path, "model", part.digest[:16], rendering, sky)
     folder = opened.working.get("train")
     for at_work, rendering, block in _trainings(opened):
         try:
             facts = (at_work / CHECKPOINT).stat()
             stamp = f"{facts.st_ino:x}-{facts.st_mtime_ns:x}"
             sky = rendering.with_name(COARSE_SKY)
-            return Source(at_work / CHECKPOINT, "checkpoint", stamp, rendering, sky if sky.is_file() else None, block)
+            return ModelSource(
+                at_work / CHECKPOINT, "checkpoint", stamp, rendering, sky if sky.is_file() else None, block
+            )
         except OSError:
             continue
     coarse = _coarse(opened)
     if coarse is not None:
         done = {part.path: part.digest[:16] for name, part in opened.parts.items() if name == "blocks.coarse"}
         stamp = done.get(coarse) or f"{_moved(coarse / COARSE_MODEL):x}"
-        return Source(coarse / COARSE_MODEL, "coarse", stamp, coarse / RENDERING, coarse / COARSE_SKY)
+        return ModelSource(coarse / COARSE_MODEL, "coarse", stamp, coarse / RENDERING, coarse / COARSE_SKY)
     if "initialize.splat" in opened.parts:
         part = opened.parts["initialize.splat"]
         begun = folder is not None and (folder / RENDERING).is_file()
-        return Source(part.path, "initial", part.digest[:16], folder / RENDERING if folder and begun else None)
+        return ModelSource(part.path, "initial", part.digest[:16], folder / RENDERING if folder and begun else None)
     return None
 
 
@@ -137,7 +139,7 @@ def _moved(path: Path) -> int:
         return 0
 
 
-def iteration_of(source: Source) -> int | None:
+def iteration_of(source: ModelSource) -> int | None:
     """How far a model is; None where its file does not say."""
     if source.kind == "initial":
         return 0
@@ -150,7 +152,7 @@ def iteration_of(source: Source) -> int | None:
         return None
 
 
-def load(source: Source, opened: Contents) -> Shown:
+def load(source: ModelSource, opened: Contents) -> LoadedModel:
     """Read a model for drawing.
 
     Raises:
@@ -164,9 +166,9 @@ def load(source: Source, opened: Contents) -> Shown:
         gaussians = read_splat(source.path)
         sky = read_panorama(source.sky) if source.sky is not None else None
     if source.rendering is None:
-        return Shown(gaussians, sky, rasterizer.RenderOptions(sh_degree=gaussians.sh_degree), None, 0)
+        return LoadedModel(gaussians, sky, rasterizer.RenderOptions(sh_degree=gaussians.sh_degree), None, 0)
     options, megapixels = as_trained(source.rendering, gaussians)
-    return Shown(gaussians, sky, options, megapixels, iteration_of(source) or 0)
+    return LoadedModel(gaussians, sky, options, megapixels, iteration_of(source) or 0)
 
 
 def views_of(opened: Contents) -> tuple[View, ...]:
@@ -199,7 +201,7 @@ def device_of(opened: Contents, logged: str) -> str:
     return str(machine.get("device", logged)) if isinstance(machine, Mapping) else logged
 
 
-def pictures(shown: Shown, view: View, threads: int, device: str = "auto") -> tuple[bytes, bytes]:
+def pictures(shown: LoadedModel, view: View, threads: int, device: str = "auto") -> tuple[bytes, bytes]:
     """JPEGs of a render and of its photo, both of the size that is trained on, 2 megapixels at most.
 
     Args:
@@ -220,7 +222,7 @@ def pictures(shown: Shown, view: View, threads: int, device: str = "auto") -> tu
     return _jpeg(render), _jpeg(photo)
 
 
-def _on_card(shown: Shown, camera: Camera) -> Pixels | None:
+def _on_card(shown: LoadedModel, camera: Camera) -> Pixels | None:
     """A render by the graphics card; None where there is none, or too little memory is free."""
     try:
         device = choose_device("auto")
@@ -236,11 +238,11 @@ def _on_card(shown: Shown, camera: Camera) -> Pixels | None:
         torch.cuda.empty_cache()  # does nothing where CUDA was not used
 
 
-def _rendered(shown: Shown, camera: Camera, device: Device) -> Pixels:
+def _rendered(shown: LoadedModel, camera: Camera, device: Device) -> Pixels:
     return render_pixels(placed((shown.gaussians, shown.sky), device), camera, shown.options)
 
 
-def viewer(shown: Shown, source: Source, opened: Contents, name: str) -> tuple[str, bytes]:
+def viewer(shown: LoadedModel, source: ModelSource, opened: Contents, name: str) -> tuple[str, bytes]:
     """The 3D viewer's page of a model, and the splat that it loads from beside it, called ``SPLAT``.
 
     Args:
@@ -256,7 +258,7 @@ def viewer(shown: Shown, source: Source, opened: Contents, name: str) -> tuple[s
         raise SplatpipeError("There is nothing to show in 3D yet.")
     frame = load_frame(opened.parts["georef.frame"].path)
     gaussians = in_world(shown.gaussians, frame)
-    look = look_of(shown.options, shown.sky)
+    look = viewer_rendering(shown.options, shown.sky)
     dataset, held_out = opened.parts["undistort.dataset"].path, set(held_out_of(opened))
     title = f"{name}, iteration {shown.iteration:,}"
     scene = viewer_scene(dataset, frame, look, held_out, len(gaussians), title)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from splatpipe.pipeline.app.view.job import Job
+from splatpipe.pipeline.app.view.marking_job import MarkingJob
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.joint_fit import JointFit, fit_jointly
@@ -48,7 +48,7 @@ HELPFUL_MARKS = 4  # of a point: from there on more tell little
 
 
 @dataclass
-class Told:
+class WarningCollector:
     """A reporter that keeps the warnings."""
 
     warnings: list[str] = field(default_factory=list)
@@ -97,7 +97,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class _Fitted:
+class _GeoreferencedSite:
     site: LocalSurvey
     fit: JointFit
     survey: Survey
@@ -113,7 +113,7 @@ class Estimator:
         SplatpipeError: if the points lie elsewhere than the photos.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: MarkingJob) -> None:
         self._job = job
         self._index = {name: k for k, name in enumerate(job.model.names)}
         self._located: dict[str, tuple[object, SurveyPoint]] = {}
@@ -128,7 +128,7 @@ class Estimator:
         Args:
             marks: Pixels by point and photo, (0, 0) the top-left corner of the first one.
         """
-        job, told = self._job, Told()
+        job, told = self._job, WarningCollector()
         points = [self._locate(k, marks.get(point.name, {})) for k, point in enumerate(job.points)]
         survey = self._survey(points)
         try:
@@ -172,7 +172,7 @@ class Estimator:
         file = ControlFile(job.crs.text, job.points, ())
         return Survey(file, job.crs, job.text.path.name, tuple(with_roles(points, job.config.check_points)))
 
-    def _fit(self, survey: Survey, told: Told) -> _Fitted:
+    def _fit(self, survey: Survey, told: WarningCollector) -> _GeoreferencedSite:
         job, stations = self._job, self._stations
         site = make_site(survey, self._geodetic, stations, job.frame, job.config)
         start = start_similarity(site, survey, job.model, job.positions, job.frame)
@@ -184,7 +184,7 @@ class Estimator:
         require_fit(fit, observed, survey)
         if not survey.of_role("control"):
             fit = replace(fit, similarity=start[0])
-        return _Fitted(site, fit, survey)
+        return _GeoreferencedSite(site, fit, survey)
 
     def _lifted(self, similarity: Similarity, site: LocalSurvey) -> Similarity:
         """Before any mark: the model moved in height so that the points lie on it, whatever datum each is in."""
@@ -198,7 +198,7 @@ class Estimator:
         return replace(similarity, translation=similarity.translation + np.array([0.0, 0.0, lift]))
 
     def _expected(
-        self, fitted: _Fitted, wanted: Bool[np.ndarray, " n"]
+        self, fitted: _GeoreferencedSite, wanted: Bool[np.ndarray, " n"]
     ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
         """Where the survey has points in the model, and how well that is known, in the model's units."""
         similarity, enu = fitted.fit.similarity, fitted.site.targets.enu[wanted].copy()
@@ -217,7 +217,7 @@ class Estimator:
         """Of the photos' positions, which share most of their errors: what these alone are worth."""
         return np.asarray(np.median(self._stations.sigmas, axis=0))
 
-    def _sigmas(self, fitted: _Fitted) -> tuple[float, float]:
+    def _sigmas(self, fitted: _GeoreferencedSite) -> tuple[float, float]:
         """Standard deviations of the frame, horizontally and vertically: the median over the model."""
         if not fitted.survey.of_role("control"):
             east, north, up = self._stated_sigmas().tolist()
@@ -258,7 +258,7 @@ class Projector:
         job: What is marked.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: MarkingJob) -> None:
         self._job = job
         self._cloud, self._shows = _cloud_of(job.model)
 
@@ -327,7 +327,7 @@ def _cloud_of(model: SparseModel) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.n
     return np.array([point.xyz for point in chosen], dtype=np.float64).reshape(-1, 3), shows
 
 
-def residual_of(sighting: Sighting, point: SurveyPoint, job: Job) -> list[float] | None:
+def residual_of(sighting: Sighting, point: SurveyPoint, job: MarkingJob) -> list[float] | None:
     """What a photo shows of a point less the mark, pixels; None where that is not known."""
     if point.found is None:
         return None

@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.dataset import View
 
 if TYPE_CHECKING:  # torch takes seconds to load, and marking does without
-    from splatpipe.pipeline.app.view.checkpoint_render import Shown, Source
+    from splatpipe.pipeline.app.view.checkpoint_render import LoadedModel, ModelSource
 
 LOOK_EVERY_S = 2.0
 MOST_PICTURES = 64  # that are kept: pairs of JPEGs of some 100 kB
@@ -39,7 +39,7 @@ class Live:
         self._opened = Contents()
         self._looked_s = -LOOK_EVERY_S
         self._renderer = ThreadPoolExecutor(1, "render")  # one at a time
-        self._model: tuple[str, Shown] | None = None
+        self._model: tuple[str, LoadedModel] | None = None
         self._viewer: tuple[str, bytes, bytes] | None = None
         self._views: tuple[Path | None, tuple[View, ...]] = (None, ())
         self._pictures: OrderedDict[tuple[str, int], tuple[bytes, bytes]] = OrderedDict()
@@ -74,7 +74,7 @@ class Live:
                 "started_s": log.started_s,
                 "last_s": log.last_s,
                 "now_s": time.time(),
-                "stages": [stage.told() for stage in log.stages.values()],
+                "stages": [stage.as_json() for stage in log.stages.values()],
                 "left_after_s": log.left_after_s,
                 "curves": {name: log.curves[name].points for name in CURVES if name in log.curves},
                 "curves_of": log.curves_of,
@@ -122,7 +122,7 @@ class Live:
             self._viewer = source.stamp, page.encode(), splat
         return self._viewer[1:]
 
-    def _load(self, source: Source, opened: Contents) -> Shown:
+    def _load(self, source: ModelSource, opened: Contents) -> LoadedModel:
         from splatpipe.pipeline.app.view import checkpoint_render
 
         if self._model is None or self._model[0] != source.stamp:

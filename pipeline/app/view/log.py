@@ -72,7 +72,7 @@ class StageState:
         pace = (last - first) / max(last_s - first_s, 1e-9)
         return max(0.0, self.total - last) / pace if pace > 0.0 else None
 
-    def told(self) -> dict[str, JSON]:
+    def as_json(self) -> dict[str, JSON]:
         """For the page."""
         kept = ("name", "state", "seconds", "done", "total", "what", "unit", "message")
         return {name: getattr(self, name) for name in kept} | {"seconds_left": self.seconds_left}

@@ -23,7 +23,7 @@ from splatpipe.pipeline.app.view.estimate import (
     Projector,
     residual_of,
 )
-from splatpipe.pipeline.app.view.job import Job
+from splatpipe.pipeline.app.view.marking_job import MarkingJob
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.survey.control_edit import ControlText
@@ -57,7 +57,7 @@ class Marking:
         job: What is marked.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: MarkingJob) -> None:
         self.job = job
         self._lock = threading.Lock()
         self._points = {point.name: point for point in job.points}

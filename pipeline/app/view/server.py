@@ -28,7 +28,7 @@ from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, NotThereError, 
 from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, Guard
 from splatpipe.pipeline.app.view.landing import fetchable, landing
 from splatpipe.pipeline.app.view.live import Live
-from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, Stopped, UsageError
+from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, StopSignal, UsageError
 from splatpipe.pipeline.engine.run_folder import RunFolder, open_run_folder
 from splatpipe.pipeline.web import asset
 from splatpipe.pipeline.web.measured_page import SITE
@@ -102,7 +102,7 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
                 threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
 
         _Server(_settings(make_app(routes, token)), ready).run(sockets=[listening])
-    except Stopped as stopped:
+    except StopSignal as stopped:
         if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
             raise
     finally:
@@ -131,9 +131,9 @@ def _take_signals_back() -> None:
 
 def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> list[Route]:
     """What marking adds."""
-    from splatpipe.pipeline.app.view.job import open_job
     from splatpipe.pipeline.app.view.mark_routes import MarkPages
     from splatpipe.pipeline.app.view.marking import Marking
+    from splatpipe.pipeline.app.view.marking_job import open_job
 
     marking = Marking(open_job(pages.run, options.points))
     pages.marking = True

@@ -12,4 +12,4 @@ from splatpipe.pipeline.engine import config  # noqa: E402
 
 config.load_preset = lambda name: {}
 start.require_memory = lambda request: None  # of a training, which this line has none of
-start.told_beforehand = lambda request: ""
+start.forecast_text = lambda request: ""

@@ -19,7 +19,7 @@ STOPPED = (130, 143)  # exit codes of Ctrl-C and of SIGTERM
 
 
 @dataclass
-class Told:
+class StageMessages:
     """What one stage said, in all attempts at one artifact.
 
     Attributes:
@@ -36,7 +36,7 @@ class Told:
 
 
 @dataclass
-class StageStory:
+class StageHistory:
     """What became of a stage in the last run.
 
     Attributes:
@@ -49,7 +49,7 @@ class StageStory:
         message: What it failed with.
         hint: What to do about it.
         lasting: Whether the same input fails again.
-        told: What it said.
+        messages: What it said.
     """
 
     name: str
@@ -61,18 +61,18 @@ class StageStory:
     message: str = ""
     hint: str = ""
     lasting: bool = False
-    told: Told = field(default_factory=Told)
+    messages: StageMessages = field(default_factory=StageMessages)
 
     @property
     def reached(self) -> float | None:
         """How far it came, in its own unit: the last progress, or the last point of a curve if that is further."""
-        steps = [step for curve in self.told.metrics.values() for step in curve]
-        done = self.told.progress.get("done")
+        steps = [step for curve in self.messages.metrics.values() for step in curve]
+        done = self.messages.progress.get("done")
         return max([*steps, *([] if done is None else [float(done)])], default=None)
 
 
 @dataclass
-class Story:
+class RunHistory:
     """The last run.
 
     Attributes:
@@ -88,7 +88,7 @@ class Story:
         keys: The last known key of each stage, in any run.
     """
 
-    stages: dict[str, StageStory] = field(default_factory=dict)
+    stages: dict[str, StageHistory] = field(default_factory=dict)
     began_s: float = 0.0
     ended_s: float = 0.0
     exit_code: int | None = None
@@ -100,7 +100,7 @@ class Story:
     keys: dict[str, str] = field(default_factory=dict)
 
     @property
-    def culprit(self) -> StageStory | None:
+    def culprit(self) -> StageHistory | None:
         """The stage in which it ended badly, or is."""
         bad = ("failed", "stopped", "broken off", "running")
         return next((stage for stage in self.stages.values() if stage.state in bad), None)
@@ -112,14 +112,14 @@ class Story:
         return bool(self.stages) and good and not self.exit_code and not self.running
 
 
-def read_story(path: Path, *, running: bool) -> Story:
+def read_history(path: Path, *, running: bool) -> RunHistory:
     """Read the events of a run's folder; lines that are none are passed over.
 
     Args:
         path: `events.jsonl`; it need not be there.
         running: Whether somebody works in the folder now.
     """
-    reader = _Reader()
+    reader = _EventReader()
     for event in _events(path):
         try:
             reader.take(event)
@@ -140,42 +140,44 @@ def _events(path: Path) -> Iterator[Event]:
         return
 
 
-class _Reader:
+class _EventReader:
     """Takes one event after the other."""
 
     def __init__(self) -> None:
-        self._story = Story()
-        self._told: dict[tuple[str, str], Told] = {}
+        self._history = RunHistory()
+        self._messages: dict[tuple[str, str], StageMessages] = {}
         self._keys: dict[str, str] = {}
 
     def take(self, event: Event) -> None:
-        self._story.ended_s = event.time_s
+        self._history.ended_s = event.time_s
         getattr(self, f"_{event.kind}")(event.stage, event.data)
 
-    def finish(self, running: bool) -> Story:
-        story = self._story
-        story.running, story.keys = running, dict(self._keys)
-        story.stages = {name: story.stages[name] for name in shards_first(story.stages)}
-        for stage in story.stages.values():
+    def finish(self, running: bool) -> RunHistory:
+        history = self._history
+        history.running, history.keys = running, dict(self._keys)
+        history.stages = {name: history.stages[name] for name in shards_first(history.stages)}
+        for stage in history.stages.values():
             if stage.state == "running" and not running:
                 stage.state = "broken off"
-        return story
+        return history
 
     def _run_started(self, _name: str, data: Facts) -> None:
-        stages = {str(name): StageStory(str(name), "not reached") for name in data["stages"]}
-        self._story = Story(stages, self._story.ended_s, self._story.ended_s)
-        self._story.machine, self._story.versions = data.get("machine", {}), data.get("versions", {})
+        stages = {str(name): StageHistory(str(name), "not reached") for name in data["stages"]}
+        self._history = RunHistory(stages, self._history.ended_s, self._history.ended_s)
+        self._history.machine, self._history.versions = data.get("machine", {}), data.get("versions", {})
 
     def _run_finished(self, _name: str, data: Facts) -> None:
-        self._story.exit_code = int(data["exit_code"])
-        self._story.message, self._story.hint = str(data["message"]), str(data["hint"])
+        self._history.exit_code = int(data["exit_code"])
+        self._history.message, self._history.hint = str(data["message"]), str(data["hint"])
 
     def _stage_started(self, name: str, data: Facts) -> None:
         stage = self._stage(name, "running", data)
         stage.reason = str(data["reason"])
-        before = stage.told if stage.key else Told()
+        before = stage.messages if stage.key else StageMessages()
         # what it says again counts, and not what it said before; the curves go on
-        stage.told = self._told[name, stage.key] = Told(metrics=before.metrics, progress=before.progress)
+        stage.messages = self._messages[name, stage.key] = StageMessages(
+            metrics=before.metrics, progress=before.progress
+        )
 
     def _stage_reused(self, name: str, data: Facts) -> None:
         self._stage(name, "reused", data).seconds = float(data["seconds"])
@@ -194,26 +196,26 @@ class _Reader:
         stage.seconds, stage.memory_bytes = data.get("seconds"), data.get("peak_memory_bytes")
 
     def _progress(self, name: str, data: Facts) -> None:
-        self._heard(name).progress = data
+        self._messages_of(name).progress = data
 
     def _metric(self, name: str, data: Facts) -> None:
-        curve = self._heard(name).metrics.setdefault(str(data["name"]), {})
+        curve = self._messages_of(name).metrics.setdefault(str(data["name"]), {})
         curve[float(data["step"] or 0)] = float(data["value"])
 
     def _note(self, name: str, data: Facts) -> None:
-        self._heard(name).notes.append(str(data["message"]))
+        self._messages_of(name).notes.append(str(data["message"]))
 
     def _warning(self, name: str, data: Facts) -> None:
-        self._heard(name).warnings.append((str(data["message"]), str(data["hint"])))
+        self._messages_of(name).warnings.append((str(data["message"]), str(data["hint"])))
 
-    def _stage(self, name: str, state: State, data: Facts) -> StageStory:
-        stage = self._story.stages.setdefault(name, StageStory(name, state))
+    def _stage(self, name: str, state: State, data: Facts) -> StageHistory:
+        stage = self._history.stages.setdefault(name, StageHistory(name, state))
         stage.state = state
         stage.key = str(data.get("key", "")) or stage.key
         self._keys[name] = stage.key
-        stage.told = self._told.setdefault((name, stage.key), Told())
+        stage.messages = self._messages.setdefault((name, stage.key), StageMessages())
         return stage
 
-    def _heard(self, name: str) -> Told:
-        stage = self._story.stages.get(name)
-        return stage.told if stage is not None else Told()
+    def _messages_of(self, name: str) -> StageMessages:
+        stage = self._history.stages.get(name)
+        return stage.messages if stage is not None else StageMessages()

@@ -12,10 +12,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from splatpipe.pipeline.edit.merge import Merge, origin_of
-from splatpipe.pipeline.edit.pictures import Points, Views, choose_views, picture, write_side_by_side
+from splatpipe.pipeline.edit.pictures import PictureCameras, Points, choose_views, picture, write_side_by_side
 from splatpipe.pipeline.edit.record import Edit, with_edits, write_record
-from splatpipe.pipeline.edit.size import Output
-from splatpipe.pipeline.edit.sources import SPLAT, STAGES, Source, is_run, open_source
+from splatpipe.pipeline.edit.size import OutputFile
+from splatpipe.pipeline.edit.sources import SPLAT, STAGES, SplatSource, is_run, open_source
 from splatpipe.pipeline.edit.workpiece import Workpiece, between
 from splatpipe.pipeline.engine.digests import file_digest
 from splatpipe.pipeline.engine.durable import sync_folder, sync_tree
@@ -39,7 +39,7 @@ class Step(Protocol):
 
 
 @dataclass(frozen=True)
-class Task:
+class EditTask:
     """What is asked for.
 
     Attributes:
@@ -49,8 +49,8 @@ class Task:
         pictures: Whether there are to be any.
     """
 
-    source: Source
-    output: Output
+    source: SplatSource
+    output: OutputFile
     steps: Sequence[Step]
     pictures: bool = True
 
@@ -61,7 +61,7 @@ class Task:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _SplatExtent:
     """Where a splat lies, for pictures."""
 
     points: Points
@@ -69,7 +69,7 @@ class _Look:
     count: int
 
 
-def edit_splat(task: Task, report: Reporter) -> dict[str, Any]:
+def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
     """Edit a splat: read it, take the steps, write it, what was done to it, and pictures.
 
     Args:
@@ -90,12 +90,12 @@ def edit_splat(task: Task, report: Reporter) -> dict[str, Any]:
     piece = Workpiece(task.source.read())
     if not len(piece):
         raise SplatpipeError(f"{task.source.name} has no Gaussians.", hint="Name another splat.")
-    before = _Look(piece.sample(), piece.facts.place, len(piece))
+    before = _SplatExtent(piece.sample(), piece.facts.place, len(piece))
     edits = _take_steps(task, piece, total, report)
     scene = piece.scene()
     _require_finite(scene)
     scene = Scene(scene.gaussians, with_edits(scene.facts, edits))
-    after = _Look(piece.sample(), scene.facts.place, len(piece))
+    after = _SplatExtent(piece.sample(), scene.facts.place, len(piece))
     del piece
     _write(task, scene)
     write_record(task.beside(RECORD), task.source, digest, edits, _made(task, after.count))
@@ -117,7 +117,7 @@ def edit_splat(task: Task, report: Reporter) -> dict[str, Any]:
     return {**told, "outputs": [str(path) for path in outputs]}
 
 
-def _take_steps(task: Task, piece: Workpiece, total: int, report: Reporter) -> list[Edit]:
+def _take_steps(task: EditTask, piece: Workpiece, total: int, report: Reporter) -> list[Edit]:
     edits: list[Edit] = []
     for number, step in enumerate(task.steps, start=1):
         count, told = len(piece), len(piece.notes)
@@ -128,12 +128,12 @@ def _take_steps(task: Task, piece: Workpiece, total: int, report: Reporter) -> l
     return edits
 
 
-def _made(task: Task, count: int) -> dict[str, Any]:
+def _made(task: EditTask, count: int) -> dict[str, Any]:
     made = {"name": task.output.path.name, "format": task.output.kind.name, "gaussians": count}
     return {**made, "sha256": file_digest(task.output.path)} if task.output.path.is_file() else made
 
 
-def require_free(task: Task) -> None:
+def require_free(task: EditTask) -> None:
     """Refuse to do nothing, and to write over what is edited, what is merged, or anything of a run.
 
     Raises:
@@ -168,7 +168,7 @@ def _require_finite(scene: Scene) -> None:
         )
 
 
-def _write(task: Task, scene: Scene) -> None:
+def _write(task: EditTask, scene: Scene) -> None:
     """Let the output take its place at once, or not at all."""
     path = task.output.path
     aside = path.with_name(f".{os.getpid()}.new.{path.name}")
@@ -192,7 +192,7 @@ def _write(task: Task, scene: Scene) -> None:
             aside.unlink(missing_ok=True)
 
 
-def _views(task: Task, before: _Look, after: _Look) -> Views:
+def _views(task: EditTask, before: _SplatExtent, after: _SplatExtent) -> PictureCameras:
     """Both in the frame of what it has become."""
     to_after = _between(before.place, after.place)
     poses = ((camera, to_after.camera_pose(camera.cam_from_world)) for camera in task.source.cameras())
@@ -202,7 +202,7 @@ def _views(task: Task, before: _Look, after: _Look) -> Views:
     return replace(views, before=replace(views.before, cam_from_world=back))
 
 
-def _write_picture(task: Task, views: Views, before: _Look, right: Pixels) -> None:
+def _write_picture(task: EditTask, views: PictureCameras, before: _SplatExtent, right: Pixels) -> None:
     """Read what it was once more, and draw it beside what it has become."""
     left = picture(task.source.read(), views.before, before.points, f"before: {before.count:,} Gaussians")
     try:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, State, check_command, notify
-from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, Stopped, exit_code
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, StopSignal, exit_code
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.verdict import Verdict
@@ -27,12 +27,12 @@ NOTICE_S = 4.7  # and a notice has what is left of that time,
 LEAST_NOTICE_S = 0.5  # but at least this
 
 
-class Ending:
+class CommandSummary:
     """Tells the end of a command, good or bad: a summary for people on stderr, one JSON object for programs."""
 
     outcome: Outcome | None = None
     reports: bool = True  # not who makes one shard: others may be at work in OUT, and the report is of all
-    told: Mapping[str, Any] | None = None
+    details: Mapping[str, Any] | None = None
     news: Sequence[str] = ()
     _reported: Path | None = None
     _command: str | None = None
@@ -41,7 +41,7 @@ class Ending:
         self._out, self._as_json = out, as_json
         self._started_s = time.monotonic()
 
-    def __enter__(self) -> Ending:
+    def __enter__(self) -> CommandSummary:
         return self
 
     def notify_by(self, command: str | None) -> None:
@@ -64,7 +64,7 @@ class Ending:
         if error is None and self.outcome is not None:
             self._show(self.outcome, seconds)
         if self._as_json:
-            print_json({**self._as_object(error, seconds), **(self.told or {})})
+            print_json({**self._as_object(error, seconds), **(self.details or {})})
         if self._command is not None and not _insists(error):
             self._notify(self._command, error)
 
@@ -74,7 +74,7 @@ class Ending:
 
         state: State = "done" if error is None else "failed"
         limit_s = TIME_LIMIT_S
-        if isinstance(error, Stopped | KeyboardInterrupt):
+        if isinstance(error, StopSignal | KeyboardInterrupt):
             state = "stopped"
             limit_s = max(LEAST_NOTICE_S, getattr(error, "at_s", time.monotonic()) + NOTICE_S - time.monotonic())
         out = self._out.resolve()
@@ -88,7 +88,7 @@ class Ending:
         from splatpipe.pipeline.app.report import make_report
         from splatpipe.pipeline.engine.run_folder import LOG_FILE
 
-        until_s = error.at_s + STOP_S if isinstance(error, Stopped) else None
+        until_s = error.at_s + STOP_S if isinstance(error, StopSignal) else None
         try:
             self._reported = make_report(self._out, self._out / LOG_FILE, until_s=until_s)
         except SplatpipeError as trouble:
@@ -137,9 +137,9 @@ class Ending:
 def _insists(error: BaseException | None) -> bool:
     """Whether the user pressed Ctrl-C once more while the first one was being obeyed: then nothing is waited for."""
     before = None if error is None else error.__context__
-    while before is not None and not isinstance(before, Stopped):
+    while before is not None and not isinstance(before, StopSignal):
         before = before.__context__
-    return isinstance(error, Stopped) and before is not None
+    return isinstance(error, StopSignal) and before is not None
 
 
 def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -160,11 +160,11 @@ def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 def _verdict(out: Path) -> Verdict | None:
     """The report's, where the run's record can be read: what is wrong with it does not spoil the run's end."""
-    from splatpipe.pipeline.app.report.holdings import open_holdings
+    from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
     from splatpipe.pipeline.app.report.verdict import judge
 
     try:
-        return judge(open_holdings(out))
+        return judge(read_report_inputs(out))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, SplatpipeError):
         return None
 

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float32, Float64
 from torch import Tensor
 
-from splatpipe.pipeline.edit.sightings import Photos
+from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
@@ -30,7 +30,7 @@ HALFWAY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Worth:
+class PhotoErrorChange:
     """Sums over the photos of squared errors (of pixels of 0..1, three channels).
 
     Attributes:
@@ -42,9 +42,9 @@ class Worth:
     worse: Float32[np.ndarray, " n"]
 
 
-def worth_in_photos(
-    gaussians: Gaussians, asked: Bool[np.ndarray, " n"], photos: Photos, told: Callable[[int], None]
-) -> Worth:
+def error_change_in_photos(
+    gaussians: Gaussians, asked: Bool[np.ndarray, " n"], photos: TrainingPhotos, told: Callable[[int], None]
+) -> PhotoErrorChange:
     """By how much photos are more like renders with each Gaussian, and by how much others are less.
 
     Exposure differs between photos and is forgiven: a colour map is fitted to each, as ``metrics.psnr_cc`` does.
@@ -75,10 +75,10 @@ def worth_in_photos(
         better -= np.minimum(paid, 0.0)
         worse += np.maximum(paid, 0.0)
         told(index + 1)
-    return Worth(better, worse)
+    return PhotoErrorChange(better, worse)
 
 
-def _rendered(model: Gaussians, camera: Camera, photos: Photos, options: rasterizer.RenderOptions) -> Tensor:
+def _rendered(model: Gaussians, camera: Camera, photos: TrainingPhotos, options: rasterizer.RenderOptions) -> Tensor:
     rendered = rasterizer.render(model, camera, options)
     if photos.sky is None:
         return rendered.colour

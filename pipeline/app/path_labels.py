@@ -19,13 +19,13 @@ _BESIDE = re.compile(rf"(?<![\w./-])(?:\.\./)+(?:[^/{_END}]+/)*([^/{_END}]+)")
 
 
 @dataclass(frozen=True)
-class Places:
+class PathLabels:
     """Folders and files that messages may name, with what they are called instead; longer ones come first."""
 
     names: tuple[tuple[str, str], ...]
 
     @staticmethod
-    def of(out: Path, photos: Path | None = None, options: Mapping[str, Any] | None = None) -> Places:
+    def of(out: Path, photos: Path | None = None, options: Mapping[str, Any] | None = None) -> PathLabels:
         """Those of a run.
 
         Args:
@@ -41,7 +41,7 @@ class Places:
                 found[value], found[str(Path(value).parent)] = Path(value).name, ""
         # A folder right below the root tells nothing, and its name may be a word of the text.
         kept = {path: name for path, name in found.items() if path.count("/") > 1}
-        return Places(tuple(sorted(kept.items(), key=lambda item: -len(item[0]))))
+        return PathLabels(tuple(sorted(kept.items(), key=lambda item: -len(item[0]))))
 
     def plain(self, text: str) -> str:
         """A text without folders of this machine."""

@@ -33,7 +33,7 @@ Found = Mapping[str, Mapping[str, tuple[float, float]]]
 
 
 @dataclass(frozen=True)
-class Job:
+class MarkingJob:
     """What marking starts from.
 
     Attributes:
@@ -71,7 +71,7 @@ class Job:
         return 0.5 if self.config.pixel_origin == "centre" else 0.0
 
 
-def open_job(run: RunFolder, points_file: Path | None) -> Job:
+def open_job(run: RunFolder, points_file: Path | None) -> MarkingJob:
     """Read all that marking takes.
 
     Args:
@@ -101,7 +101,7 @@ def open_job(run: RunFolder, points_file: Path | None) -> Job:
     places = (source.folder, parts["ingest.photos"])
     frame = _frame(model, positions, config.georef, photos)
     found = _found(parts.get("georef.control"), points, photos)
-    return Job(points, crs, photos, *places, model, positions, frame, config.georef, found, text, command)
+    return MarkingJob(points, crs, photos, *places, model, positions, frame, config.georef, found, text, command)
 
 
 def _found(control: Path | None, points: Sequence[SurveyedPoint], photos: Mapping[str, Photo]) -> Found:

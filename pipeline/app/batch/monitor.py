@@ -15,8 +15,8 @@ from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, PlannedCapture
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState, Level
 from splatpipe.pipeline.app.batch.tries import Try, read_tries
 from splatpipe.pipeline.app.report import REPORT_FILE
-from splatpipe.pipeline.app.report.holdings import Holdings, open_holdings
-from splatpipe.pipeline.app.report.story import read_story
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs, read_report_inputs
+from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, SplatpipeError
 from splatpipe.pipeline.engine.machine import available_cores
@@ -30,7 +30,7 @@ GO_ON = "Repeat the command: it goes on from what is finished."
 
 
 @dataclass(frozen=True)
-class Facts:
+class CaptureFacts:
     """What a capture's folder of results holds; the fields are those of ``CaptureState``."""
 
     verdict: str = ""
@@ -42,7 +42,7 @@ class Facts:
     viewer: str = ""
 
 
-class Account:
+class BatchMonitor:
     """Tells where a call stands, again and again; what cannot have changed since is not read again.
 
     Args:
@@ -52,7 +52,7 @@ class Account:
     def __init__(self, call: Call) -> None:
         self._call = call
         self._plan = call.plan()
-        self._facts: dict[str, tuple[object, Facts]] = {}
+        self._facts: dict[str, tuple[object, CaptureFacts]] = {}
 
     def state(self) -> BatchState:
         """Where it stands now."""
@@ -88,9 +88,9 @@ class Account:
         if not planned.jobs:
             return self._with_facts(CaptureState(planned.name, "reused", progress=1.0), planned, ())
         tries = read_tries(self._call.tries_files(planned.key))
-        return self._with_facts(self._standing(planned, tries, ended=ended), planned, tries)
+        return self._with_facts(self._capture_state(planned, tries, ended=ended), planned, tries)
 
-    def _standing(self, planned: PlannedCapture, tries: Sequence[Try], *, ended: bool) -> CaptureState:
+    def _capture_state(self, planned: PlannedCapture, tries: Sequence[Try], *, ended: bool) -> CaptureState:
         """Its state and what belongs to it, by its jobs' tries; of shards side by side the liveliest one's."""
         done = {each.stage for each in tries if each.succeeded}
         jobs = self._call.jobs(planned)
@@ -131,12 +131,12 @@ class Account:
         """How far a running stage is, by its own events."""
         out = self._call.out / planned.name
         path = out / EVENTS_FILE if stage == stage_name(stage) else shard_events(out, stage)
-        story = read_story(path, running=True)
-        found = story.stages.get(stage)
-        if found is None or found.state != "running" or not found.told.progress:
+        history = read_history(path, running=True)
+        found = history.stages.get(stage)
+        if found is None or found.state != "running" or not found.messages.progress:
             return 0.0
         with suppress(KeyError, TypeError, ValueError, ZeroDivisionError):
-            return min(1.0, max(0.0, float(found.told.progress["done"]) / float(found.told.progress["total"])))
+            return min(1.0, max(0.0, float(found.messages.progress["done"]) / float(found.messages.progress["total"])))
         return 0.0
 
     def _with_facts(self, told: CaptureState, planned: PlannedCapture, tries: Sequence[Try]) -> CaptureState:
@@ -157,7 +157,7 @@ class Account:
             viewer=facts.viewer,
         )
 
-    def _read(self, planned: PlannedCapture, told: CaptureState) -> Facts:
+    def _read(self, planned: PlannedCapture, told: CaptureState) -> CaptureFacts:
         """What its folder holds, with a picture of it."""
         facts = read_facts(self._call.out, planned.name, told.state in ("done", "reused", "failed"))
         try:
@@ -190,7 +190,7 @@ class Account:
         return needed
 
 
-def read_facts(out: Path, name: str, judged: bool) -> Facts:
+def read_facts(out: Path, name: str, judged: bool) -> CaptureFacts:
     """What lies in a capture's folder of results; as far as it can be read.
 
     Args:
@@ -199,15 +199,15 @@ def read_facts(out: Path, name: str, judged: bool) -> Facts:
         judged: With the verdict: nothing is to be said of what still goes on.
     """
     folder = out / name
-    facts = Facts(
+    facts = CaptureFacts(
         report=_link(name, REPORT_FILE, folder),
         viewer=_link(name, VIEWER_FILE, folder),
     )
     try:
-        holdings = open_holdings(folder)
-        verdict = judge(holdings) if judged else None
-        seconds = sum(float(artifact.manifest["seconds"]) for artifact in holdings.artifacts.values())
-        facts = replace(facts, seconds=seconds, figures=_figures(holdings))
+        inputs = read_report_inputs(folder)
+        verdict = judge(inputs) if judged else None
+        seconds = sum(float(artifact.manifest["seconds"]) for artifact in inputs.artifacts.values())
+        facts = replace(facts, seconds=seconds, figures=_figures(inputs))
     except (
         SplatpipeError,
         OSError,
@@ -232,14 +232,14 @@ _SUMMARIES = (
 )
 
 
-def _figures(holdings: Holdings) -> dict[str, float | int]:
+def _figures(inputs: ReportInputs) -> dict[str, float | int]:
     """What people ask for first."""
     found: dict[str, float | int] = {}
     for stage, names in _SUMMARIES:
-        summary = holdings.summary(stage)
+        summary = inputs.summary(stage)
         found |= {name: summary[name] for name in names if isinstance(summary.get(name), int | float)}
     with suppress(OSError, ValueError, KeyError, TypeError):
-        found["check_rmse_3d_m"] = float(holdings.read("georef.accuracy")["tables"]["check"]["rmse_3d_m"])
+        found["check_rmse_3d_m"] = float(inputs.read("georef.accuracy")["tables"]["check"]["rmse_3d_m"])
     return found
 
 

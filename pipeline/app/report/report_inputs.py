@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.app.report.story import Story, read_story
+from splatpipe.pipeline.app.report.run_history import RunHistory, read_history
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, Contents, RunFolder, open_run_folder
 from splatpipe.pipeline.engine.store import Artifact
@@ -36,12 +36,12 @@ class Deliverable:
 
 
 @dataclass(frozen=True)
-class Holdings:
+class ReportInputs:
     """All that a report is made from.
 
     Attributes:
         out: The run's folder.
-        story: What happened.
+        history: What happened.
         config: The options as they were; None where they cannot be read.
         photos_dir: The user's folder; None where nobody knows.
         contents: The artifacts that belong together.
@@ -49,7 +49,7 @@ class Holdings:
     """
 
     out: Path
-    story: Story
+    history: RunHistory
     config: LineConfig | None
     photos_dir: Path | None
     contents: Contents
@@ -106,7 +106,7 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path.name} is nested too deeply") from error
 
 
-def open_holdings(out: Path) -> Holdings:
+def read_report_inputs(out: Path) -> ReportInputs:
     """Look at a run's folder, which may be that of a running, a stopped or a failed one.
 
     Args:
@@ -116,11 +116,11 @@ def open_holdings(out: Path) -> Holdings:
         UsageError: if there is no run in it.
     """
     run = open_run_folder(out, LINE)
-    story = read_story(run.out / EVENTS_FILE, running=run.at_work)
+    history = read_history(run.out / EVENTS_FILE, running=run.at_work)
     config, photos_dir = _configuration(run)
-    unfinished = {name for name, stage in story.stages.items() if stage.state in BAD}
-    contents = run.contents(config, story.keys, unfinished)
-    return Holdings(run.out, story, config, photos_dir, contents, _deliverables(run, contents))
+    unfinished = {name for name, stage in history.stages.items() if stage.state in BAD}
+    contents = run.contents(config, history.keys, unfinished)
+    return ReportInputs(run.out, history, config, photos_dir, contents, _deliverables(run, contents))
 
 
 def _configuration(run: RunFolder) -> tuple[LineConfig | None, Path | None]:

@@ -32,7 +32,7 @@ BEFORE_SIGMAS = 2.0  # and of its own standard deviations along the view axis
 
 
 @dataclass(frozen=True, eq=False)
-class Photos:
+class TrainingPhotos:
     """The photos that a splat was trained on.
 
     Attributes:
@@ -49,7 +49,7 @@ class Photos:
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class GaussianVisibility:
     """What all photos together see of each Gaussian.
 
     Attributes:
@@ -69,15 +69,15 @@ class Sightings:
     gap: Float32[np.ndarray, " n"]
 
 
-class _Sums:
-    """Sums over the photos, of which ``Sightings`` are made."""
+class _VisibilitySums:
+    """Sums over the photos, of which ``GaussianVisibility`` are made."""
 
     def __init__(self, n: int) -> None:
         self.weight, self.square, self.border = (np.zeros(n, np.float32) for _ in range(3))
         self.area, self.before, self.gap = (np.zeros(n, np.float32) for _ in range(3))
         self.towards = np.zeros((n, 3), np.float32)
 
-    def sightings(self) -> Sightings:
+    def sightings(self) -> GaussianVisibility:
         def part(value: Float32[np.ndarray, " n"], of: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
             return np.asarray(np.divide(value, of, out=np.zeros_like(value), where=of > 0.0))
 
@@ -86,10 +86,10 @@ class _Sums:
         angle[self.weight == 0.0] = 0.0
         photos = part(self.weight * self.weight, self.square)
         border, before, gap = part(self.border, self.weight), part(self.before, self.area), part(self.gap, self.weight)
-        return Sightings(self.weight, photos, angle, border, before, gap)
+        return GaussianVisibility(self.weight, photos, angle, border, before, gap)
 
 
-def look_through(gaussians: Gaussians, photos: Photos, told: Callable[[int], None]) -> Sightings:
+def look_through(gaussians: Gaussians, photos: TrainingPhotos, told: Callable[[int], None]) -> GaussianVisibility:
     """Sum up what photos see.
 
     Args:
@@ -100,7 +100,7 @@ def look_through(gaussians: Gaussians, photos: Photos, told: Callable[[int], Non
     grey = grey_of(gaussians)
     plain = replace(photos.options, sh_degree=0, depth=True, magnitudes=False)
     centres, axes = gaussians.means.detach().numpy(force=True), half_axes(gaussians)
-    sums = _Sums(len(gaussians))
+    sums = _VisibilitySums(len(gaussians))
     for done, camera in enumerate(photos.cameras, start=1):
         rendered = rasterizer.render(grey, camera, plain)
         behind = without_islands(rendered.median_depth.numpy(force=True))
@@ -136,7 +136,7 @@ def _border(camera: Camera) -> Float32[np.ndarray, "h w"]:
 
 
 def _add(
-    sums: _Sums,
+    sums: _VisibilitySums,
     rows: Int64[np.ndarray, " m"],
     found: Float32[np.ndarray, "m 3"],
     camera: Camera,
