@@ -22,6 +22,7 @@ from splatpipe.pipeline.splat.formats.plain_ply import frame_comments
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, write_panorama
 from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.survey.georeference import accuracy_in_words
 from splatpipe.pipeline.survey.handover import facts_of, in_world
 from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.train.options import TrainConfig
@@ -181,7 +182,23 @@ def test_georef_json_places_the_exported_cameras(exported: Path) -> None:
 def test_the_crs_and_its_operation_are_told(inputs: Inputs, tmp_path: Path) -> None:
     recorder = tiny_scene.Recorder()
     export.run(ExportConfig(), inputs, tmp_path, recorder)
-    assert "EPSG:32634" in recorder.notes[0] and "good to 0 m" in recorder.notes[0] and "unknown" in recorder.notes[0]
+    note = recorder.notes[0]
+    assert "EPSG:32634" in note and "an exact conversion" in note and "unknown" in note
+
+
+@pytest.mark.parametrize(
+    ("accuracy_m", "words"),
+    [
+        (None, "of unknown accuracy"),
+        (0.0, "an exact conversion"),
+        (0.004, "accurate to 4 mm"),
+        (0.05, "accurate to 0.05 m"),
+        (1.26, "accurate to 1.3 m"),
+        (120.0, "accurate to 120 m"),
+    ],
+)
+def test_an_accuracy_is_never_rounded_to_nothing(accuracy_m: float | None, words: str) -> None:
+    assert accuracy_in_words(accuracy_m) == words
 
 
 def test_broken_gaussians_stay_out_of_the_file(inputs: Inputs, tmp_path: Path) -> None:

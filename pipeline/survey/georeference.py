@@ -66,10 +66,25 @@ def georeference(frame: Frame, box: Float64[np.ndarray, "2 3"]) -> dict[str, Any
     }
 
 
+def accuracy_in_words(accuracy_m: float | None) -> str:
+    """The accuracy that PROJ states of an operation, to two significant digits; 0 means a conversion without error.
+
+    Args:
+        accuracy_m: Metres; None where PROJ does not know it.
+    """
+    if accuracy_m is None:
+        return "of unknown accuracy"
+    if accuracy_m == 0.0:
+        return "an exact conversion"
+    if accuracy_m < 0.01:
+        return f"accurate to {accuracy_m * 1000.0:.2g} mm"
+    return f"accurate to {accuracy_m:.2g} m" if accuracy_m < 99.5 else f"accurate to {accuracy_m:,.0f} m"
+
+
 def accuracy_line(georeferenced: Mapping[str, Any]) -> str:
     """In what CRS and by which operation, a sentence or two, of a `georef.json` that has an origin."""
     crs, operation = georeferenced["crs"], georeferenced["crs"]["operation"]
-    accuracy = "of unknown accuracy" if operation["accuracy_m"] is None else f"good to {operation['accuracy_m']:g} m"
+    accuracy = accuracy_in_words(operation["accuracy_m"])
     best = "" if operation["best"] else "; a better one lacks its grid"
     return (
         f"Coordinates are in {crs['id']} ({crs['name']}), by {operation['name']}, {accuracy}{best}. "

@@ -119,15 +119,16 @@ def _vertical(datum: str, *, named: bool) -> str:
 
 def _crs(inputs: ReportInputs, frame: Mapping[str, Any]) -> str:
     """As `georef.json` has it where it was written, else as the frame has it."""
+    from splatpipe.pipeline.survey.georeference import accuracy_in_words
+
     path = inputs.part("export.georef")
     told = read_json(path) if path is not None else {}
     crs = told.get("crs") if isinstance(told, Mapping) else None
     if not isinstance(crs, Mapping):
         return str(frame.get("crs") or "the UTM zone of the origin")
     operation = crs.get("operation", {})
-    accuracy = operation.get("accuracy_m")
-    good = "of unknown accuracy" if accuracy is None else f"good to {accuracy:g} m"
-    return f"{crs.get('id')} ({crs.get('name')}), by {operation.get('name')}, {good}"
+    accuracy = accuracy_in_words(operation.get("accuracy_m"))
+    return f"{crs.get('id')} ({crs.get('name')}), by {operation.get('name')}, {accuracy}"
 
 
 def _tables(model: Mapping[str, Any], splat: Mapping[str, Any]) -> list[dict[str, Any]]:
