@@ -4,6 +4,7 @@
 # make develop                 installs links to the sources, so that what is edited is what runs; make test goes back
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            writes the tables of docs/options.md from the code
+# make aarch64                 the kernels and their tests in C++ for 64-bit Arm, under QEMU
 # make test-image              builds the container image for real and runs the demo in it (Linux, root, buildah, runc)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
@@ -44,7 +45,7 @@ CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || 
 # The tests of a file share what they set up, so that a file stays with one worker.
 WORKERS = -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: run test test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test aarch64 test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -91,6 +92,16 @@ sanitize-%: .venv/.tested
 	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPLATPIPE_SANITIZE=$(SANITIZERS) > /dev/null
 	@$(BIN)/ninja -j2 --quiet -C build/sanitize/$*
 	@if setarch -R true 2>/dev/null; then setarch -R build/sanitize/$*/native_tests; else build/sanitize/$*/native_tests; fi
+
+# The kernels and their tests in C++ compiled for 64-bit Arm, and passed under emulation where there is QEMU (a minute).
+aarch64: .venv/.dependencies
+	@command -v aarch64-linux-gnu-g++ >/dev/null || { echo "needs apt install g++-aarch64-linux-gnu qemu-user-static"; exit 1; }
+	@echo "== native tests on aarch64"
+	@SPLATPIPE_WERROR=1 $(BIN)/cmake -S pipeline/raster/native -B build/aarch64 -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
+	  --toolchain $(CURDIR)/tests/native/aarch64.cmake -DSPLATPIPE_NATIVE_TESTS=ON > /dev/null
+	@$(BIN)/ninja -j2 --quiet -C build/aarch64
+	@if command -v qemu-aarch64-static >/dev/null; then qemu-aarch64-static -L /usr/aarch64-linux-gnu build/aarch64/native_tests; \
+	  else echo "compiled; not run, for want of qemu-user-static"; fi
 
 # No weak symbols in what is compiled per instruction set; of CUDA the C interface alone, for every device asked for.
 symbols: .venv/.tested
