@@ -14,6 +14,7 @@ from splatpipe.pipeline.app.cli_batch import batch
 from splatpipe.pipeline.app.cli_check import check
 from splatpipe.pipeline.app.cli_edit import OrderedCommand, edit
 from splatpipe.pipeline.app.cli_formats import convert, export
+from splatpipe.pipeline.app.cli_help import helped
 from splatpipe.pipeline.app.cli_options import (
     BoundaryOption,
     ConfigOption,
@@ -41,6 +42,7 @@ from splatpipe.pipeline.app.cli_options import (
     WaitOption,
     WhatOption,
     expanded,
+    stages,
 )
 from splatpipe.pipeline.app.cli_runs import (
     Overrides,
@@ -69,14 +71,14 @@ from splatpipe.pipeline.engine.machine import available_cores
 app = typer.Typer(
     name="splatpipe",
     help="From a folder of drone photos to a georeferenced, quality-checked 3D Gaussian splat.",
+    epilog="Each command tells more: splatpipe COMMAND --help. Read on: README.md, docs/options.md",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
-app.command()(batch)
+helped(app)(batch)
 
 
 def _show_version(wanted: bool) -> None:
@@ -96,7 +98,7 @@ def _root(
     pass
 
 
-@app.command()
+@helped(app)
 def run(
     photos: PhotosArgument,
     out: OutArgument,
@@ -135,7 +137,7 @@ def run(
             runner.walk(until=until, rerun=again)
 
 
-@app.command()
+@helped(app)
 def demo(
     out: OutArgument,
     preset: PresetOption = "demo",
@@ -158,9 +160,9 @@ def demo(
     run(capture_path(), out, preset, None, assignments, **budgets, **machine, **ending)  # type: ignore[arg-type]
 
 
-@app.command()
+@helped(app)
 def stage(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The stage to run.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", autocompletion=stages, help="The stage to run.")],
     out: OutArgument,
     assignments: SetOption = None,
     shard: ShardOption = None,
@@ -183,7 +185,7 @@ def stage(
             runner.run_alone(name) if shard is None else runner.run_shard(name, shard)
 
 
-@app.command()
+@helped(app)
 def georef(
     out: OutArgument,
     gcp: Annotated[
@@ -207,7 +209,7 @@ def georef(
             runner.walk()
 
 
-@app.command()
+@helped(app)
 def surface(
     out: OutArgument,
     products: Annotated[
@@ -264,11 +266,11 @@ def surface(
                 done.details, done.news = {"surface": measured}, measured_lines(out, measured)
 
 
-app.command()(export)
-app.command()(convert)
+helped(app)(export)
+helped(app)(convert)
 
 
-@app.command()
+@helped(app)
 def render(
     out: OutArgument,
     path: PathOption = "cameras",
@@ -290,7 +292,7 @@ def render(
         done.details = {"render": render_run(out, wanted, threads or available_cores(), device)}
 
 
-@app.command()
+@helped(app)
 def view(
     out: OutArgument,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for a free one.")] = 0,
@@ -314,7 +316,7 @@ def view(
     serve(out, ViewOptions(port, bind, browser, mark, points), say)
 
 
-@app.command()
+@helped(app)
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Say what is there, what is stale and why."""
     from splatpipe.pipeline.app.console import show_status
@@ -328,7 +330,7 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
         show_status(statuses)
 
 
-@app.command()
+@helped(app)
 def report(out: OutArgument, as_json: JsonOption = False) -> None:
     """Write OUT/report.html anew, from what is there."""
     from splatpipe.pipeline.app.console import say
@@ -343,7 +345,7 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
     say(str(path))
 
 
-@app.command()
+@helped(app)
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the present configuration no longer asks for."""
     from splatpipe.pipeline.app.console import say
@@ -360,7 +362,7 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
         say(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")
 
 
-@app.command()
+@helped(app)
 def options(preset: PresetOption = "standard") -> None:
     """List every option with its value in a preset and what it does."""
     from splatpipe.pipeline.app.console import show_table
@@ -371,7 +373,7 @@ def options(preset: PresetOption = "standard") -> None:
     show_table(rows, ("option", "value", "what it does"))
 
 
-@app.command()
+@helped(app)
 def doctor(
     out: Annotated[
         Path | None, typer.Argument(callback=lambda path: path and expanded(path), help="Where runs are to write.")
@@ -393,8 +395,8 @@ def doctor(
         say(f"! {caution.message} {caution.hint}")
 
 
-app.command()(check)
-app.command(cls=OrderedCommand)(edit)
+helped(app)(check)
+helped(app, cls=OrderedCommand)(edit)
 
 
 def _stop(number: int, _frame: FrameType | None) -> NoReturn:

@@ -107,12 +107,7 @@ def edit(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Crop, clean, move, turn, scale, merge and reduce a splat: steps are taken in the order in which they are given.
-
-    splatpipe edit out/site site.sog --crop-polygon site.geojson --rotate 37 --reduce 50MB
-
-    Coordinates are of the splat's CRS, or its own where it lies nowhere on the earth.
-    """
+    """Crop, clean, move, turn, scale, merge and reduce a splat, in the order in which the steps are given."""
     with CommandSummary(out, as_json) as done:
         options = {
             "crop_box": crop_box,

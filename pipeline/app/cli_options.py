@@ -22,6 +22,25 @@ def expanded(path: Path) -> Path:
         raise UsageError(f"There is no home folder for {path}.", hint="Give the whole path, or set HOME.") from error
 
 
+def presets(incomplete: str) -> list[str]:
+    """The presets whose names begin so, for a shell that completes."""
+    from splatpipe.pipeline.engine.config import preset_names
+
+    return [name for name in preset_names() if name.startswith(incomplete)]
+
+
+def stages(incomplete: str) -> list[str]:
+    """The stages whose names begin so."""
+    from splatpipe.stages.line import LINE
+
+    return [stage.name for stage in LINE if stage.name.startswith(incomplete)]
+
+
+def devices(incomplete: str) -> list[str]:
+    """The devices whose names begin so."""
+    return [name for name in ("auto", "cpu", "cuda") if name.startswith(incomplete)]
+
+
 PhotosArgument = Annotated[
     Path, typer.Argument(callback=expanded, help="Folder of photos, or one with images/ and sparse/0 (COLMAP).")
 ]
@@ -37,7 +56,7 @@ ShardOption = Annotated[
     int | None,
     typer.Option(min=1, metavar="K", help="Make this shard alone; other processes may make others at the same time."),
 ]
-DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+DeviceOption = Annotated[str, typer.Option(autocompletion=devices, help="auto, cpu or cuda.")]
 ThreadsOption = Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. The result is the same.")]
 SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout at the end.")]
@@ -52,7 +71,7 @@ NotifyOption = Annotated[
         "SPLATPIPE_CAPTURE, SPLATPIPE_REPORT and SPLATPIPE_OUT in its environment.",
     ),
 ]
-PresetOption = Annotated[str, typer.Option(help="preview (minutes), standard or high.")]
+PresetOption = Annotated[str, typer.Option(autocompletion=presets, help="preview (minutes), standard or high.")]
 TimeBudgetOption = Annotated[
     str | None,
     typer.Option(metavar="10m|90s|1h30m", help="For the whole command; the training is planned to fill what is left."),
@@ -64,9 +83,13 @@ BoundaryOption = Annotated[
     str | None,
     typer.Option(metavar="FILE", help="The area that counts, GeoJSON; what is outside stays coarse. auto, or none."),
 ]
-UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
-RerunOption = Annotated[list[str] | None, typer.Option(metavar="STAGE", help="Run this stage again. Repeatable.")]
-RerunFromOption = Annotated[str | None, typer.Option(metavar="STAGE", help="Run this stage and all after it again.")]
+UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Stop after this stage.")]
+RerunOption = Annotated[
+    list[str] | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage again. Repeatable.")
+]
+RerunFromOption = Annotated[
+    str | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage and all after it again.")
+]
 PathOption = Annotated[
     str,
     typer.Option(metavar="cameras|orbit|FILE", help="The way: through the cameras, around, or keyframes (JSON, CSV)."),

@@ -1,0 +1,171 @@
+"""``--help`` of each command after its first sentence: what it reads and leaves, examples, where to read on."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+
+RUN_EXITS = (
+    "0 done, 1 the photos or files cannot be used, 2 a wrong call, 3 a stage failed, 4 this machine lacks something; "
+    "130 and 143 stopped: the same command goes on."
+)
+
+
+@dataclass(frozen=True)
+class HelpPage:
+    """The rest of a command's help.
+
+    Args:
+        about: What it reads and what it leaves.
+        examples: Calls, without the program's name.
+        read_on: The page of the documentation.
+        exits: Exit codes, where they matter.
+    """
+
+    about: str
+    examples: tuple[str, ...]
+    read_on: str
+    exits: str = ""
+
+    def epilog(self) -> str:
+        """What follows the options."""
+        calls = "\n".join(f"  splatpipe {call}" for call in self.examples)
+        parts = ["Examples:" if len(self.examples) > 1 else "Example:", calls]
+        if self.exits:
+            parts.append(f"Exit codes: {self.exits}")
+        return "\n\n".join([*parts, f"Read on: {self.read_on}"])
+
+
+PAGES = {
+    "run": HelpPage(
+        "Reads JPEG, PNG or TIFF photos (GPS from EXIF and XMP), and beside them gcp_list.txt, geo.txt, "
+        "boundary.geojson and masks/, if they are there. Leaves in OUT splat.ply, viewer.html, report.html, "
+        "georef.json, ortho.tif, dsm.tif, a film and more, and the stages' artifacts in OUT/stages. The "
+        "photos are not changed.",
+        ("run PHOTOS OUT --preset preview", "run PHOTOS OUT --time-budget 2h --set export.sky=true"),
+        "docs/products.md, docs/options.md, docs/budgets.md",
+        RUN_EXITS,
+    ),
+    "demo": HelpPage(
+        "Reads 40 rendered photos of a farmhouse with control points, which lie in the package. Leaves in OUT what a "
+        "run of your own photos would leave; it takes minutes and 1.2 GB of memory.",
+        ("demo out/demo",),
+        "README.md, docs/products.md",
+        RUN_EXITS,
+    ),
+    "batch": HelpPage(
+        "Reads a folder of capture folders, or a list (TOML, CSV) with options for each. Leaves a run in OUT/NAME for "
+        "each capture, and batch.html, batch.csv and batch.json about all. Needs Snakemake: "
+        "pip install 'splatpipe\\[batch]'.",
+        ("batch CAPTURES OUT --dry-run", "batch captures.toml OUT --retries 3"),
+        "docs/unattended.md",
+        "0 all captures succeeded, 1 some failed, 2 a wrong call or list, 3 Snakemake failed, 4 this machine lacks "
+        "something; 130 and 143 stopped.",
+    ),
+    "stage": HelpPage(
+        "Reads the artifacts of earlier stages in OUT. Leaves the stage's own, and out of date what depends on it "
+        "(splatpipe status tells); splatpipe run makes that anew.",
+        ("stage evaluate OUT", "stage train OUT --shard 2"),
+        "docs/rooms.md, docs/blocks.md",
+        RUN_EXITS,
+    ),
+    "georef": HelpPage(
+        "Reads OUT and the control points. Leaves OUT with the new place in each of its files; trains anew only if the "
+        "control bends the model.",
+        ("georef OUT --gcp gcp_list.txt", "georef OUT --set georef.crs=EPSG:2178"),
+        "docs/surveying.md",
+        RUN_EXITS,
+    ),
+    "surface": HelpPage(
+        "Reads a run with a metric scale. Leaves in OUT the orthophoto and the surface model as GeoTIFFs, façade "
+        "elevations, a dense cloud (LAZ), a mesh, sections and volumes, as asked.",
+        ("surface OUT --products ortho,dsm --gsd 2cm", "surface OUT --volume heaps.geojson --base lowest"),
+        "docs/surfaces.md",
+        RUN_EXITS,
+    ),
+    "export": HelpPage(
+        "Reads a finished run. Leaves the files in OUT/export; each says which way is up and where it lies on the "
+        "earth.",
+        ("export OUT --format spz,tiles",),
+        "docs/formats.md",
+        RUN_EXITS,
+    ),
+    "convert": HelpPage(
+        "Reads a PLY (also compressed), SPZ, SOG, GLB, or the folder of a trainer's model. Leaves one file, in the "
+        "format that its ending says. Needs no run.",
+        ("convert splat.ply splat.spz", "convert splat.ply splat.sog"),
+        "docs/formats.md",
+    ),
+    "render": HelpPage(
+        "Reads a finished run. Leaves a film or a folder of pictures below OUT/renders, or where --output says.",
+        ("render OUT --path orbit --seconds 20", "render OUT --stills --what depth"),
+        "docs/viewing.md",
+    ),
+    "view": HelpPage(
+        "Reads OUT, also while a run works in it. Serves pages on this machine alone until Ctrl-C; leaves nothing, but "
+        "with --mark the control points' places in the photos.",
+        ("view OUT", "view OUT --mark --points control.csv"),
+        "docs/viewing.md",
+    ),
+    "status": HelpPage(
+        "Reads OUT, also while a run works in it, and leaves it as it is.",
+        ("status OUT",),
+        "docs/rooms.md",
+    ),
+    "report": HelpPage(
+        "Reads OUT and leaves report.html in it. A run does that by itself; this is for one that was stopped.",
+        ("report OUT",),
+        "docs/products.md",
+    ),
+    "clean": HelpPage(
+        "Reads OUT. Removes artifacts of older options and photos from OUT/stages, and nothing else of OUT.",
+        ("clean OUT",),
+        "docs/rooms.md",
+    ),
+    "options": HelpPage(
+        "Prints the options that --set and a --config file take.",
+        ("options --preset high",),
+        "docs/options.md",
+    ),
+    "doctor": HelpPage(
+        "Looks at processor, memory, disk, CUDA and libraries; leaves nothing.",
+        ("doctor", "doctor OUT --json"),
+        "docs/cuda.md, docs/containers.md",
+    ),
+    "check": HelpPage(
+        "Reads the photos and the surveyor's files beside them, in half a minute. Leaves check.html with a map: what "
+        "overlaps too little, blurred photos, missing positions; and tells time, memory and disk of a run.",
+        ("check PHOTOS", "check PHOTOS -o site.html"),
+        "docs/preflight.md",
+        "0 it can be reconstructed, also with warnings, 1 it cannot as it is, 2 a wrong call.",
+    ),
+    "edit": HelpPage(
+        "Reads a splat of any format, or a run. Leaves a new file, beside it NAME.edits.json with what was done, and "
+        "pictures before and after. Coordinates are of the splat's CRS, or its own where it lies nowhere on the earth.",
+        (
+            "edit OUT site.sog --crop-polygon site.geojson --reduce 50MB",
+            "edit splat.ply moved.ply --rotate 37 --move 0,0,1.5",
+        ),
+        "docs/edit.md",
+    ),
+}
+
+
+def helped(app: typer.Typer, **how: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function a command of the application, with its page of help.
+
+    Args:
+        app: Which application.
+        how: As for ``app.command``.
+    """
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        page = PAGES[function.__name__]
+        sentence = inspect.cleandoc(function.__doc__ or "").partition("\n\n")[0]
+        return app.command(help=f"{sentence}\n\n{page.about}", epilog=page.epilog(), **how)(function)
+
+    return register
