@@ -4,6 +4,7 @@
 # make develop                 installs links to the sources, so that what is edited is what runs; make test goes back
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            writes the tables of docs/options.md from the code
+# make release                 the wheel and the sdist in clean environments: licences, SBOM, types, the demo's bits
 # make aarch64                 the kernels and their tests in C++ for 64-bit Arm, under QEMU
 # make test-image              builds the container image for real and runs the demo in it (Linux, root, buildah, runc)
 # make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
@@ -45,7 +46,7 @@ CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || 
 # The tests of a file share what they set up, so that a file stays with one worker.
 WORKERS = -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: run test aarch64 test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test aarch64 release sdist test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -92,6 +93,16 @@ sanitize-%: .venv/.tested
 	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPLATPIPE_SANITIZE=$(SANITIZERS) > /dev/null
 	@$(BIN)/ninja -j2 --quiet -C build/sanitize/$*
 	@if setarch -R true 2>/dev/null; then setarch -R build/sanitize/$*/native_tests; else build/sanitize/$*/native_tests; fi
+
+# The wheel and the source distribution in environments that have nothing else (PYTHONS="python3.12 python3.13" adds these).
+release: .venv/.installed .venv/.dev
+	@echo "== the release"
+	@$(BIN)/python tests/release $(if $(filter cpu,$(TORCH)),--torch-index https://download.pytorch.org/whl/cpu) $(PYTHONS:%=--python %)
+
+# With the pages' scripts bundled, so that who builds from it needs a compiler and no node.
+sdist: .venv/.dev .venv/.node
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python pipeline/web/build.py && $(BIN)/python -m build --sdist --outdir dist . > /dev/null
+	@ls dist/splatpipe-*.tar.gz
 
 # The kernels and their tests in C++ compiled for 64-bit Arm, and passed under emulation where there is QEMU (a minute).
 aarch64: .venv/.dependencies

@@ -1,0 +1,195 @@
+"""``make release``: the wheel and the source distribution as users get them, in environments that have nothing else.
+
+The wheel is installed where there is neither compiler nor node, the source distribution is built where there is a
+compiler and no node. Each has to run the demo to the bits of the build tree, and to have its licences, its bill of
+materials and its types. What is built stays in ``build/release``. CUDA is left out (SPLATPIPE_CUDA=off): its kernels
+take long to compile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Sequence
+from email.parser import HeaderParser
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+WORK = ROOT / "build" / "release"
+CONSTRAINTS = ROOT / "constraints.txt"
+VALIDATOR = "cyclonedx-python-lib[json-validation]"
+SHELL = ("sh", "env")  # all that a user's PATH has to have
+TOOLS = ("c++", "cc", "g++", "gcc", "ld", "as", "ar", "ranlib", "nm", "make", "uname", *SHELL)
+VALIDATE = (
+    "import sys; from cyclonedx.schema import SchemaVersion\n"
+    "from cyclonedx.validation.json import JsonStrictValidator\n"
+    "sys.exit(str(JsonStrictValidator(SchemaVersion.V1_6).validate_str(open(sys.argv[1]).read()) or ''))"
+)
+
+
+class Problem(Exception):
+    """What is not as it has to be."""
+
+
+def main() -> int:
+    """The exit code: 0 where all of it holds."""
+    parser = argparse.ArgumentParser(prog="make release", description=__doc__)
+    parser.add_argument("--torch-index", default="", help="index of torch alone; empty for that of the rest")
+    parser.add_argument("--set", action="append", default=[], help="an option of the demo's runs, to make them shorter")
+    parser.add_argument(
+        "--python", action="append", default=[], help="further Pythons, each of which makes a wheel and runs"
+    )
+    options = parser.parse_args()
+    shutil.rmtree(WORK, ignore_errors=True)
+    WORK.mkdir(parents=True)
+    sets = [word for text in options.set for word in ("--set", text)]
+    try:
+        expected = run_demo(Path(sys.executable), WORK / "tree", sets, os.environ["PATH"])
+        sdist = make_sdist()
+        for python in (sys.executable, *options.python):
+            name = subprocess.check_output(
+                [python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], text=True
+            )
+            check_python(Path(python), name.strip(), sdist, (options.torch_index, sets, expected))
+    except (Problem, subprocess.CalledProcessError) as problem:
+        say(f"FAILED: {problem}")
+        return 1
+    say("The wheel and the source distribution hold what is promised.")
+    return 0
+
+
+def check_python(python: Path, name: str, sdist: Path, how: tuple[str, list[str], str]) -> None:
+    """Build both for a Python, look into the wheel, and run the demo with each."""
+    torch_index, sets, expected = how
+    say(f"Python {name}")
+    from_tree = build_wheel(python, ROOT, WORK / name / "wheel", os.environ["PATH"])
+    from_sdist = build_wheel(python, sdist, WORK / name / "sdist", folder_of(TOOLS))
+    if contents(from_tree) != contents(from_sdist):
+        raise Problem("The wheels of the tree and of the source distribution have other files.")
+    clean = make_environment(python, WORK / name / "clean", torch_index)
+    check_wheel(from_tree, clean)
+    for wheel in (from_tree, from_sdist):
+        pip(clean, "install", "--no-deps", "--force-reinstall", str(wheel))
+        found = run_demo(clean, WORK / name / f"demo-{wheel.parent.name}", sets, folder_of(SHELL))
+        if found != expected:
+            raise Problem(f"splat.ply of {wheel} has other bits than the build tree's.")
+    say("  the demo: the bits of the build tree, without compiler and node on PATH")
+
+
+def make_sdist() -> Path:
+    """The source distribution, which has the pages' scripts bundled."""
+    subprocess.run([sys.executable, ROOT / "pipeline/web/build.py"], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "build", "--sdist", "--outdir", WORK, ROOT], check=True, stdout=subprocess.DEVNULL
+    )
+    (path,) = WORK.glob("*.tar.gz")
+    say(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
+    return path
+
+
+def build_wheel(python: Path, source: Path, target: Path, path: str) -> Path:
+    """A wheel, built with nothing but what its own requirements bring and ``path`` has."""
+    began = time.monotonic()
+    environment = {**os.environ, "PATH": path, "SPLATPIPE_CUDA": "off"}
+    command = [str(python), "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(target), str(source)]
+    subprocess.run(command, check=True, env=environment)
+    (wheel,) = target.glob("*.whl")
+    took_s = time.monotonic() - began
+    say(f"  {wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB, built in {took_s:.0f} s from {source.name}")
+    return wheel
+
+
+def make_environment(python: Path, target: Path, torch_index: str) -> Path:
+    """The Python of a fresh environment with what splatpipe needs, in the versions that were tested."""
+    subprocess.run([str(python), "-m", "venv", target], check=True)
+    clean = target / "bin" / "python"
+    (torch,) = (line for line in CONSTRAINTS.read_text(encoding="utf-8").splitlines() if line.startswith("torch=="))
+    if torch_index:
+        pip(clean, "install", "--no-deps", "--index-url", torch_index, torch)
+    pip(clean, "install", torch)
+    return clean
+
+
+def check_wheel(wheel: Path, clean: Path) -> None:
+    """Licences, bill of materials, types, and that it installs and starts without tools."""
+    pip(clean, "install", str(wheel))
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        info = next(name for name in names if name.endswith(".dist-info/METADATA")).removesuffix("METADATA")
+        told = HeaderParser().parsestr(archive.read(f"{info}METADATA").decode())
+        missing = {f"{info}licenses/{name}" for name in told.get_all("License-File", [])} - set(names)
+        if missing or len(told.get_all("License-File", [])) < 2:
+            raise Problem(f"Licences are missing: {missing}")
+        archive.extract(f"{info}sboms/splatpipe.cdx.json", WORK)
+    check_bill(WORK / f"{info}sboms/splatpipe.cdx.json")
+    search = ["--python-executable", str(clean), "--config-file", str(ROOT / "pyproject.toml")]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *search, "-p", "splatpipe.pipeline.engine", "-p", "splatpipe.stages"],
+        cwd=WORK, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    if done.returncode:
+        raise Problem(done.stdout + done.stderr)
+    say("  licences, bill of materials (CycloneDX 1.6, strictly valid) and types are in the wheel")
+
+
+def check_bill(path: Path) -> None:
+    """CycloneDX's own validator takes it."""
+    tools = WORK / "tools" / "bin" / "python"
+    if not tools.exists():
+        subprocess.run([sys.executable, "-m", "venv", WORK / "tools"], check=True)
+        pip(tools, "install", VALIDATOR)
+    subprocess.run([tools, "-c", VALIDATE, path], check=True)
+
+
+def run_demo(python: Path, out: Path, sets: Sequence[str], path: str) -> str:
+    """Run the demo; the digest of its splat."""
+    began = time.monotonic()
+    log = out.with_suffix(".log")
+    log.parent.mkdir(parents=True, exist_ok=True)
+    environment = {"HOME": str(WORK), "PATH": path}
+    with log.open("w", encoding="utf-8") as file:
+        command = [str(python.parent / "splatpipe"), "demo", str(out), *sets]
+        done = subprocess.run(command, env=environment, cwd=WORK, stdout=file, stderr=file, check=False)
+    if done.returncode:
+        raise Problem(f"The demo ended with {done.returncode}: see {log}")
+    digest = hashlib.sha256((out / "splat.ply").read_bytes()).hexdigest()
+    say(f"  {out.relative_to(WORK)}/splat.ply in {time.monotonic() - began:.0f} s: sha256 {digest[:16]}")
+    return digest
+
+
+def folder_of(names: Sequence[str]) -> str:
+    """A folder that has these programs of the machine and no other, to be a PATH."""
+    folder = WORK / ("bin-tools" if "cc" in names else "bin")
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        found = shutil.which(name)
+        if found and not (folder / name).exists():
+            (folder / name).symlink_to(found)
+    return str(folder)
+
+
+def contents(wheel: Path) -> list[str]:
+    """The names of a wheel's files."""
+    with zipfile.ZipFile(wheel) as archive:
+        return sorted(archive.namelist())
+
+
+def pip(python: Path, *words: str) -> None:
+    """Call a Python's pip, with the versions that were tested."""
+    how = ["-q", "--disable-pip-version-check"]
+    subprocess.run([str(python), "-m", "pip", words[0], *how, "-c", str(CONSTRAINTS), *words[1:]], check=True)
+
+
+def say(text: str) -> None:
+    """Tell whoever waits."""
+    print(text, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
