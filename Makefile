@@ -23,10 +23,10 @@ SPLATPIPE_CUDA := $(or $(SPLATPIPE_CUDA),$(if $(filter wheel,$(MAKECMDGOALS)),$(
 export SPLATPIPE_CUDA
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-SOURCES := $(shell find pipeline stages configs demo bundled -type f -not -path '*/__pycache__/*' \
+SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' \
   -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' -not -name '*.so' -not -name versions.toml \
   2>/dev/null)
-BUILT := pyproject.toml constraints.txt $(filter bundled/% pipeline/raster/native/% pipeline/web/%,$(filter-out pipeline/%.py,$(SOURCES)))
+BUILT := pyproject.toml constraints.txt $(filter pipeline/raster/native/% pipeline/web/%,$(filter-out pipeline/%.py,$(SOURCES)))
 NATIVE := $(filter %.cpp %.h %.cu %.cuh,$(SOURCES)) $(wildcard tests/native/* tests/harness/*.cpp tests/harness/*.h tests/harness/*.cu)
 
 # The index has torch's own wheels; what torch needs comes from PyPI with the rest.

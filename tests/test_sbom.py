@@ -14,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "bundled"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline/raster/native"))
 
 import sbom
 
@@ -27,7 +27,8 @@ PURL = re.compile(r"pkg:(npm|cargo|pypi|generic)/[A-Za-z0-9%._/-]+(@[A-Za-z0-9.+
 def bill(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = tmp_path_factory.mktemp("sbom") / "splatpipe.cdx.json"
     subprocess.run(
-        [sys.executable, ROOT / "bundled/sbom.py", path, "--nanobind", "3.1.0", "--cuda", "13.0"], check=True
+        [sys.executable, ROOT / "pipeline/raster/native/sbom.py", path, "--nanobind", "3.1.0", "--cuda", "13.0"],
+        check=True,
     )
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return found

@@ -62,9 +62,7 @@ class MatchGraph:
         return own
 
 
-def match_quickly(
-    layout: Layout, glimpses: Sequence[QuickFeatures], threads: int, report: Reporter
-) -> MatchGraph:
+def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: int, report: Reporter) -> MatchGraph:
     """Match neighbours by what is known of the photos, look-alikes, and more of them for those that find no partner."""
     count = len(layout)
 

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[3]
 DIST = ROOT / "pipeline" / "web" / "dist"
 LICENCES = Path(__file__).resolve().parent / "licences"
 NEEDED = "# What a run needs"  # the section of constraints.txt
