@@ -27,7 +27,7 @@ SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pyc
   -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' -not -name '*.so' -not -name versions.toml \
   2>/dev/null)
 BUILT := pyproject.toml constraints.txt $(filter pipeline/raster/native/% pipeline/web/%,$(filter-out pipeline/%.py,$(SOURCES)))
-NATIVE := $(filter %.cpp %.h %.cu %.cuh,$(SOURCES)) $(wildcard tests/native/* tests/harness/*.cpp tests/harness/*.h tests/harness/*.cu)
+NATIVE := $(filter %.cpp %.h %.cu %.cuh,$(SOURCES)) $(wildcard tests/native/*.cpp tests/native/*.h tests/harness/*.cpp tests/harness/*.h tests/harness/*.cu)
 
 # The index has torch's own wheels; what torch needs comes from PyPI with the rest.
 CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.pytorch.org/whl/cpu)
