@@ -157,7 +157,7 @@ def demo(
     budgets = {"time_budget": time_budget, "max_memory": max_memory}
     machine = {"device": device, "threads": threads, "seed": seed}
     ending = {"wait": wait, "notify": notify, "as_json": as_json}
-    run(capture_path(), out, preset, None, assignments, **budgets, **machine, **ending)  # type: ignore[arg-type]
+    run(capture_path(), out, preset, None, assignments, **budgets, **machine, **ending)
 
 
 @helped(app)
