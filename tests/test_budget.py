@@ -434,8 +434,8 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.stages import train
 from splatpipe.pipeline.train import plan
-from splatpipe.pipeline.train.measure import Measured, middle_of
-from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, Footage, lengths_of
+from splatpipe.pipeline.train.measure import middle_of
+from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, lengths_of
 from splatpipe.pipeline.train.limits import FIXED_BYTES
 from splatpipe.pipeline.train.memory import resident_bytes
 

@@ -307,7 +307,7 @@ def test_forecast_grows_with_the_model_and_the_picture_and_keeps_to_its_limit():
 
 
 def test_forecast_never_waits(kernels, monkeypatch):
-    monkeypatch.setattr("splatpipe.pipeline.raster.cuda_forecast.Reading.arrived", lambda self: False)
+    monkeypatch.setattr("splatpipe.pipeline.raster.cuda_forecast.PendingFacts.arrived", lambda self: False)
     for _ in range(2):
         backward_of(OPTIONS, kernels)
     assert kernels.forecast.room(FrameSize(60, 20)).passes == FIRST_PASSES  # nothing is known yet

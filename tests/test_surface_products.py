@@ -142,7 +142,7 @@ def test_of_a_site_in_many_small_parts_the_largest_is_kept() -> None:
 
 def test_a_stage_that_finds_no_site_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dsm_stage, "open_run_surface", lambda *_: run_surface(FRAME, photos(), HOUSE))
-    monkeypatch.setattr(dsm_stage, "survey_site", lambda *_: None)
+    monkeypatch.setattr(dsm_stage, "measure_extent", lambda *_: None)
     told = InterruptingReporter()
     assert dsm_stage.run(DsmConfig(), Inputs({}, tmp_path, {}, Machine("cpu", 1)), tmp_path, told) == {"cells": 0}
     assert told.calls == 1
