@@ -361,7 +361,7 @@ def test_file_of_other_photos_is_refused_and_some_missing_ones_are_named(
     assert "names them as their files are called" in caught.value.hint
     some = [replace(row, photo="GONE.JPG") if row.photo == "DJI_0020.JPG" else row for row in rows(FIVE)]
     result = georef(tmp_path / "b", whole, gcp_list(some))
-    assert [w for w in result.told.warnings if "1 photos that are not in this capture: GONE.JPG" in w]
+    assert [w for w in result.told.warnings if "1 photo that is not in this capture: GONE.JPG" in w]
     assert result.table("control")["count"] == 5
 
 
@@ -473,6 +473,23 @@ def test_every_third_of_six_points_is_a_check_point_unless_said_otherwise(
     assert [name for name, role in named.roles().items() if role == "check"] == ["P01", "P02"]
     with pytest.raises(SplatpipeError, match="P99"):
         georef(tmp_path / "wrong", whole, gcp_list(rows(names)), check_points="P99")
+
+
+def test_option_goes_before_roles_of_the_file_and_says_so(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+    names = ("P01", "P02", "P03", "P04", "P05", "P06")
+    lines = ["EPSG:32633", "name,x,y,z,photo,pixel_x,pixel_y,role"]
+    for row in rows(names):
+        role = "check" if row.name in {"P02", "P05"} else "control"
+        lines.append(",".join(map(str, (row.name, *row.place, row.photo, *row.pixel, role))))
+    control = "\n".join(lines) + "\n"
+    told = {}
+    for k, option in enumerate(("auto", "P02,P05", "P01", "none")):
+        result = georef(tmp_path / str(k), whole, control, check_points=option)
+        checks = [name for name, role in result.roles().items() if role == "check"]
+        assert checks == {"auto": ["P02", "P05"], "none": []}.get(option, option.split(","))
+        told[option] = [note for note in result.told.notes if "georef.check_points=" in note]
+    assert not told["auto"] + told["P02,P05"]
+    assert all("which has P02, P05 as check points" in " ".join(told[option]) for option in ("P01", "none"))
 
 
 def test_pixels_may_count_from_the_centre_of_the_first(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:

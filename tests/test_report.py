@@ -363,6 +363,12 @@ def show_nothing_inside(told: dict[str, Any]) -> None:
             "of the training",
         ),
         ("georef.accuracy", lambda told: told["tables"]["check"].update(rmse_up_m=0.5), "doubt", "50.0 cm in height"),
+        (
+            "evaluate.metrics",
+            lambda told: told["accuracy"]["splat"]["points"][2].update(residual_m=[3.0, 0.0, 4.0]),
+            "doubt",
+            "(5.00 m)",
+        ),
         ("georef.accuracy", lambda told: told["tables"].update(check=None), "doubt", "no check point proves it"),
         (
             "georef.accuracy",

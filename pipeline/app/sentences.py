@@ -87,7 +87,7 @@ def _sparse(made: Figures) -> str:
 
 def _targets(made: Figures) -> str:
     said = [plural(made["coded"], "coded target")] if made["coded"] else []
-    said += [plural(made["quadrants"], "sighting") + " of chequered targets"] if made["quadrants"] else []
+    said += [plural(made["quadrants"], "sighting") + " of black-and-white quadrants"] if made["quadrants"] else []
     return ", ".join(said) + " found" if said else "no targets looked for or found"
 
 

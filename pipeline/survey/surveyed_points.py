@@ -149,7 +149,9 @@ def load_survey(
             f"{'controls' if len(file.zero_heights) == 1 else 'control'} horizontally only."
         )
     _tell_unusable(points, path.name, model, photos, report)
-    return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
+    roled = with_roles(points, config.check_points)
+    _tell_overruled(roled, path.name, config.check_points, report)
+    return Survey(file, crs, path.name, tuple(roled))
 
 
 def _with_targets(
@@ -262,7 +264,7 @@ def _tell_marks(
         )
     if missing:
         report.warning(
-            f"{name} names {len(missing)} photos that are not in this capture: {some(missing)}.",
+            f"{name} names {missing_photos(missing)}.",
             "Their marks are left out. Correct the names, or add the photos.",
         )
     if len(outside) > OUTSIDE_SHARE * marks:
@@ -274,6 +276,24 @@ def _tell_marks(
         report.warning(
             f"{len(outside)} marks of {name} lie outside of their photos and are left out: {some(outside)}.",
             "Correct their pixel coordinates.",
+        )
+
+
+def missing_photos(names: Sequence[str]) -> str:
+    """How photos are told that a file names and the capture does not have."""
+    many = "1 photo that is" if len(names) == 1 else f"{len(names)} photos that are"
+    return f"{many} not in this capture: {some(names)}"
+
+
+def _tell_overruled(points: Sequence[SurveyPoint], name: str, setting: str, report: Reporter) -> None:
+    """Say that the option, which may be left from an earlier call, goes before the roles that the file states."""
+    usable = [point for point in points if point.role != "left_out"]
+    stated = {point.name for point in usable if point.surveyed.role == "check"}
+    if any(point.surveyed.role for point in usable) and stated != {p.name for p in usable if p.role == "check"}:
+        report.note(
+            f"georef.check_points={setting} goes before the roles in {name}, which has "
+            f"{some(sorted(stated)) if stated else 'no point'} as check points; "
+            "--set georef.check_points=auto takes the file's."
         )
 
 

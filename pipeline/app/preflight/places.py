@@ -19,6 +19,7 @@ from splatpipe.pipeline.survey.control_file import ControlFile, read_control_fil
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
 from splatpipe.pipeline.survey.position_doubts import WELL_KNOWN_M
 from splatpipe.pipeline.survey.scale_bars import read_scale_bars
+from splatpipe.pipeline.survey.surveyed_points import missing_photos
 
 DOWN_DEG = -75.0  # pitch of the gimbal: further up, walls are seen, and the focal length with them
 ONE_HEIGHT = 0.1  # spread of the heights above take-off over their median
@@ -138,8 +139,10 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
         text = f"None of the photos that {name} names is in this capture: {some(missing)}."
         return [Finding("control-broken", "error", text, "Check that the file belongs to these photos.")]
     if missing:
-        text = f"{name} names {len(missing)} photos that are not in this capture: {some(missing)}."
-        findings.append(Finding("control-marks", "warning", text, "Their marks are left out: correct the names."))
+        text = f"{name} names {missing_photos(missing)}."
+        findings.append(
+            Finding("control-marks", "warning", text, "Their marks are left out. Correct the names, or add the photos.")
+        )
     if outside:
         severe = len(outside) > OUTSIDE_SHARE * len(marks)
         text = f"{len(outside)} of {len(marks)} marks of {name} lie outside of their photos: {some(outside)}."

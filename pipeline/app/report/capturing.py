@@ -157,10 +157,16 @@ def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
 
 
+def _source(told: object) -> str:
+    """Where a figure is from, as people write it: ``xmp-calibrated`` is XMP calibrated."""
+    words = str(told or "").replace("-", " ")
+    return words.replace("exif", "EXIF").replace("xmp", "XMP")
+
+
 def _camera(camera: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, str]:
     make, model = str(camera.get("make") or ""), str(camera.get("model_name") or "")
     name = (model if model.casefold().startswith(make.casefold()) else f"{make} {model}").strip() or "unknown camera"
-    known = str(camera.get("focal_source", "")).replace("-", " ")
+    known = _source(camera.get("focal_source"))
     focal = f"{number(camera.get('focal_px'), 1)} px" + (f" ({known})" if known else "")
     size = f"{count(camera.get('width'))} × {count(camera.get('height'))}"
     if told.get("exif_size"):
@@ -179,7 +185,7 @@ def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str,
     model = str(camera.get("model", ""))
     if lens.get("freed"):
         model += f" ({', '.join(str(name) for name in lens['freed'])})"
-    source = str(camera.get("focal_source") or "").replace("-", " ") if camera.get("has_prior") else ""
+    source = _source(camera.get("focal_source")) if camera.get("has_prior") else ""
     photos = f"{count(camera.get('placed'))} of {count(camera.get('photos'))}"
     return {
         "name": str(camera.get("name") or "unknown camera"),
@@ -238,7 +244,7 @@ def _positions(summary: Mapping[str, Any], positions: Sequence[Mapping[str, Any]
     if not positions:
         return "none of the photos has one"
     told = f"{len(positions):,} photos"
-    sources = ", ".join(str(source) for source in summary.get("position_sources", []))
+    sources = ", ".join(_source(source) for source in summary.get("position_sources", []))
     told += f", from {sources}" if sources else ""
     flights = summary.get("flights")
     told += f", {count(flights)} flights" if isinstance(flights, int) and flights > 1 else ""

@@ -21,6 +21,8 @@ PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # share of the photos
 ERROR_GOOD_PX, ERROR_DOUBT_PX = 1.0, 2.0  # mean reprojection error
 FOCAL_GOOD = 0.05  # of the prior
 HORIZONTAL_GSDS, VERTICAL_GSDS = 2.0, 3.0  # root mean square at check points
+SURFACE_GSDS = 6.0  # of one surveyed point: twice what is usual in height, root mean square
+MOST_NAMED = 3
 FEW_CHECKS = 3  # fewer prove little
 PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos at 2 megapixels, their exposure apart (trials.md)
 CAMERAS = "Cameras"
@@ -223,14 +225,16 @@ def _splat(inputs: ReportInputs) -> VerdictLine | None:
     if not points:
         return None
     lengths = {point["name"]: sum(x * x for x in point["residual_m"] if x is not None) ** 0.5 for point in points}
-    far = sorted((name for name, off in lengths.items() if off > 2 * VERTICAL_GSDS * gsd), key=lambda n: -lengths[n])
+    bound = SURFACE_GSDS * gsd
+    far = sorted((name for name, off in lengths.items() if off > bound), key=lambda n: -lengths[n])
     if not far:
         off = length(max(lengths.values()))
         text = f"At {plural(len(points), 'surveyed point')} the splat's own surface is within {off}."
         return VerdictLine("good", "Surface", text)
-    text = f"The splat's own surface is off at {len(far)} of {plural(len(points), 'surveyed point')}: "
-    which = far[0] if len(far) == 1 else f"most of all {far[0]},"
-    return VerdictLine("doubt", "Surface", text + f"{which} by {length(lengths[far[0]])}.")
+    text = f"The splat's own surface is off by more than {length(bound)} ({SURFACE_GSDS:g} ground sample distances) at "
+    text += f"{len(far)} of {plural(len(points), 'surveyed point')}: "
+    text += ", ".join(f"{name} ({length(lengths[name])})" for name in far[:MOST_NAMED])
+    return VerdictLine("doubt", "Surface", text + (", …" if len(far) > MOST_NAMED else "") + ".")
 
 
 def _views(inputs: ReportInputs) -> VerdictLine | None:
